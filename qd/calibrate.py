@@ -63,8 +63,6 @@ def calibrate(
 
     Raises:
         ValueError: If a value cannot be used; if a penalty never occurred, once the scales of the others are written.
-        AllInvalidError: If no episode is valid.
-        EvaluatorError: If a worker is lost; what was crossed is kept.
     """
     if policy is not None and out is None and robot.settings_file is None:
         raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")
@@ -90,7 +88,11 @@ def calibrate(
             )  # fmt: skip
             result, done = merged(results, join=1), count
             if done < terrains:
-                _print_absent(result)
+                sums = np.asarray(result.penalties)[~result.invalid].sum(axis=0).tolist()
+                if absent := [name for name, value in zip(result.penalty_names, sums, strict=True) if not value]:
+                    print(
+                        f"In the first {result.invalid.size} episodes {', '.join(absent)} never occurred.", flush=True
+                    )
                 count = terrains
             elif _failing(result).sum() < _ENOUGH:
                 print(f"{_failing(result).sum()} of {result.invalid.size} episodes did not reach the goal.", flush=True)
@@ -131,21 +133,11 @@ def measured(result: RolloutResult) -> dict[str, Any]:
     }
 
 
-def _print_absent(result: RolloutResult) -> None:
-    valid = ~result.invalid
-    sums = np.asarray(result.penalties)[valid].sum(axis=0).tolist()
-    absent = [name for name, value in zip(result.penalty_names, sums, strict=True) if not value]
-    if absent:
-        print(f"In the first {valid.sum()} episodes {', '.join(absent)} never occurred.", flush=True)
-
-
 def _print_scales(report: dict[str, Any]) -> None:
-    failing, count = report["failing_episodes"], report["episodes"] - report["invalid_episodes"]
-    if report["scaled_by"] == "failing":
-        count = failing
-        print(f"Means over the {count} episodes on {report['terrains']} terrains that did not reach the goal:")
-    else:
-        print(f"Means over all {count} valid episodes, as only {failing} did not reach the goal, under {_ENOUGH}:")
+    failing, valid = report["failing_episodes"], report["episodes"] - report["invalid_episodes"]
+    count = failing if report["scaled_by"] == "failing" else valid
+    about = f"{report['terrains']} terrains ({failing} of {valid} valid episodes did not reach the goal)"
+    print(f"Means over {count} {report['scaled_by']} episodes on {about}:")
     for name, scale in report["scales"].items():
         hits = round(report["share_of_episodes_with"][name] * count)
         print(f"  {name:<14}{scale:12.4f}{f'  (in {hits} episodes alone)' if hits < _FEW else ''}")

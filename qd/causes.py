@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.ground import PATCHES, patches_at
+from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
-
-if TYPE_CHECKING:
-    from sim.spaces.base import TerrainSpace
 
 LEAST_HEIGHT = 0.03
 """A part that is nowhere so high or deep under the robot lies beside its way [m]."""
@@ -31,7 +30,7 @@ _FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is me
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """How a robot meets a part that lies alone on flat ground."""
+    """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
     kind: str
     """In a word or two: rise, drop, ridge, ditch and so on; docs/faults.md has all."""
@@ -76,9 +75,10 @@ class Effects:
     def way(self, part: int, half_width: float) -> tuple[float, bool]:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
         patches, (x, y) = self.patches[part], CrossingCfg.start
-        rows = _places((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
-        columns = _places((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
-        return on_the_way(self.heights[part], half_width), bool(patches[rows, columns].any())
+        first_row, last_row = patches_at((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
+        first, last = patches_at((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
+        changed = patches[first_row : last_row + 1, first : last + 1].any()
+        return on_the_way(self.heights[part], half_width), bool(changed)
 
     def shape(self, part: int, half_width: float) -> Shape:
         """The shape of a part; of one that changes the ground and no height on the way, its kind alone."""
@@ -88,13 +88,7 @@ class Effects:
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
 
 
-def _places(span: tuple[float, float], length: float, count: int) -> slice:
-    """Patches between two places [m] of an axis of some length [m], which so many divide evenly."""
-    first, last = patches_at(span, length, count)
-    return slice(first, last + 1)
-
-
-def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: "TerrainSpace") -> Effects:
+def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
     """What parts of a terrain do, each beside all others.
 
     Args:
@@ -102,8 +96,6 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: "Terrain
         parts: Their numbers.
         space: What the genes mean.
     """
-    from sim.bank import terrains_of  # with Warp: not for `--help`
-
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
     heights, ground = terrains_of(np.concatenate(rows), space)
     nothing = np.zeros((len(parts), *PATCHES), bool)
@@ -131,11 +123,10 @@ def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
     met = met[met[:, 0] == met[0, 0]]
     place = (int(met[0, 0]), int(met[np.argmax(steepness[*met.T]), 1]))
     left, right = _reach(heights, column, row, half_width)
+    slopes = {"slope_deg": steepness, "along_deg": along, "across_deg": across}
     numbers = {
         "height_m": height,
-        "slope_deg": _degrees(float(steepness[place])),
-        "along_deg": _degrees(float(along[place])),
-        "across_deg": _degrees(float(across[place])),
+        **{name: float(np.rad2deg(np.arctan(float(values[place])))) for name, values in slopes.items()},
         "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[place]), abs(along[place])))),
         "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
         "left_m": left,
@@ -151,7 +142,7 @@ def on_the_way(field: NDArray[np.float32], half_width: float) -> float:
 
 def _kind_of(shape: dict[str, float]) -> str:
     """The kind of a shape by the limits above; docs/faults.md has them as a table."""
-    raised, rises = shape["height_m"] > 0.0, shape["along_deg"] > 0.0
+    raised = shape["height_m"] > 0.0
     if abs(shape["height_m"]) < LEAST_HEIGHT:
         return "beside the way"
     if shape["slope_deg"] < GENTLE:
@@ -160,10 +151,10 @@ def _kind_of(shape: dict[str, float]) -> str:
         name, ends = "ridge" if raised else "ditch", sum(shape[side] < NARROW for side in ("left_m", "right_m"))
         if ends:
             return f"{name} end" if ends == 1 else "knob" if raised else "hole"
-        return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
-    if shape["oblique_deg"] > SIDEWAYS:
+    elif shape["oblique_deg"] > SIDEWAYS:
         return "side slope"
-    name = "rise" if rises else "drop"
+    else:
+        name = "rise" if shape["along_deg"] > 0.0 else "drop"
     return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
 
 
@@ -178,15 +169,11 @@ def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width
     """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
     centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
     first, near = round(CrossingCfg.start[0] / SPACING) + int(column), round(_NEAR / SPACING)
-    highest = field[centre - beside + int(row), first]
+    place = centre - beside + int(row)
+    highest = field[place, first]
     window = field[:, max(first - near, 0) : first + near + 1]
     low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
-    place = centre - beside + int(row)
     above, below = np.flatnonzero(low[place:]), np.flatnonzero(low[place::-1])
     left = place + int(above[0]) if len(above) else len(low)
     right = place - int(below[0]) if len(below) else -1
     return SPACING * (left - centre), SPACING * (centre - right)
-
-
-def _degrees(slope: float) -> float:
-    return float(np.rad2deg(np.arctan(slope)))

@@ -117,13 +117,12 @@ def any_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def fault_words(archive: Archive, *, what: str = "failing elite") -> list[str]:
-    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions.
+def _counted(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'s' * (count != 1)}"
 
-    Args:
-        archive: The elites.
-        what: What one of them is called.
-    """
+
+def fault_words(archive: Archive) -> list[str]:
+    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions."""
     faults, numbers = archive.faults, fault_numbers(archive)
     if faults is None or not numbers["failing"]:
         return []
@@ -131,40 +130,37 @@ def fault_words(archive: Archive, *, what: str = "failing elite") -> list[str]:
     if numbers["crossed_resolved"]:
         rate = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
         sentences.append(
-            f"{_counted(numbers['failing'], what)}; with contact resolved the controller fails on {rate} of those "
-            "that it crossed so: they are confirmed."
+            f"{_counted(numbers['failing'], 'failing elite')}; with contact resolved the controller fails on {rate} of "
+            "those that it crossed so: they are confirmed."
         )
     if numbers["mujoco_c"]["crossed"]:
         rate = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])
         sentences.append(f"In plain MuJoCo C it fails on {rate} of those that it crossed there.")
     if faults.certifiers:
-        count = count_faults(archive)
-        if count is not None:
+        if (count := count_faults(archive)) is not None:
             terrains = f"{_counted(count, 'fault')}: terrains that {any_of(faults.certifiers)} crosses"
             alone = " No specialist of this search was trained." if numbers["faults"] is None else ""
             sentences.append(f"{terrains} and this controller does not.{alone}")
         rest = int((archive.failing & ~archive.certified).sum())
-        sentences.append(f"{_counted(rest, what)} {'is' if rest == 1 else 'are'} not known to be passable.")
+        sentences.append(f"{_counted(rest, 'failing elite')} {'is' if rest == 1 else 'are'} not known to be passable.")
     return sentences
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'s' * (count != 1)}"
 
 
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
-    faults = archive.faults
-    if faults is None:
-        return []
-    kinds = {
-        "With contact resolved": faults.resolved_outcomes[number],
-        "In MuJoCo C": faults.mujoco_c_outcomes[number],
-    }
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    kinds = [
+        ("With contact resolved", faults.resolved_outcomes[number]),
+        ("In MuJoCo C", faults.mujoco_c_outcomes[number]),
+    ]
     for column, name in enumerate(faults.certifiers):
-        kinds[name] = faults.certifier_outcomes[number, column]
-        kinds[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, column]
-    sentences = [f"{what}: {_goal_words(counts)} reach the goal." for what, counts in kinds.items() if counts.any()]
+        kinds.append((name, faults.certifier_outcomes[number, column]))
+        kinds.append((f"{name} with contact resolved", faults.certifier_resolved_outcomes[number, column]))
+    sentences = [
+        f"{kind}: {rate_words(int(counts[0]), int(counts.sum() - counts[_INVALID]))} reach the goal."
+        for kind, counts in kinds
+        if counts.any()
+    ]
     if not sentences:
         return []
     by = [name for name, certifies in zip(faults.certifiers, faults.certificates()[number], strict=True) if certifies]
@@ -178,10 +174,6 @@ def elite_words(archive: Archive, number: int) -> list[str]:
         confirmed = "" if archive.confirmed[number] else "not "
         sentences.append(f"It is {confirmed}confirmed, and not known to be passable.")
     return sentences
-
-
-def _goal_words(counts: NDArray[np.int64]) -> str:
-    return rate_words(int(counts[0]), int(counts.sum() - counts[_INVALID]))
 
 
 def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:

@@ -6,7 +6,6 @@ Modes: failing elites on which the controller struggles in the same way and whos
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,7 +56,7 @@ def verdicts_of(archive: Archive) -> NDArray[np.int64]:
 
 
 def verdict_of(archive: Archive, number: int) -> str:
-    """The verdict on one elite: empty if it does not fail."""
+    """The verdict on one elite in a word."""
     return VERDICTS[int(verdicts_of(archive)[number])]
 
 
@@ -75,7 +74,7 @@ class Elites:
     fresh: NDArray[np.bool_]
     """Whether the values are of fresh episodes, shape (N,)."""
     cell: NDArray[np.int64]
-    """Cell that these episodes fall into, shape (N,); elites whose luck put them apart may share one."""
+    """Cell that these episodes fall into, shape (N,)."""
     fitness: NDArray[np.float64]
     """Shape (N,)."""
     ratios: NDArray[np.float64]
@@ -96,7 +95,6 @@ class Elites:
     """Place in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found it say whether it fails."""
 
     def __len__(self) -> int:
-        """N."""
         return len(self.numbers)
 
     @property
@@ -128,20 +126,14 @@ class Elites:
         return round(float(getattr(self, rate)[place]) * int(self.counted[place]))
 
     def by_severity(self) -> NDArray[np.int64]:
-        """Rows by how badly the robot fares, shape (N,), the worst first.
+        """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
 
-        Faults come before certified, confirmed, failing and other elites, of these the ones with the lowest goal rate,
-        the most base collisions, the most falls and the highest fitness. Fitness alone does not order by failure: it
-        prizes trouble that is the same in every episode.
+        Fitness alone does not order by failure: it prizes trouble that is the same in every episode.
         """
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
     def most_reproducible(self, count: int) -> list[int]:
-        """Numbers of the terrains whose penalties vary least between episodes, for their size; the steadiest first.
-
-        A terrain on which the controller fails comes before one that it crosses, and one whose fresh episodes landed in
-        its cell or beside it before one where they did not.
-        """
+        """Numbers of the terrains whose penalties vary least between episodes, failing and reproduced ones first."""
         order = np.lexsort((self.variation, ~self.reproduced, ~self.failing))
         return self.numbers[order[:count]].tolist()
 
@@ -162,8 +154,8 @@ def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
     rows = np.arange(len(archive))
     if (fresh := archive.fresh) is not None:
         is_fresh, reproduced = fresh.valid, fresh.reproduced | ~fresh.valid
-        for name, found in values.items():
-            values[name] = np.where(is_fresh.reshape(-1, *[1] * (found.ndim - 1)), getattr(fresh, name), found)
+        for name, value in values.items():
+            values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
         rows = np.flatnonzero(is_fresh) if judged else rows
     values = {name: value[rows] for name, value in values.items()}
     means, stds = (values.pop(name).sum(axis=1) for name in ("penalty_mean", "penalty_std"))
@@ -189,22 +181,12 @@ def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.i
         genes: Shape (N, num_genes).
         space: What they mean.
     """
-    banks = [heights_of(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
-    if not banks:
+    if not len(genes):
         return np.zeros(0, np.int64)
+    banks = [heights_of(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
     maps = np.concatenate([bank.reshape(len(bank), -1).astype(np.float64) for bank in banks])
-    return joined(rms_distances(maps, maps) < KIN_M)
-
-
-def joined(kin: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Number of the group that each of N belongs to, from 0 in the order of its first member, shape (N,).
-
-    Args:
-        kin: Which are joined directly, shape (N, N).
-    """
-    _, labels = connected_components(kin, directed=False)
-    _, first, places = np.unique(labels, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[places].astype(np.int64)
+    _, families = connected_components(rms_distances(maps, maps) < KIN_M, directed=False)
+    return families.astype(np.int64)
 
 
 def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,8 +271,8 @@ def find_modes(elites: Elites) -> Modes:
     :data:`TOLERANCE` of the best: of divisions that separate about as well, the finer one says more.
     """
     features = np.column_stack([elites.ratios, elites.goal_rate, elites.collision_rate, elites.fallen_rate])
-    distances = squareform(pdist(features))
-    labels, silhouettes = np.ones(len(elites), np.int64), {}
+    distances, silhouettes = squareform(pdist(features)), {}
+    labels = np.ones(len(elites), np.int64)
     if len(elites) >= _MIN_ELITES and distances.any():
         tree = linkage(features, "ward")
         divisions = {count: fcluster(tree, count, "maxclust") for count in range(2, MAX_MODES + 1)}
@@ -336,17 +318,13 @@ class Ranking:
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
 
-    @cached_property
-    def _severity(self) -> NDArray[np.int64]:
-        return self.elites.by_severity()
-
     def order(self, by: str = "modes") -> NDArray[np.int64]:
         """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
 
         ``modes`` begins with the worst terrain of each mode that has one on which the controller fails, no two of one
         family where that can be had. The worst failing terrain of each other family follows, then the rest.
         """
-        severity = self._severity
+        severity = self.elites.by_severity()
         if by == "fault":
             return severity
         if by == "modes":
@@ -356,18 +334,17 @@ class Ranking:
         return severity[np.argsort(sign * values[severity], kind="stable")]
 
     def _leading(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
-        failing = severity[self.elites.failing[severity]]
-        labels, families = self.modes.labels, set[int]()
-        leading: list[int] = []
-        for mode in dict.fromkeys(labels[failing].tolist()):
-            of_mode = failing[labels[failing] == mode].tolist()
-            leading.append(next((row for row in of_mode if int(self.families[row]) not in families), of_mode[0]))
-            families.add(int(self.families[leading[-1]]))
-        for row in failing.tolist():
-            if int(self.families[row]) not in families:
-                leading.append(row)
-                families.add(int(self.families[row]))
-        return np.array([*leading, *np.setdiff1d(severity, leading, assume_unique=True)], dtype=np.int64)
+        failing = severity[self.elites.failing[severity]].tolist()
+        labels, families = self.modes.labels.tolist(), self.families.tolist()
+        leading: dict[int, int] = {}  # families by row
+        for mode in dict.fromkeys(labels[row] for row in failing):
+            of_mode = [row for row in failing if labels[row] == mode]
+            leader = next((row for row in of_mode if families[row] not in leading.values()), of_mode[0])
+            leading[leader] = families[leader]
+        for row in failing:
+            if families[row] not in leading.values():
+                leading[row] = families[row]
+        return np.array([*leading, *np.setdiff1d(severity, [*leading], assume_unique=True)], dtype=np.int64)
 
     def mode_of(self, place: int) -> Mode | None:
         """The mode of the elite in a row; None of one that does not fail."""
@@ -393,6 +370,6 @@ def rank(archive: Archive, space: TerrainSpace, *, judged: bool = False) -> Rank
     """
     elites = elites_of(archive, judged=judged)
     families = families_of(archive.genes[elites.numbers], space)
-    places = {int(family): place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()]), start=1)}
-    numbers = np.array([places[int(family)] for family in families], dtype=np.int64)
+    by_worst = [*dict.fromkeys(families[elites.by_severity()].tolist())]
+    numbers = 1 + np.argsort(by_worst)[families]
     return Ranking(elites=elites, modes=failure_modes(elites), families=numbers)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from qd.archive import (
     ARCHIVE_FILE,
-    OUTCOMES,
     Archive,
     FaultCounts,
     FreshValues,
@@ -76,13 +75,7 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
 
 
 def drawn_elites(archive: Archive, most: int, seed: int) -> Archive:
-    """An archive of some elites, drawn at random without replacement; all of them where there are no more than wanted.
-
-    Args:
-        archive: The elites.
-        most: How many to draw.
-        seed: The search's seed; the iterations done are drawn with too.
-    """
+    """An archive of ``most`` elites, drawn by the search's seed and its iterations; all if there are no more."""
     if len(archive) <= most:
         return archive
     rng = np.random.default_rng(np.random.SeedSequence([seed, archive.iterations], spawn_key=(_DRAW_STREAM,)))
@@ -114,20 +107,9 @@ def fresh_values(
     times = -(-FRESH_EPISODES // num_replicas)
     seeds = elite_seeds(archive, seed, times, stream=_FRESH_STREAM)
     result = evaluate(archive.genes.repeat(times, axis=0), seeds)
-    if result.invalid.shape[1] != num_replicas:
-        raise ValueError(f"evaluate must give {num_replicas} episodes, got {result.invalid.shape[1]}")
-    return _compared(archive, _grouped(result, times), fitness)
-
-
-def _grouped(result: RolloutResult, times: int) -> RolloutResult:
-    """A result whose terrains come ``times`` times in succession as one of 40 episodes a terrain."""
     arrays = {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
     grouped = {name: v.reshape(-1, times * v.shape[1], *v.shape[2:])[:, :FRESH_EPISODES] for name, v in arrays.items()}
-    return replace(result, **grouped)
-
-
-def _compared(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> FreshValues:
-    cells = archive.cells
+    result, cells = replace(result, **grouped), archive.cells
     fresh = evaluation_of(result, cells, fitness)
     collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
     cell = cells.cell_of(fresh.ratios, collided)
@@ -144,11 +126,10 @@ def _compared(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> F
 
 def outcome_counts(result: RolloutResult) -> NDArray[np.int64]:
     """Episodes of each terrain by :data:`qd.archive.OUTCOMES`, shape (num_terrains, 4)."""
-    counts = {name: flags.sum(axis=1) for name, flags in (
-        ("goal", result.reached_goal), ("base_collision", result.base_collision), ("invalid", result.invalid),
-    )}  # fmt: skip
-    counts["other"] = result.invalid.shape[1] - sum(counts.values())
-    return np.stack([counts[name] for name in OUTCOMES], axis=1).astype(np.int64)
+    goal, collided, invalid = (
+        flags.sum(axis=1) for flags in (result.reached_goal, result.base_collision, result.invalid)
+    )
+    return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,19 +164,16 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
         robot: The robot, if its settings file must be named.
         policy: The controller, if it has moved or is code.
         space: The terrain space, if it is code.
-
-    Raises:
-        FileNotFoundError: If there is no run.
     """
     cfg = RunDirectory(run).read_cfg()
     if space is not None:
         load_space(space)  # one of a user's own, which the run's name then finds
-    body = robot_of(as_settings(cfg), robot, run)
-    controller = own_policy(run, cfg, body) if policy is None else spec_of(policy, body)
-    if not is_searched(cfg, controller, body):
+    robot_cfg = robot_of(as_settings(cfg), robot, run)
+    controller = own_policy(run, cfg, robot_cfg) if policy is None else spec_of(policy, robot_cfg)
+    if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
-    where = get_space(cfg.space, cfg.space_sha256).name  # where its code is now
-    return Search(run=run, cfg=cfg, robot=body, policy=controller, space=where)
+    space_now = get_space(cfg.space, cfg.space_sha256).name  # where its code is now
+    return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=space_now)
 
 
 def panel_of(robot: RobotCfg) -> dict[str, str]:
@@ -222,30 +200,30 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
             raise ValueError(f"certifier {name} does not fit {search.robot.name}: {error}") from error
 
 
-def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
-    """The archive after its controller has crossed some elites with contact resolved.
+def confirm(
+    archive: Archive,
+    rows: NDArray[np.int64],
+    search: Search,
+    crossings: Crossings,
+    how: Literal["resolved", "mujoco_c"] = "resolved",
+) -> Archive:
+    """The archive after its controller has crossed some elites with contact resolved, or in MuJoCo C.
 
     Args:
         archive: With fresh values.
-        rows: Numbers of the elites.
+        rows: Numbers of the elites. Up to 100 of them, which the seed draws, are crossed in MuJoCo C.
         search: The search that found them.
         crossings: What crosses terrains.
+        how: The episodes begin alike.
     """
+    if how == "mujoco_c":
+        order = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows]
+        rows = np.sort(rows[np.argsort(order, kind="stable")][:_MOST_IN_MUJOCO_C])
+    label = "contact resolved" if how == "resolved" else "MuJoCo C"
+    counts = _cross(archive, rows, search, crossings, search.policy, how, _CONFIRM_STREAM, label)
     faults = archive.faults or FaultCounts.none_of(len(archive))
-    counts = _cross(archive, rows, search, crossings, search.policy, "resolved", _CONFIRM_STREAM, "contact resolved")
-    return replace(archive, faults=replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts)))
-
-
-def confirm_in_mujoco_c(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
-    """The archive after its controller has crossed up to 100 of some elites in MuJoCo C; the seed draws them.
-
-    The episodes begin as those of :func:`confirm` do, which has the arguments.
-    """
-    faults = archive.faults or FaultCounts.none_of(len(archive))
-    order = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows]
-    drawn = np.sort(rows[np.argsort(order, kind="stable")][:_MOST_IN_MUJOCO_C])
-    counts = _cross(archive, drawn, search, crossings, search.policy, "mujoco_c", _CONFIRM_STREAM, "MuJoCo C")
-    return replace(archive, faults=replace(faults, mujoco_c_outcomes=_put(faults.mujoco_c_outcomes, drawn, counts)))
+    column = f"{how}_outcomes"
+    return replace(archive, faults=replace(faults, **{column: _put(getattr(faults, column), rows, counts)}))
 
 
 def certify(
@@ -265,31 +243,27 @@ def certify(
         crossings: What crosses terrains.
     """
     faults = archive.faults or FaultCounts.none_of(len(archive))
-    kinds = (faults.certifier_outcomes, faults.certifier_resolved_outcomes)
-    columns = {
-        name: (digest, *(counts[:, place] for counts in kinds))
-        for place, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
-    }
+    searched = dict(zip(faults.certifiers, faults.certifier_outcomes.swapaxes(0, 1), strict=True))
+    resolved = dict(zip(faults.certifiers, faults.certifier_resolved_outcomes.swapaxes(0, 1), strict=True))
+    hashes = dict(zip(faults.certifiers, faults.certifier_sha256, strict=True))
     for name, policy in certifiers.items():
-        digest, nothing = certifier_hash(name, policy), np.zeros_like(faults.resolved_outcomes)
-        before = columns.get(name, ("", nothing, nothing))
-        _, searched, resolved = before if before[0] == digest else ("", nothing, nothing)
+        digest = certifier_hash(name, policy)
+        if hashes.get(name) != digest:
+            searched[name] = resolved[name] = np.zeros_like(faults.resolved_outcomes)
         counts = _cross(archive, rows, search, crossings, policy, "searched", _CERTIFY_STREAM, name)
-        worth = rows[goal_rates(counts) >= FAILING_GOAL_RATE]
-        finer = _cross(
-            archive, worth, search, crossings, policy, "resolved", _CERTIFY_RESOLVED_STREAM, f"{name}, contact resolved"
+        crossed = rows[goal_rates(counts) >= FAILING_GOAL_RATE]
+        label = f"{name}, contact resolved"
+        finer = _cross(archive, crossed, search, crossings, policy, "resolved", _CERTIFY_RESOLVED_STREAM, label)
+        hashes[name], searched[name] = digest, _put(searched[name], rows, counts)
+        resolved[name] = _put(_put(resolved[name], rows, 0), crossed, finer)
+    if hashes:
+        faults = replace(
+            faults,
+            certifiers=tuple(hashes),
+            certifier_sha256=tuple(hashes.values()),
+            certifier_outcomes=np.stack([*searched.values()], axis=1),
+            certifier_resolved_outcomes=np.stack([*resolved.values()], axis=1),
         )
-        columns[name] = (digest, _put(searched, rows, counts), _put(_put(resolved, rows, 0), worth, finer))
-    if not columns:
-        return replace(archive, faults=faults)
-    hashes, searched_all, resolved_all = zip(*columns.values(), strict=True)
-    faults = replace(
-        faults,
-        certifiers=tuple(columns),
-        certifier_sha256=hashes,
-        certifier_outcomes=np.stack(searched_all, axis=1),
-        certifier_resolved_outcomes=np.stack(resolved_all, axis=1),
-    )
     return replace(archive, faults=faults)
 
 
@@ -326,16 +300,13 @@ def seen_by(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[s
     assert archive.faults is not None
     marks, columns = np.array(marks_of(archive.genes)), []
     for name in archive.faults.certifiers:
-        policy = certifiers.get(name)
-        trained_on = set() if policy is None else recorded_marks(policy)
-        if policy is None or not (trained_on or _has_record(policy)):
+        if (policy := certifiers.get(name)) is None:
+            return None
+        trained_on, files = recorded_marks(policy), ControllerSpec.parse(policy).files
+        if not trained_on and not any(file.with_suffix(".train.json").is_file() for file in files):
             return None
         columns.append(np.isin(families, families[np.isin(marks, [*trained_on])]))
     return np.stack(columns, axis=1) if columns else None
-
-
-def _has_record(policy: str) -> bool:
-    return any(file.with_suffix(".train.json").is_file() for file in ControllerSpec.parse(policy).files)
 
 
 def judge(
@@ -365,14 +336,11 @@ def judge(
 
     Returns:
         The judged archive.
-
-    Raises:
-        FileNotFoundError: If there is no run.
-        EvaluatorError: If a worker is lost; what was crossed is kept.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     if seed is not None and seed < 0:
         raise ValueError(f"seed must be at least 0, got {seed}")
+    fresh_seed = search.cfg.seed if seed is None else seed
     check_policy(search.policy, search.robot, compute.device)
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if "others" in stages:
@@ -380,6 +348,12 @@ def judge(
     with claimed(run), Crossings(
         search.robot, compute, cache=run / CROSSINGS_FOLDER, open_evaluator=open_evaluator
     ) as crossings:  # fmt: skip
+
+        def cross_fresh(terrains: NDArray, seeds: NDArray) -> RolloutResult:
+            return crossings.cross(
+                search.policy, terrains, seeds, replicas=FRESH_EPISODES, space=search.space, label="fresh episodes"
+            )
+
         archive = search.read_archive()
         if archive.fresh is None and "fresh" not in stages:
             raise ValueError(f"{run} must have fresh episodes of its elites, got none: begin with the stage fresh")
@@ -387,39 +361,28 @@ def judge(
         for stage in stages:
             failing = np.flatnonzero(archive.failing)
             if stage == "fresh":
-                archive = _evaluated_again(archive, search, crossings, search.cfg.seed if seed is None else seed)
-            elif stage == "resolved":
-                archive = confirm(archive, failing, search, crossings)
-            elif stage == "mujoco_c":
-                archive = confirm_in_mujoco_c(archive, failing, search, crossings)
-            else:
+                fresh = fresh_values(
+                    archive, cross_fresh, search.cfg.fitness, num_replicas=FRESH_EPISODES, seed=fresh_seed
+                )
+                archive = archive.corrected_by(fresh)
+            elif stage == "others":
                 archive = certify(archive, failing, certifiers, search, crossings)
+            else:
+                archive = confirm(archive, failing, search, crossings, stage)
             if families is None or stage == "fresh":
                 families = families_of(archive.genes, get_space(search.cfg.space, search.cfg.space_sha256))
-            by = origin_of(compute.device, search.cfg.seed if seed is None else seed, compute.workers)
-            _write(archive, families, search, certifiers, {stage: {**by, **identity(search.robot, search.policy)}})
+            origin = origin_of(compute.device, fresh_seed, compute.workers) | identity(search.robot, search.policy)
+            _write(archive, families, search, certifiers, {stage: origin})
     for line in fault_words(archive):
         print(line)
     return archive
-
-
-def _evaluated_again(archive: Archive, search: Search, crossings: Crossings, seed: int) -> Archive:
-    """The archive with what 40 fresh episodes of each elite say."""
-
-    def evaluate(terrains: NDArray, seeds: NDArray) -> RolloutResult:
-        return crossings.cross(
-            search.policy, terrains, seeds, replicas=FRESH_EPISODES, space=search.space, label="fresh episodes"
-        )
-
-    fresh = fresh_values(archive, evaluate, search.cfg.fitness, num_replicas=FRESH_EPISODES, seed=seed)
-    return archive.corrected_by(fresh)
 
 
 def _write(
     archive: Archive, families: NDArray[np.int64], search: Search, certifiers: Mapping[str, str], by: dict[str, Any]
 ) -> None:
     """Writes archive, numbers and figures of a run."""
-    run, file = RunDirectory(search.run), search.run / SUMMARY_FILE
+    file = search.run / SUMMARY_FILE
     assert archive.fresh is not None
     seen = None if archive.faults is None else seen_by(archive, families, certifiers)
     numbers = read_json(file) if file.exists() else {}
@@ -428,4 +391,4 @@ def _write(
     write_archive(search.run / ARCHIVE_FILE, archive)
     write_atomically(file, to_json(numbers))
     if (search.run / METRICS_FILE).exists():
-        figures.write_figures(search.run, archive, run.read_metrics())
+        figures.write_figures(search.run, archive, RunDirectory(search.run).read_metrics())

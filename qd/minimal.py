@@ -73,13 +73,9 @@ class Case:
         """All its parts."""
         return tuple(sorted(self.parts))
 
-    def goal_rate(self, trial: Trial) -> float:
-        """Share of the valid episodes that reached the goal; NaN if too many are invalid."""
-        return float(goal_rates(self.counts[trial]))
-
     def fails(self, trial: Trial) -> bool:
         """Whether the controller fails it; too many invalid episodes say nothing."""
-        return self.goal_rate(trial) < FAILING_GOAL_RATE
+        return bool(goal_rates(self.counts[trial]) < FAILING_GOAL_RATE)
 
     def known_best(self, parts: Parts) -> Trial:
         """The fresh episodes of some parts if they were crossed, else the 20."""
@@ -125,17 +121,19 @@ def find_minimal(case: Case) -> Steps:
     parts = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
     scalable = case.scalable and not set(parts) <= set(case.flat)
     scale, passing = (yield from _scaled(case, parts)) if scalable else (None, None)
-    others = {part: tuple(other for other in parts if other != part) for part in parts}
-    trials = [trial for trial in case.counts if trial.scale != 1.0 and trial.parts == parts]
     return Minimal(
         parts=parts,
         counts=case.counts[Trial(parts, fresh=True)],
-        without={part: case.counts[case.known_best(rest)] for part, rest in others.items()},
+        without={part: case.counts[case.known_best(_rest(parts, part))] for part in parts},
         scale=scale,
         passing_scale=passing,
-        scales={trial.scale: case.counts[trial] for trial in trials},
+        scales={trial.scale: case.counts[trial] for trial in case.counts if trial.scale != 1.0},
         subsets=len({trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}),
     )
+
+
+def _rest(parts: Parts, part: int) -> Parts:
+    return tuple(other for other in parts if other != part)
 
 
 def _missing(case: Case, *trials: Trial) -> Steps:
@@ -150,7 +148,7 @@ def _exhaustive(case: Case) -> Steps:
         trials = [Trial(parts) for parts in combinations(case.whole, size)]
         yield from _missing(case, *trials)
         failing = [trial for trial in trials if case.fails(trial)]
-        for trial in sorted(failing, key=lambda trial: (case.goal_rate(trial), trial.parts)):
+        for trial in sorted(failing, key=lambda trial: (goal_rates(case.counts[trial]), trial.parts)):
             fresh = trial._replace(fresh=True)
             yield from _missing(case, fresh)
             if case.fails(fresh):
@@ -166,7 +164,7 @@ def _greedy(case: Case) -> Steps:
             part, place = case.parts[place % len(case.parts)], place + 1
             if part not in parts:
                 continue
-            rest = tuple(other for other in parts if other != part)
+            rest = _rest(parts, part)
             yield from _missing(case, case.known_best(rest))
             parts, needed = (rest, 0) if case.fails(case.known_best(rest)) else (parts, needed + 1)
         fresh = Trial(parts, fresh=True)
@@ -208,10 +206,9 @@ def case_of(
         on_gpu: Whether robots cross on a GPU.
     """
     genes = archive.genes[number]
-    count = len(space.parts(genes))
-    if not count:
+    if not (words := space.parts(genes)):
         raise ValueError(f"space must have parts(genes) and without(genes, parts), got {space.name} without parts")
-    effects = effects_of(genes, range(count), space)
+    effects = effects_of(genes, range(len(words)), space)
     parts = np.flatnonzero(effects.changes(LEAST_EFFECT_M)).tolist()
     if how == "exhaustive" and len(parts) > MOST_PARTS:
         raise ValueError(f"how must be greedy with over {MOST_PARTS} parts, got {len(parts)} of elite {number}")
@@ -227,7 +224,7 @@ def case_of(
 def take_apart(
     archive: Archive, cases: Mapping[int, Case], space: TerrainSpace, search: Search, crossings: Crossings
 ) -> dict[int, Minimal]:
-    """Finds the minimal terrains of some elites, all of them together.
+    """Finds the minimal terrains of some elites, all of them together, by number of the elite.
 
     All subsets of an elite are crossed from the same starts; the fresh episodes have others. Starts follow from the
     search's seed and from what names the elite.
@@ -238,16 +235,11 @@ def take_apart(
         space: Of the genes.
         search: Its controller crosses them.
         crossings: What crosses terrains.
-
-    Returns:
-        By number of the elite, rising.
     """
-    seeds = {
-        fresh: elite_seeds(archive, search.cfg.seed, Trial((), fresh=fresh).rows, stream=stream).reshape(
-            len(archive), -1
-        )
-        for fresh, stream in ((False, _STREAM), (True, _FRESH_STREAM))
-    }
+    seeds = {}
+    for fresh, stream in ((False, _STREAM), (True, _FRESH_STREAM)):
+        times = Trial((), fresh=fresh).rows
+        seeds[fresh] = elite_seeds(archive, search.cfg.seed, times, stream=stream).reshape(-1, times)
     subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values() if case.how == "exhaustive"]
     most_rows = max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}

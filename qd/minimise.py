@@ -12,15 +12,8 @@ from numpy.typing import NDArray
 from qd.archive import OUTCOMES, Archive, goal_rates
 from qd.causes import effects_of
 from qd.faults import judgement, rate_of
-from qd.groups import VERDICTS, verdict_of, verdicts_of
-from qd.judge import (
-    CROSSINGS_FOLDER,
-    certifiers_of,
-    certify,
-    check_certifiers,
-    confirm,
-    find_search,
-)
+from qd.groups import verdict_of
+from qd.judge import CROSSINGS_FOLDER, certifiers_of, certify, check_certifiers, confirm, find_search
 from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
 from qd.run.directory import claimed
 from qd.show.figures import save_figure
@@ -53,20 +46,17 @@ class MinimalFound:
     genes: dict[int, NDArray[np.float32]]
     """By number of the elite, each of shape (num_genes,)."""
 
-    def chosen(self, text: str, whose: object) -> list[int]:
+    def chosen(self, text: str, run: object) -> list[int]:
         """Numbers of elites that have a minimal terrain, as a command line names them: some, or ``all``.
 
         Args:
             text: Numbers apart by spaces or commas, or ``all``.
-            whose: Their run, for the message.
+            run: Whose they are, for the message.
         """
         known = list(map(str, self.genes))
-        words = split_words([text])
-        words = known if words == ["all"] else words
-        unknown = [word for word in words if word not in known]
-        if unknown or not words:
-            named = ", ".join(unknown) or repr(text)
-            raise ValueError(f"{whose} has no minimal terrain of elite {named}: expected all, or {', '.join(known)}")
+        words = known if text.strip() == "all" else split_words([text])
+        if not words or not set(words) <= set(known):
+            raise ValueError(f"{run} has no minimal terrain of elite {text}: expected all, or {', '.join(known)}")
         return [int(word) for word in dict.fromkeys(words)]
 
     def entry(self, number: int) -> dict[str, Any]:
@@ -113,10 +103,6 @@ def minimise(
 
     Returns:
         What the run has now; None without a failing elite.
-
-    Raises:
-        FileNotFoundError: If there is no run.
-        EvaluatorError: If a worker is lost; what was crossed is kept.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     check_policy(search.policy, search.robot, compute.device)
@@ -130,12 +116,10 @@ def minimise(
     ) as crossings:  # fmt: skip
         archive = search.read_archive()
         numbers = _failing(archive, elite, run, _MOST_ELITES[kind])
-        cases = {
-            number: case_of(archive, number, terrain_space, half_width, how, on_gpu=kind == "cuda")
-            for number in numbers
-        }
+        on_gpu = kind == "cuda"
+        cases = {n: case_of(archive, n, terrain_space, half_width, how, on_gpu=on_gpu) for n in numbers}
         minima = take_apart(archive, cases, terrain_space, search, crossings)
-        elites = as_elites(archive, minima, terrain_space)
+        elites = _as_elites(archive, minima, terrain_space)
         if judged:
             rows = np.arange(len(elites))
             elites = certify(confirm(elites, rows, search, crossings), rows, certifiers, search, crossings)
@@ -164,26 +148,20 @@ def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[
     """Numbers of the failing elites that are named, or of some: faults first."""
     if archive.fresh is None:
         raise ValueError(f"{run} must have fresh episodes of its elites, got none: let `faultline judge` cross them")
-    failing, verdicts = np.flatnonzero(archive.failing).tolist(), verdicts_of(archive)
+    failing = np.flatnonzero(archive.failing).tolist()
     if elite is None:
-        order = [VERDICTS.index(name) for name in ("fault", "confirmed", "certified", "failing")]
-        return sorted(sorted(failing, key=lambda number: (order.index(verdicts[number]), number))[:most])
+        order = ("fault", "confirmed", "certified", "failing")
+        return sorted(sorted(failing, key=lambda number: order.index(verdict_of(archive, number)))[:most])
     if elite.strip() == "all":
         return failing
     numbers = chosen_elites(elite, len(archive), run)
     if crossed := [number for number in numbers if number not in failing]:
-        raise ValueError(f"elite must name failing elites of {run}, got {', '.join(map(str, crossed))}, not failing")
+        raise ValueError(f"elite must name failing elites of {run}, got {', '.join(map(str, crossed))}")
     return numbers
 
 
-def as_elites(archive: Archive, minima: Mapping[int, Minimal], space: TerrainSpace) -> Archive:
-    """Minimal terrains as elites whose fresh episodes are their own; of the rest only the names hold.
-
-    Args:
-        archive: The elites that they are of.
-        minima: By number of the elite, rising.
-        space: Of the genes.
-    """
+def _as_elites(archive: Archive, minima: Mapping[int, Minimal], space: TerrainSpace) -> Archive:
+    """Minimal terrains as elites whose fresh episodes are their own; of the rest only the names hold."""
     rows = archive.rows(np.array([*minima], np.int64))
     assert rows.fresh is not None
     counts = np.array([minimal.counts for minimal in minima.values()], np.int64).reshape(-1, len(OUTCOMES))
@@ -235,7 +213,7 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     causes = Counter(entry["cause"]["kind"] for entry in entries if entry["cause"])
     verdicts = Counter(entry["verdict"] for entry in entries)
     judged = any(entry["resolved"] for entry in entries)
-    names = {one["controller"] for entry in entries for one in entry["certificates"]}
+    certifiers = {certificate["controller"] for entry in entries for certificate in entry["certificates"]}
     return {
         "minimal": len(entries),
         "bumps_histogram": {str(size): count for size, count in sorted(Counter(sizes).items())},
@@ -245,7 +223,7 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "confirmed": verdicts["confirmed"] + verdicts["fault"] if judged else None,
         "certified": verdicts["certified"] + verdicts["fault"] if judged else None,
         "faults": verdicts["fault"] if judged else None,
-        "certifiers": sorted(names),
+        "certifiers": sorted(certifiers),
     }
 
 
@@ -262,21 +240,19 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalFound | None:
     try:
         numbers, arrays = read_json(file), read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
         entries, genes = numbers["elites"], arrays["genes"]
-        if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or len(entries) != len(genes):
+        shape = (len(entries), archive.genes.shape[1])
+        if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
             raise ValueError(f"{NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
-        if not all(set(_ENTRY) <= set(entry) for entry in entries) or genes.shape[1:] != archive.genes.shape[1:]:
-            raise ValueError(f"expected {', '.join(_ENTRY)} of each, and genes of shape {archive.genes.shape[1:]}")
+        if not all(set(_ENTRY) <= set(entry) for entry in entries):
+            raise ValueError(f"expected {', '.join(_ENTRY)} of each")
     except Exception as error:  # a damaged zip archive can fail with anything
         raise ValueError(f"{folder} must have minimal terrains of its archive: {error}: make them again") from None
-    rows = [row for row, entry in enumerate(entries) if _is_in(archive, entry)]
+    # A search that went on may have found others of these numbers.
+    names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
+    rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
     if not rows:
         return None
-    kept = [entries[row] for row in rows]
-    return MinimalFound(numbers=numbers | {"elites": kept}, genes={entries[row]["elite"]: genes[row] for row in rows})
-
-
-def _is_in(archive: Archive, entry: dict[str, Any]) -> bool:
-    """Whether an elite is still the one of that number; a search that went on may have found others."""
-    number = entry["elite"]
-    exists = 0 <= number < len(archive)
-    return exists and (archive.cell[number], archive.iteration[number]) == (entry["cell"], entry["iteration"])
+    return MinimalFound(
+        numbers=numbers | {"elites": [entries[row] for row in rows]},
+        genes={entries[row]["elite"]: genes[row] for row in rows},
+    )

@@ -2,20 +2,17 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sim.bank import terrains_of
 from sim.files.figures import new_figure
 from sim.maps.picture import draw_heights
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from sim.spaces.base import TerrainSpace
+from sim.spaces.base import TerrainSpace
 
 _SHOWN = 12  # terrains of the gallery
 _COLUMNS = 3
@@ -26,9 +23,9 @@ def draw_minimal(
     robot: str,
     numbers: dict[str, Any],
     genes: Mapping[int, NDArray[np.float32]],
-    space: "TerrainSpace",
+    space: TerrainSpace,
     most: int = _SHOWN,
-) -> "Figure":
+) -> Figure:
     """How many parts failures take, by the kind of the cause, and some minimal terrains from above.
 
     Of every kind of cause the gallery has one terrain before it has a second of another.
@@ -61,30 +58,26 @@ def draw_minimal(
 
 def _gallery(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The entries, the first of each kind of cause first."""
-    seen: dict[str, int] = {}
-    order = []
-    for place, entry in enumerate(entries):
+    seen, turns = Counter(), []
+    for entry in entries:
         kind = entry["cause"]["kind"] if entry["cause"] else ""
-        seen[kind] = seen.get(kind, 0) + 1
-        order.append((seen[kind], place))
-    return [entries[place] for _, place in sorted(order)]
+        seen[kind] += 1
+        turns.append(seen[kind])
+    return [entries[place] for place in np.argsort(turns, kind="stable")]
 
 
-def _draw_histogram(axes: "Axes", numbers: dict[str, Any]) -> None:
+def _draw_histogram(axes: Axes, numbers: dict[str, Any]) -> None:
     """Terrains by the number of their parts, stacked by the kind of the cause."""
     entries = numbers["elites"]
     sizes = np.arange(max(len(entry["bumps"]) for entry in entries) + 1)
     bottom = np.zeros(len(sizes))
     kinds = [kind for kind, _ in Counter((entry["cause"] or {}).get("kind") for entry in entries).most_common()]
     for place, kind in enumerate(kinds):
-        own = [len(entry["bumps"]) for entry in entries if (entry["cause"] or {}).get("kind") == kind]
-        counts = np.bincount(own, minlength=len(sizes))
-        look: dict[str, Any] = {
-            "color": _COLORS[place % len(_COLORS)],
-            "hatch": "//" * (place // len(_COLORS)),
-            "edgecolor": "white",
-        }
-        axes.bar(sizes, counts, bottom=bottom, label=f"{kind or 'no part'} ({len(own)})", **look)
+        of_kind = [len(entry["bumps"]) for entry in entries if (entry["cause"] or {}).get("kind") == kind]
+        counts = np.bincount(of_kind, minlength=len(sizes))
+        color, hatch = _COLORS[place % len(_COLORS)], "//" * (place // len(_COLORS))
+        label = f"{kind or 'no part'} ({len(of_kind)})"
+        axes.bar(sizes, counts, bottom=bottom, label=label, color=color, hatch=hatch, edgecolor="white")
         bottom += counts
     axes.set_xticks(sizes)
     axes.set_xlabel("parts that a failure takes")

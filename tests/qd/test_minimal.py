@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.judge import Search
-from qd.minimal import Case, Trial, find_minimal, take_apart
+from qd.minimal import Case, Trial, case_of, find_minimal, take_apart
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute
 from sim.robots.find import get_robot
@@ -140,6 +140,17 @@ def test_where_flat_parts_alone_are_left_nothing_is_scaled():
     slippery = replace(case(parts=range(3)), flat=(1,))
     minimal = solve(slippery, lambda trial: 0 if 1 in trial.parts else 20)
     assert (minimal.parts, minimal.scale, minimal.scales) == ((1,), None, {})
+
+
+@pytest.mark.parametrize(("on_gpu", "how"), [(False, "greedy"), (True, "exhaustive")])
+def test_parts_go_from_the_lowest_under_the_robot_on(on_gpu, how):
+    archive = small_archive(1)
+    archive = replace(archive, fresh=fresh_values(archive), genes=np.zeros((1, 64), np.float32))
+    for bump, height in ((4, 0.96), (6, 0.7), (1, 0.4)):
+        archive.genes[0, 8 * bump : 8 * bump + 8] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, height)  # across the way
+    case = case_of(archive, 0, SUPER_GAUSSIAN, 0.3, None, on_gpu=on_gpu)
+    assert (case.parts, case.how, case.scalable, case.flat) == ((1, 6, 4), how, True, ())
+    assert [(trial, counts.sum()) for trial, counts in case.counts.items()] == [(Trial((1, 4, 6), fresh=True), 40)]
 
 
 @BOTH

@@ -18,24 +18,19 @@ _PICTURED = 6  # terrains
 def minimal_section(shown: Shown) -> list[Block]:
     """How little of a terrain it takes to fail, with pictures."""
     material = shown.material
-    found, robot, run = material.minimal, material.robot.spec, material.run
-    if found is None:
-        text = f"Left out: there is no {NUMBERS_FILE} of these elites. It is made by"
+    minima = material.minimal
+    if minima is None:
+        text, word = f"Left out: there is no {NUMBERS_FILE} of these elites. It is made by", "minimise"
         if material.archive.fresh is None:
-            return [
-                absent(
-                    f"{text} faultline minimise, after",
-                    without_machine(command_line("judge", robot=robot, run=run)),
-                )
-            ]
-        return [absent(text, without_machine(command_line("minimise", robot=robot, run=run)))]
-    entries = found.numbers["elites"]
-    shows = "How many parts failures take, by the kind of the cause, and minimal terrains from above"
-    drawn = draw_minimal(material.archive.robot, found.numbers, found.genes, material.space, most=_PICTURED)
-    return [paragraph(_told(entries)), picture("minimal", drawn, shows), _listed(entries)]
+            text, word = f"{text} faultline minimise, after", "judge"
+        return [absent(text, without_machine(command_line(word, robot=material.robot.spec, run=material.run)))]
+    entries = minima.numbers["elites"]
+    caption = "How many parts failures take, by the kind of the cause, and minimal terrains from above"
+    figure = draw_minimal(material.archive.robot, minima.numbers, minima.genes, material.space, most=_PICTURED)
+    return [paragraph(_summary(entries)), picture("minimal", figure, caption), _table(entries)]
 
 
-def _told(entries: list[dict[str, Any]]) -> str:
+def _summary(entries: list[dict[str, Any]]) -> str:
     sizes = [len(entry["bumps"]) for entry in entries]
     alone = sum(size == 1 for size in sizes)
     text = (
@@ -52,7 +47,7 @@ def _told(entries: list[dict[str, Any]]) -> str:
     return f"{text} The cause is the part without which most robots arrive."
 
 
-def _listed(entries: list[dict[str, Any]]) -> str:
+def _table(entries: list[dict[str, Any]]) -> str:
     head = ["elite", "goal", "95 % interval", "parts", "cause", "margin [cm]", "verdict", "what is left"]
     rows = [
         [
