@@ -42,7 +42,7 @@ class Train(_OfTraining, TrainCfg):
         """The settings of the robot, or of the training to go on with, that a command line names."""
         robot, resume = _peek(argv)
         cfg = TrainCfg.of(robot) if resume is None else _resumed(TrainCfg, resume, robot)
-        return cls(robot=robot.spec, resume=resume, **_values(cfg))
+        return cls(robot=robot.spec, resume=resume, **vars(cfg))
 
     def execute(self) -> None:
         """Trains."""
@@ -73,7 +73,7 @@ class Finetune(_OfTraining, FinetuneCfg):
             cfg = _resumed(FinetuneCfg, resume, robot)
         else:
             cfg = FinetuneCfg.of(robot) if peek(argv, "--specialist") is None else FinetuneCfg.specialist(robot)
-        return cls(robot=robot.spec, resume=resume, **_values(cfg))
+        return cls(robot=robot.spec, resume=resume, **vars(cfg))
 
     def execute(self) -> None:
         """Fine-tunes."""
@@ -108,7 +108,7 @@ class Harden(HardenCfg, Where):
     def defaults(cls, argv: Sequence[str]) -> Self:
         """The settings of the robot that a command line names."""
         robot = get_robot(peek(argv, "--robot") or "anymal")
-        return cls(robot=robot.spec, **_values(HardenCfg.of(robot)))
+        return cls(robot=robot.spec, **vars(HardenCfg.of(robot)))
 
     def execute(self) -> None:
         """Hardens."""
@@ -146,10 +146,6 @@ def _run_dir(flags: _OfTraining, name: str) -> Path:
     names = (f"{stamp}-{number}" if number else stamp for number in count())  # two may begin in one second
     new = next(place for place in map(Path("runs").joinpath, names) if not place.exists())
     return flags.run_dir or flags.resume or new
-
-
-def _values(cfg: Any) -> dict[str, Any]:
-    return {setting.name: getattr(cfg, setting.name) for setting in fields(cfg)}
 
 
 def _part(kind: type[_Cfg], flags: Any) -> _Cfg:

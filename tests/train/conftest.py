@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import pytest
-import torch
 
 from sim.robots.find import get_robot
 from train.task.cfg import CurriculumCfg, TaskCfg
@@ -11,11 +10,6 @@ from train.task.task import CommandTask
 
 NUM_ENVS = 6
 CURRICULUM = CurriculumCfg(num_columns=2, noise_columns=1)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 @pytest.fixture

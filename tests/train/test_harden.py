@@ -41,7 +41,7 @@ class World:
         self.searched, self.trained, self.crossed = {}, {}, []
 
     def _work(self, run) -> bool:
-        """Whether there is something to do in a run; Ctrl-C comes in the middle of it where that is asked for."""
+        """Whether there is work to do in a run; Ctrl-C comes in the middle of ``stop_in``."""
         if (run / "done").exists():
             return False
         run.mkdir(exist_ok=True)
