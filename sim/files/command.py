@@ -15,14 +15,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import tyro
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.settings import PositiveInt, check
-
-_DEBUG = "FAULTLINE_DEBUG"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,20 +103,9 @@ class Interrupted(KeyboardInterrupt):
     """The program was asked to stop; its text says what comes next, for example how to resume."""
 
 
-class _Command(Protocol):
-    def execute(self) -> object: ...
-
-
-@runtime_checkable
-class _HasDefaults(Protocol):
-    """A command whose defaults follow from some of its flags, such as those of a robot that they name."""
-
-    def defaults(self, argv: Sequence[str]) -> Any: ...
-
-
 def debugging() -> bool:
     """Whether errors are to be shown with their tracebacks: FAULTLINE_DEBUG is set."""
-    return os.environ.get(_DEBUG, "0") not in ("", "0")
+    return os.environ.get("FAULTLINE_DEBUG", "0") not in ("", "0")
 
 
 def with_traceback(error: BaseException, text: str) -> str:
@@ -126,13 +113,10 @@ def with_traceback(error: BaseException, text: str) -> str:
     return f"{text}\n{''.join(traceback.format_exception(error))}" if debugging() else text
 
 
-def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
-    """Parses the flags of a command, checks them against their ranges, and runs it.
+def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
+    """Parses the flags of the command that the word ``name`` calls, checks them against their ranges, and runs it.
 
-    Args:
-        cls: The command.
-        argv: Its flags.
-        name: The word that calls it.
+    A command whose defaults follow from some of its flags has a class method ``defaults(argv)``.
 
     Returns:
         Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
@@ -141,9 +125,8 @@ def run_command(cls: type[_Command], argv: Sequence[str], *, name: str) -> int:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        defaults: Any = {"default": cls.defaults(argv)} if isinstance(cls, _HasDefaults) else {}
-        flags: Any = cls  # a protocol is no type that tyro's annotations take
-        command: _Command = tyro.cli(flags, prog=f"faultline {name}", args=list(argv), **defaults)
+        defaults = {"default": cls.defaults(argv)} if hasattr(cls, "defaults") else {}
+        command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
         check(command)
         status = command.execute()
         return status if isinstance(status, int) else 0
@@ -168,14 +151,11 @@ def peek(argv: Sequence[str], flag: str) -> str | None:
     return value
 
 
-_COMPILER, _AGAIN_S = f"{os.sep}llvmlite{os.sep}", 0.1
-
-
 def _interrupt(signum: int, frame: FrameType | None) -> None:
     while frame is not None:
-        if _COMPILER in frame.f_code.co_filename:
+        if f"{os.sep}llvmlite{os.sep}" in frame.f_code.co_filename:
             # Its C code calls Python back and drops what is raised there: the signal comes again until it is over.
-            later = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), signum))
+            later = threading.Timer(0.1, os.kill, (os.getpid(), signum))
             later.daemon = True
             later.start()
             return
@@ -186,9 +166,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 def command_line(name: str, **flags: object) -> str:
     """A command as it is typed: ``faultline replay --run runs/x --elite 0``.
 
-    Args:
-        name: The word that calls it.
-        flags: Values by field name; None, False and empty lists are left out, True is a bare flag.
+    Flags are named by fields; None, False and empty lists are left out, True is a bare flag.
     """
     words = ["faultline", name]
     for field, value in flags.items():
@@ -210,13 +188,7 @@ def split_words(values: Sequence[str]) -> list[str]:
 
 
 def chosen_elites(text: str, count: int, whose: object) -> list[int]:
-    """Numbers of elites, as a command line names them: separated by spaces or commas, or ``all``.
-
-    Args:
-        text: The numbers.
-        count: How many elites there are.
-        whose: Their run, for the message.
-    """
+    """Numbers of ``count`` elites of a run: separated by spaces or commas, or ``all``."""
     known = [str(number) for number in range(count)]
     words = known if split_words([text]) == ["all"] else split_words([text])
     unknown = [word for word in words if word not in known]
@@ -239,9 +211,9 @@ def publish(
         out: File of the report, a ``.json`` if there is a figure; it is shown alone if left out.
         measure: Makes the report.
         show: Prints it.
-        draw: Makes a PNG of it, which is written beside it, ``.png`` in place of ``.json``.
+        draw: Makes a PNG of it, which is written beside it.
     """
-    makers: dict[Path, Callable[[dict[str, Any]], bytes]] = {} if out is None else {out: to_json}
+    makers: dict[Path, Callable[[Any], bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:
         if out.suffix != ".json":
             raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")

@@ -34,9 +34,7 @@ _PLAIN_WORDS = {
 def problems(settings: Any, prefix: str = "") -> list[str]:
     """What is wrong with the values of a settings dataclass and of those inside it: a line each, its field first.
 
-    Args:
-        settings: The dataclass.
-        prefix: Stands before each field's name, for example ``task.``.
+    The prefix stands before each field's name, for example ``task.``.
     """
     lines: list[str] = []
     for setting in fields(settings):
@@ -58,13 +56,7 @@ def check(settings: Any, prefix: str = "") -> None:
 
 
 def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
-    """A settings dataclass of JSON values, which it must know by name.
-
-    Args:
-        cls: The dataclass; fields may be such dataclasses, or tuples of them.
-        data: Values by the names of fields.
-        name: What an error calls it.
-    """
+    """A settings dataclass of JSON values by the names of its fields; an error calls it ``name``."""
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
@@ -88,9 +80,10 @@ def _unknown(given: Any, known: Any) -> Iterator[str]:
 
 def _mismatch(annotation: Any, value: Any) -> str | None:
     """What a value should have been; None if it fits or its annotation is beyond msgspec."""
-    if any(isinstance(number, float) and not math.isfinite(number) for number in _numbers(value)):
+    parts = [float(part) if isinstance(part, float) else part for part in _parts(value)]  # a NumPy float as Python's
+    if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
         return "a finite number"
-    plain = tuple(map(_plain, value)) if isinstance(value, tuple) else _plain(value)
+    plain = tuple(parts) if isinstance(value, tuple) else parts[0]
     try:
         converted = msgspec.convert(plain, annotation)
     except msgspec.ValidationError as error:
@@ -107,18 +100,13 @@ def _in_words(expected: str) -> str:
     return expected
 
 
-def _plain(number: Any) -> Any:
-    """A NumPy float as Python's."""
-    return float(number) if isinstance(number, float) else number
-
-
 def _choices(annotation: Any) -> tuple[Any, ...]:
     """Values of the literals in an annotation."""
     parts = get_args(annotation)
     return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
 
 
-def _numbers(value: Any) -> tuple[Any, ...]:
+def _parts(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 

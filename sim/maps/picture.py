@@ -23,7 +23,7 @@ SLIPPERY, SOFT = (0.0, 0.68, 0.68), (0.55, 0.25, 0.75)
 _TINT = 0.5  # share of the tint where a patch is as slippery or soft as can be
 
 
-def ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
+def _ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
     """Tint of a terrain's patches, the stronger the more slippery or soft they are; RGBA, shape (rows, cols, 4)."""
     slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)
     tau = np.maximum(ground.time_constant_s[0].astype(np.float64), LEAST_TIME_CONSTANT_S)
@@ -34,18 +34,15 @@ def ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
 
 
 def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> NDArray[np.float64]:
-    """Colours of the nodes or cells of one terrain with the tint of its ground.
+    """Colours of a terrain's nodes or cells, RGB (0 to 1), shape (rows, columns, 3), with the tint of its ground.
 
-    Args:
-        colors: RGB (0 to 1), shape (rows, columns, 3).
-        ground: Of the terrain.
-        margin: Nodes of them on each side that are not of the terrain.
+    ``margin`` nodes of them on each side are not of the terrain.
     """
     row, col = (
         patches_at(np.arange(count) - margin, nodes - 1, patches)
         for count, patches, nodes in zip(colors.shape[:2], PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
     )
-    tint = ground_tint(ground)[row[:, None], col]
+    tint = _ground_tint(ground)[row[:, None], col]
     return colors + tint[..., 3:] * (tint[..., :3] - colors)
 
 
@@ -55,13 +52,9 @@ def draw_heights(
     limits: tuple[float, float] | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
-    """A height map from above with start and goal; returns the image.
+    """Heights [m], shape (nrow, ncol), from above with start and goal, tinted by the ground; returns the image.
 
-    Args:
-        axes: Where.
-        heights: Of a terrain [m], shape (nrow, ncol).
-        limits: Heights of the darkest and the lightest grey [m]; those of the terrain.
-        ground: Its friction and softness, which tint it.
+    The limits are the heights of the darkest and the lightest grey [m]; the terrain's if left out.
     """
     low, high = limits or (float(heights.min()), float(heights.max()))
     greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
@@ -69,7 +62,7 @@ def draw_heights(
         heights, origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
     )
     if ground is not None:
-        axes.imshow(ground_tint(ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), interpolation="nearest")
+        axes.imshow(_ground_tint(ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), interpolation="nearest")
     for place, look in ((CrossingCfg.start, START), (CrossingCfg.goal, GOAL)):
         axes.plot(*place, **look)
     axes.set_ylabel("y [m]")

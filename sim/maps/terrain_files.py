@@ -69,28 +69,23 @@ def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thick
 
 Heights = NDArray[np.floating]
 
-_MAX_GRAY = 65_535
-_STL_HEADER = 80
 _BASE_BELOW = 0.5  # depth of the block under the lowest point of an STL [m]
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def size_of(heights: Heights) -> tuple[float, float]:
-    """Length along x and width along y of a height grid [m]."""
+def _size_of(heights: Heights) -> tuple[float, float]:
+    """Along x and along y [m]."""
     return SPACING * (heights.shape[1] - 1), SPACING * (heights.shape[0] - 1)
 
 
-def gray_scale(heights: Heights) -> tuple[float, float]:
+def _gray_scale(heights: Heights) -> tuple[float, float]:
     """Metres a gray level of a PNG and height of level 0, so that all 16 bits are used."""
-    return max(float(np.ptp(heights)), _LEAST_EXTENT) / _MAX_GRAY, float(heights.min())
+    return max(float(np.ptp(heights)), _LEAST_EXTENT) / 65_535, float(heights.min())
 
 
 def png_of(heights: Heights) -> bytes:
-    """A 16-bit grayscale PNG seen from above: x to the right, y up, so that the topmost row is the highest y.
-
-    Height = offset + scale * gray level, with those of :func:`gray_scale`; exact to half a gray level.
-    """
-    scale, offset = gray_scale(heights)
+    """A 16-bit grayscale PNG seen from above: x to the right, y up, so that the topmost row is the highest y."""
+    scale, offset = _gray_scale(heights)
     gray = np.rint((np.asarray(heights, dtype=np.float64) - offset) / scale).astype(np.uint16)
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(gray[::-1])).save(buffer, format="PNG", optimize=True)
@@ -102,7 +97,7 @@ def npz_of(heights: Heights, genes: NDArray[np.floating] | None = None, ground: 
 
     With ground of its own also ``friction`` and ``time_constant_s``, float32 (rows, cols), row along y.
     """
-    content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(size_of(heights))}
+    content = {"heights": np.asarray(heights, np.float32), "size_m": np.array(_size_of(heights))}
     if genes is not None:
         content["genes"] = np.asarray(genes, np.float32)
     if ground is not None:
@@ -134,10 +129,9 @@ def mjcf_of(heights: Heights, name: str = "terrain") -> bytes:
 
 
 def triangles_of(heights: Heights) -> NDArray[np.float64]:
-    """A solid block with the terrain as its top, closed; corners counter-clockwise seen from outside.
+    """Corners [m] of a closed block with the terrain as its top, counter-clockwise from outside, (num_triangles, 3, 3).
 
-    Returns:
-        Corners [m], shape (num_triangles, 3, 3); the top's first, 2 a cell, cut as :mod:`kernels.heightfield` is.
+    The top's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is.
     """
     rows, columns = heights.shape
     y, x = np.meshgrid(SPACING * np.arange(rows), SPACING * np.arange(columns), indexing="ij")
@@ -161,8 +155,7 @@ def stl_of(heights: Heights) -> bytes:
     records = np.zeros(len(corners), _TRIANGLE)
     records["corners"] = corners
     records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    header = b"faultline terrain, metres".ljust(_STL_HEADER)
-    return header + np.uint32(len(records)).tobytes() + records.tobytes()
+    return b"faultline terrain, metres".ljust(80) + np.uint32(len(records)).tobytes() + records.tobytes()
 
 
 FORMATS: dict[str, Callable[[Heights], bytes]] = {"npz": npz_of, "png": png_of, "xml": mjcf_of, "stl": stl_of}
@@ -185,15 +178,15 @@ def write_terrain(
     Args:
         stem: Path of the files without their endings; the folder exists.
         heights: Height grid [m], shape (nrow, ncol).
-        formats: Some of :data:`FORMATS`.
+        formats: Some of :data:`FORMATS`; the npz holds genes and ground too.
         about: Further keys of the JSON.
-        genes: The terrain's genes, shape (num_genes,), for the npz.
-        ground: Its friction and softness, for the npz.
+        genes: Shape (num_genes,).
+        ground: Friction and softness.
     """
     check_formats(formats)
-    scale, offset = gray_scale(heights)
+    scale, offset = _gray_scale(heights)
     meaning = {
-        "size_m": list(size_of(heights)),
+        "size_m": list(_size_of(heights)),
         "nodes": list(heights.shape),
         "axes": "rows along y, columns along x; the top row of a PNG is the highest y",
         "scale_m": scale,
@@ -201,12 +194,12 @@ def write_terrain(
         "png_height": "offset_m + scale_m * gray level",
         **about,
     }
-    files = {stem.with_name(f"{stem.name}.{ending}"): ending for ending in formats}
-    for path, ending in files.items():
-        write_atomically(path, npz_of(heights, genes, ground) if ending == "npz" else FORMATS[ending](heights))
-    description = stem.with_name(f"{stem.name}.json")
-    write_atomically(description, to_json(meaning))
-    return [*files, description]
+    contents = {e: npz_of(heights, genes, ground) if e == "npz" else FORMATS[e](heights) for e in formats}
+    files = {stem.with_name(f"{stem.name}.{ending}"): content for ending, content in contents.items()}
+    files[stem.with_name(f"{stem.name}.json")] = to_json(meaning)
+    for path, content in files.items():
+        write_atomically(path, content)
+    return list(files)
 
 
 def check_formats(formats: Sequence[str]) -> None:

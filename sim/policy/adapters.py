@@ -39,15 +39,7 @@ def _on_device(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
 
 
 def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
-    """Splits observation rows into physical quantities.
-
-    Args:
-        row: Observation rows, shape (num_envs, robot.observation_size).
-        robot: Whose they are.
-
-    Raises:
-        ValueError: If the rows are another robot's.
-    """
+    """Splits a robot's observation rows, shape (num_envs, observation_size), into physical quantities."""
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
     joints = robot.num_joints

@@ -70,13 +70,13 @@ class PolicyRunner:
     def __init__(
         self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
     ) -> None:
-        """Bind the buffers.
+        """Bind the controller to Warp arrays.
 
         Args:
             policy: The controller.
-            observation: Warp array, shape (num_envs, observation_size).
-            action: Warp array the actions are written to, shape (num_envs, num_joints).
-            begins: Warp array, not 0 where an episode begins with the coming step, int, shape (num_envs,).
+            observation: Shape (num_envs, observation_size).
+            action: Where actions are written to, shape (num_envs, num_joints).
+            begins: Not 0 where an episode begins with the coming step, int, shape (num_envs,).
         """
         self._policy: Any = policy
         self.memory = memory_of(policy)

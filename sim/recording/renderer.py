@@ -73,16 +73,9 @@ class Renderer:
         cfg: CrossingCfg | None = None,
         ground: GroundMaps | None = None,
     ) -> None:
-        """Build the scene and open OpenGL.
+        """Build the scene of a height grid [m], shape (nrow, ncol), and open OpenGL for images of this size [pixels].
 
-        Args:
-            robot: Robot settings.
-            heights: Height grid [m], shape (nrow, ncol).
-            width: Of the images [pixels].
-            height: Likewise.
-            shadows: Whether the sun casts them; in software they take as long as all the rest.
-            cfg: The crossing, for its goal.
-            ground: Friction and softness of the terrain.
+        Shadows take as long as all the rest in software. The crossing is for its goal.
         """
         self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg, ground=ground)
         self._context = open_context(width, height)
@@ -101,7 +94,7 @@ class Renderer:
         self._image = np.empty((height, width, 3), np.uint8)
 
     def __enter__(self) -> "Renderer":
-        """Nothing to do: all is there."""
+        """The renderer itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -170,23 +163,21 @@ class Renderer:
             geom.transparent = 1
 
     def _add_path(self, points: NDArray[np.floating], color: NDArray[np.float32]) -> None:
-        capsule = _mj.mjtGeom.mjGEOM_CAPSULE
         for begin, end in itertools.pairwise(np.asarray(points, dtype=np.float64)):
-            if self._scene.ngeom >= self._scene.maxgeom:
-                return
-            geom = self._scene.geoms[self._scene.ngeom]
-            _mj.mjv_initGeom(geom, capsule.value, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-            _mj.mjv_connector(geom, capsule.value, _PATH_RADIUS, begin, end)
-            self._scene.ngeom += 1
+            self._add_connector(_mj.mjtGeom.mjGEOM_CAPSULE.value, _PATH_RADIUS, begin, end, color)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:
         size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit
-        if size < _LEAST_FORCE or self._scene.ngeom >= self._scene.maxgeom:
+        if size < _LEAST_FORCE:
+            return
+        color = _ALARMED if size > limit else _CALM
+        tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
+        self._add_connector(_mj.mjtGeom.mjGEOM_ARROW.value, _ARROW_WIDTH, foot, tip, color)
+
+    def _add_connector(self, kind: int, width: float, begin: Any, end: Any, color: NDArray[np.float32]) -> None:
+        if self._scene.ngeom >= self._scene.maxgeom:
             return
         geom = self._scene.geoms[self._scene.ngeom]
-        arrow = _mj.mjtGeom.mjGEOM_ARROW.value
-        color = _ALARMED if size > limit else _CALM
-        _mj.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-        tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
-        _mj.mjv_connector(geom, arrow, _ARROW_WIDTH, foot, tip)
+        _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+        _mj.mjv_connector(geom, kind, width, begin, end)
         self._scene.ngeom += 1

@@ -38,14 +38,10 @@ def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
-    """Colours of a height grid: blue below 0, brown above, a line every metre, steep ground darker.
+    """Colours of a height grid: blue below 0, brown above, a line every metre, steep parts darker, with its tint.
 
-    Args:
-        heights: [m], shape (nrow, ncol), margins included; node (0, 0) stands on a whole metre.
-        ground: Friction and softness, which tint it.
-
-    Returns:
-        RGB, shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
+    Of heights [m], shape (nrow, ncol), margins included, whose node (0, 0) stands on a whole metre, this is RGB of
+    shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
     """
     cells = 0.25 * (heights[:-1, :-1] + heights[1:, :-1] + heights[:-1, 1:] + heights[1:, 1:])
     color = height_colors(cells)
@@ -69,15 +65,9 @@ def scene_model(
     cfg: CrossingCfg | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
-    """The model of a scene: the robot's own file and its terrain, in world-local coordinates.
+    """The model of a scene: the robot's file and its height grid [m], shape (nrow, ncol), in world-local coordinates.
 
-    Args:
-        robot: Robot settings.
-        heights: Height grid [m], shape (nrow, ncol).
-        width: Largest image to be rendered [pixels].
-        height: Likewise.
-        cfg: The crossing, for its goal.
-        ground: Friction and softness of the terrain.
+    Images are at most of that width and height [pixels]; the crossing is for its goal.
     """
     spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:
