@@ -44,29 +44,29 @@ def imported_names(path: Path, tree: ast.Module) -> Iterator[tuple[int, str]]:
                 yield node.lineno, str(node.args[0].value)
 
 
-def offences(path: Path, source: str) -> list[str]:
+def offences_of(path: Path, source: str) -> list[str]:
     """What a file of a room does that the house forbids, one line each."""
     room = path.parts[0]
-    found = []
+    offences = []
     for line, name in imported_names(path, ast.parse(source)):
         top, _, rest = name.partition(".")
         if top in ROOMS and ROOMS.index(top) > ROOMS.index(room):
-            found.append(f"{path}:{line}: {room} may not import {name}: imports point {' <- '.join(ROOMS)}")
+            offences.append(f"{path}:{line}: {room} may not import {name}: imports point {' <- '.join(ROOMS)}")
         elif room == "train" and top == "qd" and rest.partition(".")[0] not in QD_DOORS_FOR_TRAIN:
-            found.append(f"{path}:{line}: of qd, train may import only {', '.join(QD_DOORS_FOR_TRAIN)}, not {name}")
+            offences.append(f"{path}:{line}: of qd, train may import only {', '.join(QD_DOORS_FOR_TRAIN)}, not {name}")
         elif top == "tests":
-            found.append(f"{path}:{line}: {room} may not import {name}: tests are not shipped")
+            offences.append(f"{path}:{line}: {room} may not import {name}: tests are not shipped")
         elif not any(path.is_relative_to(door) for door in LIBRARY_DOORS.get(top, ROOMS)):
-            found.append(f"{path}:{line}: {room} may not import {name}: only {' and '.join(LIBRARY_DOORS[top])} may")
+            offences.append(f"{path}:{line}: {room} may not import {name}: only {' and '.join(LIBRARY_DOORS[top])} may")
     lines = len(source.splitlines())
     if lines > MAX_LINES:
-        found.append(f"{path}: {lines} lines, at most {MAX_LINES}: give one of its responsibilities a file of its own")
-    return found
+        offences.append(f"{path}: {lines} lines, at most {MAX_LINES}: give one of its responsibilities a file of its own")
+    return offences
 
 
 @pytest.mark.parametrize("path", FILES, ids=str)
 def test_file_keeps_to_its_room(path):
-    assert offences(path, (ROOT / path).read_text(encoding="utf-8")) == []
+    assert offences_of(path, (ROOT / path).read_text(encoding="utf-8")) == []
 
 
 def imported_modules() -> dict[str, set[str]]:
@@ -110,33 +110,23 @@ def test_every_room_is_walked():
     ("path", "source"),
     [
         ("kernels/a.py", "import sim"),
-        ("kernels/a.py", "from sim import robot"),
         ("sim/a.py", "def f():\n    from qd.archive import read"),
         ("qd/a.py", "import train.base as base"),
         ("qd/a.py", "import importlib\nimportlib.import_module('train.base')"),
         ("qd/a.py", "__import__('torch')"),
         ("qd/a.py", "import numpy, warp"),
         ("qd/a.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),
-        ("kernels/a.py", "import torch"),
         ("train/a.py", "import warp as wp"),
-        ("train/a.py", "from newton.solvers import SolverMuJoCo"),
-        ("qd/a.py", "import mujoco"),
-        ("qd/a.py", "import viser"),
         ("sim/view/a.py", "import viser"),
-        ("train/a.py", "import onnxruntime"),
         ("train/a.py", "from ribs.archives import GridArchive"),
-        ("sim/a.py", "from rsl_rl.runners import OnPolicyRunner"),
-        ("sim/a.py", "import imageio_ffmpeg"),
         ("train/a.py", "from qd import archive, show"),
-        ("train/a.py", "import qd"),
-        ("train/a.py", "from qd.show.replay import ReplayElite"),
         ("train/a.py", "from ..qd.show import figures"),
         ("sim/a.py", "from tests.oracles import height"),
         ("sim/a.py", "x = 1\n" * 501),
     ],
 )
 def test_an_offender_is_caught(path, source):
-    assert len(offences(Path(path), source)) == 1
+    assert len(offences_of(Path(path), source)) == 1
 
 
 @pytest.mark.parametrize(
@@ -151,4 +141,4 @@ def test_an_offender_is_caught(path, source):
     ],
 )
 def test_what_is_allowed_passes(path, source):
-    assert offences(Path(path), source) == []
+    assert offences_of(Path(path), source) == []
