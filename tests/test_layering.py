@@ -60,7 +60,7 @@ def offences_of(path: Path, source: str) -> list[str]:
             offences.append(f"{path}:{line}: {room} may not import {name}: only {' and '.join(LIBRARY_DOORS[top])} may")
     lines = len(source.splitlines())
     if lines > MAX_LINES:
-        offences.append(f"{path}: {lines} lines, at most {MAX_LINES}: give one of its responsibilities a file of its own")
+        offences.append(f"{path}: {lines} lines, at most {MAX_LINES}: give one of its responsibilities a file")
     return offences
 
 
