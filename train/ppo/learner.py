@@ -178,7 +178,7 @@ class Learner:
         return {key: value.detach().cpu().clone() for key, value in self.alg.get_policy().state_dict().items()}
 
     def mean_actor_state(self) -> State:
-        """The mean of the actors counted so far, likewise; the present one where there are none."""
+        """The mean of the actors counted so far under the same keys; the present one where there are none."""
         return {**self.actor_state(), **{key: value.cpu().clone() for key, value in self._mean.items()}}
 
     def count_into_mean(self, counts: bool) -> None:

@@ -12,6 +12,7 @@ from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
 from train.task.cfg import NoiseCfg, TaskCfg
 from train.task.task import CommandTask
+from train.task.vec_env import CommandVecEnv
 
 ACTION = slice(36, 48)
 
@@ -121,6 +122,24 @@ def test_load_and_friction_are_drawn_from_their_ranges(make_task):
     assert len(np.unique(friction[:, 0])) == 64
 
 
+def test_commands_speeds_and_levels_are_as_the_settings_say(make_task):
+    task = make_task(lin_vel_x=(0.5, 0.6), lin_vel_y=(-0.3, -0.2), command_interval_s=0.04, push_interval_s=0.0)
+    speeds = torch.from_dlpack(task.sim.joint_qd)[:, :6].abs()
+    assert 0.4 < speeds.max() < 0.7  # .5 of the base, a little more of its centre of mass
+    commands = []
+    for _ in range(6):
+        commands.append(task.observation[:, 9:11] / 2.0)
+        task.step(torch.zeros(task.num_envs, 12, device=task.device))
+    forward, sideward = torch.stack(commands).unbind(-1)
+    assert (forward >= 0.5).all() and (forward <= 0.6).all() and (sideward >= -0.3).all() and (sideward <= -0.2).all()
+    assert len(forward[:, 0].unique()) == 3  # a new one every two steps
+    task.restart_all(torch.ones(task.num_envs, device=task.device))
+    joint_q(task)[:2, 0] += torch.tensor([4.5, 3.5], device=task.device)  # half a tile is 4 m
+    joint_q(task)[:2, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], device=task.device)  # on their backs
+    task.step(torch.zeros(task.num_envs, 12, device=task.device))
+    assert task.levels.tolist() == [2, 0, 1, 1, 1, 1]
+
+
 def test_observations_are_noisy_within_their_widths(make_task):
     # Half widths in the units of the observation: .1 m/s * 2, .2 rad/s * .25, .05 of gravity, nothing on the command,
     # .01 rad, 1.5 rad/s * .05, nothing on the action, .1 m * 5.
@@ -148,8 +167,9 @@ def test_crossings_begin_along_the_way_with_the_goal_where_it_is(make_task):
     step = torch.zeros(12, 12, device=task.device)
     task.step(step)
     joint_q(task)[0, :2] = torch.tensor([13.6, 4.0], device=task.device)
-    task.step(step)
+    *_, extras = CommandVecEnv(task).step(step)
     assert task.end[0] == int(Outcome.GOAL) and (task.end[1:] == 0).all()
+    assert extras["time_outs"].tolist() == [True] + [False] * 11  # no failure: its value goes on
     assert joint_q(task)[0, 0] <= 10.1  # it began anew, along the way
 
 

@@ -20,18 +20,6 @@ def test_nothing_handed_out_changes_later(shared_task):
     assert not env.get_observations()["policy"].equal(handed[0])
 
 
-def test_steps_run_under_inference_mode_and_after_it(shared_task):
-    env = CommandVecEnv(shared_task)
-    shared_task.restart_all(torch.zeros(6, device=env.device))
-    with torch.inference_mode():
-        env.step(torch.zeros(6, 12, device=env.device))
-    observations, *_ = env.step(torch.zeros(6, 12, device=env.device))
-    assert env.episode_length_buf.tolist() == [2] * 6
-    weight = torch.zeros(235, requires_grad=True, device=env.device)
-    (observations["policy"] @ weight).sum().backward()  # a tensor of inference mode would be refused here
-    torch.testing.assert_close(weight.grad, observations["policy"].sum(0))
-
-
 def test_time_outs_are_the_dones_of_the_clock(shared_task):
     env = CommandVecEnv(shared_task)
     shared_task.restart_all(torch.zeros(6, device=env.device))
