@@ -1,6 +1,5 @@
 """Controllers from files: what is accepted, that nothing in them runs; and the runner that calls them."""
 
-import dataclasses
 import os
 import pickle
 
@@ -32,37 +31,20 @@ def test_an_rsl_rl_checkpoint_acts_as_rsl_rl_does(tmp_path, anymal, device, norm
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit")
-@pytest.mark.parametrize("suffix", [".pt", ".ts"])
-def test_torchscript_loads(tmp_path, anymal, device, suffix):
-    path, module = tmp_path / f"policy{suffix}", torch.nn.Linear(OBSERVATIONS, ACTIONS)
+def test_torchscript_loads(tmp_path, anymal, device):
+    path, module = tmp_path / "policy.pt", torch.nn.Linear(OBSERVATIONS, ACTIONS)
     torch.jit.trace(module, torch.zeros(4, OBSERVATIONS)).save(str(path))
     rows = torch.randn(5, OBSERVATIONS)
     actions = load_policy(str(path), anymal, device)(rows.to("cuda" if device.startswith("cuda") else "cpu"))
     torch.testing.assert_close(actions.detach().cpu(), module(rows).detach(), **near(device))
     torch.jit.trace(torch.nn.Linear(169, 10), torch.zeros(4, 169)).save(str(path))
-    with pytest.raises(ValueError, match=rf"policy\{suffix}"):
+    with pytest.raises(ValueError, match=r"policy\.pt"):
         load_policy(path, anymal, "cpu")
-
-
-def test_the_size_comes_from_the_robot(tmp_path, anymal):
-    small = dataclasses.replace(anymal, scan_x=(0.0,), scan_y=(0.0,))
-    path = save_checkpoint(tmp_path / "small.pt", rsl_rl_actor(49).state_dict())
-    assert load_policy(path, small, "cpu").sizes == (49, 12)
-
-
-class Bomb:
-    """Unpickling it creates the folder it names."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
 
 
 def test_code_in_a_file_does_not_run(tmp_path, anymal):
     proof = tmp_path / "it_ran"
-    bomb = Bomb(str(proof))
+    bomb = type("Bomb", (), {"__reduce__": lambda self: (os.mkdir, (str(proof),))})()  # unpickled, it makes a folder
     for content in (bomb, {"actor_state_dict": rsl_rl_actor().state_dict(), "infos": bomb}):
         torch.save(content, tmp_path / "a.pt")
         with pytest.raises(ValueError, match=r"a\.pt"):
@@ -90,17 +72,13 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, anymal, state):
         load_policy(save_checkpoint(tmp_path / "model.pt", state), anymal, "cpu")
 
 
-def damaged(whole):
-    """Files cut short, one with a bit flipped among the weights, and what was never a checkpoint."""
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 4
-    return [b"", whole[: len(whole) // 2], whole[:-9], bytes(flipped), b"\x80\x02.", b"hello\n"]
-
-
 def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
     path = save_checkpoint(tmp_path / "model.pt", STATE)
     load_policy(path, anymal, "cpu")
-    for content in damaged(path.read_bytes()):
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 4  # among the weights
+    for content in (b"", whole[: len(whole) // 2], whole[:-9], bytes(flipped), b"\x80\x02.", b"hello\n"):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"model\.pt"):
             load_policy(path, anymal, "cpu")
@@ -108,9 +86,8 @@ def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
         torch.save(content, path)
         with pytest.raises(ValueError, match=r"model\.pt"):
             load_policy(path, anymal, "cpu")
-    for gone in (tmp_path / "gone.pt", tmp_path / "gone\0.pt"):
-        with pytest.raises(ValueError, match="gone"):
-            load_policy(gone, anymal, "cpu")
+    with pytest.raises(ValueError, match=r"gone\.pt"):
+        load_policy(tmp_path / "gone.pt", anymal, "cpu")
 
 
 def test_a_controller_trained_for_another_robot_is_warned_of(tmp_path, anymal, capsys):
@@ -189,10 +166,6 @@ def test_a_controller_may_keep_and_change_its_row():
     np.testing.assert_array_equal(action.numpy(), 0.0)
 
 
-def fails(_):
-    raise RuntimeError("enough\nof it")
-
-
 @pytest.mark.parametrize(
     ("policy", "words"),
     [
@@ -201,7 +174,7 @@ def fails(_):
         (lambda row: torch.zeros(5, ACTIONS, device="meta"), "meta"),
         (lambda row: torch.zeros(5, ACTIONS).to_sparse(), "sparse"),
         (lambda row: None, "NoneType"),
-        (fails, r"RuntimeError: enough \(.*test_loaders\.py, line \d+\)$"),
+        (lambda row: row.no_such_name, r"AttributeError: .*test_loaders\.py, line \d+\)$"),
     ],
 )
 def test_what_goes_wrong_in_a_crossing_is_named(policy, words):

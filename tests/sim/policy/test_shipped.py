@@ -4,9 +4,8 @@ import numpy as np
 
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import NUM_COLS, NUM_ROWS, crossing_terrain
-
-FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+from sim.terrain import crossing_terrain
+from tests.sim.scenes import FLAT
 
 
 def test_the_shipped_controller_walks_to_the_goal(robot, device):

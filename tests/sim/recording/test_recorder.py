@@ -153,8 +153,6 @@ def test_terrains_given_by_genes_are_stored_as_genes(rollout, anymal, tmp_path):
 
 CHANGES = {
     "another version": {"format": np.array("faultline recording 0")},
-    "no format": {"format": None},
-    "a lost array": {"command": None},
     "neither genes nor heights": {"heights": None},
     "a joint too few": {"joint_names": np.array(["a"] * 11)},
     "another number of frames": {"touching": np.zeros((2, 4, 50, 13), bool)},
@@ -163,21 +161,16 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_what_is_no_recording_is_refused(recording, tmp_path, changes):
-    path = tmp_path / "a.npz"
-    write_recording(path, recording)
-    with np.load(path) as content:
-        content = dict(content) | changes
-    np.savez(path, **{name: value for name, value in content.items() if value is not None})
-    with pytest.raises(ValueError, match=r"a\.npz"):
-        read_recording(path)
-
-
-def test_a_damaged_file_is_refused(recording, tmp_path):
+def test_what_is_no_recording_or_damaged_is_refused(recording, tmp_path):
     path = tmp_path / "a.npz"
     write_recording(path, recording)
     whole = path.read_bytes()
+    with np.load(path) as content:
+        arrays = dict(content)
+    for name, changes in CHANGES.items():
+        np.savez(path, **{key: value for key, value in (arrays | changes).items() if value is not None})
+        with pytest.raises(ValueError, match=r"a\.npz"):
+            pytest.fail(f"{name}: {read_recording(path)}")
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
     for content in (whole[:-100], b"hello", b"", bytes(flipped)):

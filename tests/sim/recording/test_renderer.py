@@ -56,6 +56,7 @@ def test_paint_tells_heights_and_metres_apart(ground):
 def test_the_ground_of_a_scene_is_the_simulations(robot):
     rough = np.random.default_rng(1).uniform(-0.4, 0.4, (NUM_ROWS, NUM_COLS))
     model = scene_model(robot, rough, width=64, height=64)
+    assert model.hfield_nrow[0] == NUM_COLS + 2 * MARGIN_NODES and MARGIN_NODES * SPACING == 2.0
     data = mujoco.MjData(model)
     data.qpos[:] = standing(robot, 2, 4, 0.5)
     mujoco.mj_forward(model, data)
@@ -134,11 +135,6 @@ def test_a_robot_of_ones_own_is_shown_on_the_ground(tmp_path, kind):
     mujoco.mj_forward(model, data)
     feet = np.array([data.geom(name).xpos for name in dog.foot_geoms])
     np.testing.assert_allclose(feet[:, 2], 0.3 + 0.025, atol=0.02)  # spheres of 25 mm
-
-
-def test_a_margin_is_shown_beyond_the_terrain(anymal, ground):
-    model = scene_model(anymal, ground, width=64, height=64)
-    assert model.hfield_nrow[0] == NUM_COLS + 2 * MARGIN_NODES and MARGIN_NODES * SPACING == 2.0
 
 
 def test_what_cannot_be_shown_is_named(anymal, tmp_path, monkeypatch):
