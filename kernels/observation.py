@@ -153,36 +153,6 @@ def write_observation(
 
 
 @wp.kernel
-def _write_scan_kernel(
-    joint_q: wp.array2d[float],
-    terrain_of_env: wp.array[int],
-    terrain: Terrain,
-    sensors: Sensors,
-    scan_out: wp.array2d[float],
-):
-    """Grid (num_envs, num_scan_points)."""
-    env, k = wp.tid()
-    scan_out[env, k] = _scan_column(joint_q, terrain, terrain_of_env[env], sensors, env, k)
-
-
-def write_scan(joint_q: Any, terrain_of_env: Any, terrain: Terrain, sensors: Sensors, scan_out: Any) -> None:
-    """Write the height scan alone, as it stands in the observation without noise.
-
-    Args:
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        terrain: Height grids.
-        sensors: Holds the scan points.
-        scan_out: Shape (num_envs, num_scan_points).
-    """
-    expected = (joint_q.shape[0], sensors.scan_x.shape[0])
-    if tuple(scan_out.shape) != expected:
-        raise ValueError(f"scan_out must have shape {expected}, got {tuple(scan_out.shape)}")
-    inputs = [joint_q, terrain_of_env, terrain, sensors]
-    wp.launch(_write_scan_kernel, expected, inputs, outputs=[scan_out], device=joint_q.device)
-
-
-@wp.kernel
 def _apply_action_kernel(
     action: wp.array2d[float], default_joint_pos: wp.array[float], scale: float,
     last_action_out: wp.array2d[float], targets_out: wp.array2d[float],

@@ -105,7 +105,9 @@ def main(argv: list[str]) -> None:
     if args.small:
         timing = Timing(rounds=1, replay_s=1e-6)
     prepare_torch(device)
-    scene = build_scene(robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=8.0, seed=0)
+    scene = build_scene(
+        robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=1.0 if args.small else 8.0, seed=0
+    )
     ceiling = measure_ceiling(device, timing)
     rows = [
         measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in make_cases(scene).values()

@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from kernels.episode import command_goal
-from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation, write_scan
+from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, add_penalties
 from kernels.super_gaussian import LOWER, NEGLIGIBLE, UPPER, rasterise
 from sim.crossing import CrossingCfg, make_task
@@ -40,19 +40,14 @@ class Scene:
     rollout: Rollout
     genes: np.ndarray
     """Shape (num_terrains, 64)."""
-    seeds: np.ndarray
     command: Any
     """Shape (num_envs, 3)."""
     last_action: Any
     """Shape (num_envs, num_joints)."""
 
     @property
-    def robot(self) -> RobotCfg:
-        return self.rollout.robot
-
-    @property
     def num_envs(self) -> int:
-        return self.rollout.sim.num_envs
+        return self.rollout.num_envs
 
 
 def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: int, walk_s: float, seed: int) -> Scene:
@@ -62,8 +57,7 @@ def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: in
         num_envs=num_envs, device=device, cfg=CrossingCfg(),
     )  # fmt: skip
     genes = SUPER_GAUSSIAN.hard_random(num_terrains, seed)
-    seeds = np.random.SeedSequence(seed).generate_state(num_terrains, np.uint32)
-    rollout.put(genes, seeds)
+    rollout.put(genes, np.arange(num_terrains))
     for _ in range(round(walk_s / robot.control_dt)):
         rollout.control_step()
     sim = rollout.sim
@@ -73,7 +67,7 @@ def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: in
         sim.collide()  # of the poses in which the last step ended
         command = wp.zeros((num_envs, 3), dtype=float)
         command_goal(sim.joint_q, wp.zeros(num_envs, dtype=int), make_task(rollout.cfg, robot), command)
-        return Scene(rollout=rollout, genes=genes, seeds=seeds, command=command, last_action=wp.array(actions))
+        return Scene(rollout=rollout, genes=genes, command=command, last_action=wp.array(actions))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,30 +166,26 @@ def _kernel_contacts(scene: Scene) -> np.ndarray:
     # A record names its shape and the probe's centre.
     distance = np.abs(records[:, None, 3:6] - position).sum(2)
     probe = np.argmin(np.where(shape_of_probe == shape[:, None], distance, np.inf), axis=1)
-    return _by_probe(env, probe, records, (scene.num_envs, len(position)))
+    values = np.full((scene.num_envs, len(position), records.shape[1]), np.nan, np.float32)
+    values[env, probe] = records
+    return values
 
 
 def _torch_contacts(outputs: tuple[torch.Tensor, ...], num_probes: int) -> np.ndarray:
     """The same of the counterpart, which has a slot for each record that there may be."""
     probe, *vectors = (output.cpu().numpy() for output in outputs)
     exists = probe >= 0
-    records = np.concatenate([vector[exists] for vector in vectors], axis=1)
-    return _by_probe(np.nonzero(exists)[0], probe[exists], records, (len(probe), num_probes))
-
-
-def _by_probe(env: np.ndarray, probe: np.ndarray, records: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    values = np.full((*shape, records.shape[1]), np.nan, np.float32)
-    values[env, probe] = records
+    values = np.full((len(probe), num_probes, 3 * len(vectors)), np.nan, np.float32)
+    values[np.nonzero(exists)[0], probe[exists]] = np.concatenate([vector[exists] for vector in vectors], axis=1)
     return values
 
 
 def _contact_case(scene: Scene) -> Case:
     sim: Any = scene.rollout.sim
     body_q = wp.to_torch(sim.body_q).view(sim.num_envs, -1, 7)
-    probes = [getattr(sim.probes, name).numpy() for name in ("position", "strip_start", "strip_radius", "strip_body")]
-    tables = counterparts.make_tables(*probes, spacing=SPACING, device=body_q.device)
+    tables = counterparts.make_tables(sim.probes, SPACING, body_q.device)
     arguments = (body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables)
-    num_probes, poses = len(probes[0]), 7 * len(np.unique(probes[3]))
+    num_probes, poses = len(tables.position), 7 * len(tables.strip_body.unique())
     # Poses and probes read, records written, and of each contact at least the four nodes of a cell: two triangles.
     count = int(sim.contact_count.numpy()[0])
     read = FLOAT * (sim.num_envs * (poses + 1) + 3 * num_probes + 4 * count)
@@ -216,30 +206,9 @@ def _contact_case(scene: Scene) -> Case:
     )
 
 
-def _scan_work(scene: Scene) -> Work:
-    """A point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4)."""
-    points = scene.robot.num_scan_points
-    return Work(bytes=FLOAT * scene.num_envs * (points * (3 + 1) + 7 + 1), flops=22 * scene.num_envs * points)
-
-
-def _scan_case(scene: Scene) -> Case:
-    sim = scene.rollout.sim
-    out = wp.zeros((scene.num_envs, scene.robot.num_scan_points), dtype=float)
-    arrays = (sim.joint_q, sim.terrain_of_env, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y)
-    return Case(
-        name="scan",
-        launch=lambda: write_scan(sim.joint_q, sim.terrain_of_env, sim.bank.terrain, sim.sensors, out),
-        output=out,
-        counterpart=counterparts.scan,
-        arguments=(*map(wp.to_torch, arrays), SPACING),
-        work=_scan_work(scene),
-        atol=5e-4,  # where cells are steep, a micrometre along is many up, times 5
-    )
-
-
 def _observation_case(scene: Scene) -> Case:
     sim = scene.rollout.sim
-    out = wp.zeros((scene.num_envs, scene.robot.observation_size), dtype=float)
+    out = wp.zeros((scene.num_envs, scene.rollout.robot.observation_size), dtype=float)
     seed = wp.zeros(1, dtype=int)
     state = (sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env)
     arrays = (*state, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos)
@@ -249,24 +218,25 @@ def _observation_case(scene: Scene) -> Case:
         return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
 
     scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
-    # The scan; joint coordinates and velocities, command and action read; three vectors turned into the base (100).
-    scan, joints = _scan_work(scene), scene.robot.num_joints
-    values = (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
-    flops = scan.flops + scene.num_envs * (100 + 3 * joints)
+    # A scan point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4). Joint
+    # coordinates and velocities, command and action read; three vectors turned into the base (100).
+    points, joints = scene.rollout.robot.num_scan_points, scene.rollout.robot.num_joints
+    values = 4 * points + (7 + 1) + (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
+    flops = scene.num_envs * (22 * points + 100 + 3 * joints)
     return Case(
         name="observation",
         launch=lambda: write_observation(*state, sim.bank.terrain, sim.sensors, Noise(), seed, out),
         output=out,
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
-        work=Work(bytes=scan.bytes + FLOAT * scene.num_envs * values, flops=flops),
+        work=Work(bytes=FLOAT * scene.num_envs * values, flops=flops),
         atol=5e-4,
         rtol=1e-5,
     )
 
 
 def _penalties_case(scene: Scene) -> Case:
-    sim, robot = scene.rollout.sim, scene.robot
+    sim, robot = scene.rollout.sim, scene.rollout.robot
     sums = wp.zeros((scene.num_envs, len(PENALTIES)), dtype=float)
     counted = wp.ones(scene.num_envs, dtype=int)
     roles = sim.geom_role.numpy()
@@ -316,6 +286,6 @@ def _geom_forces_case(scene: Scene) -> Case:
 
 def make_cases(scene: Scene) -> dict[str, Case]:
     """All kernels on one scene, by name."""
-    makers = (_rasterise_case, _contact_case, _scan_case, _observation_case, _penalties_case, _geom_forces_case)
+    makers = (_rasterise_case, _contact_case, _observation_case, _penalties_case, _geom_forces_case)
     with wp.ScopedDevice(scene.rollout.sim.device):
         return {case.name: case for case in [make(scene) for make in makers]}

@@ -5,19 +5,14 @@ Shapes: E environments, T terrains, S strips, P probes, J joints, G geoms.
 """
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kernels.observation import (
-    ANG_VEL_SCALE,
-    JOINT_VEL_SCALE,
-    LIN_VEL_SCALE,
-    OBSERVATION_LIMIT,
-    SCAN_OFFSET,
-    SCAN_SCALE,
-)
+from kernels import observation as columns
 from kernels.penalties import COLLISION_FORCE, STUMBLE_RATIO
 
 
@@ -76,7 +71,7 @@ def scan(
     x = joint_q[:, 0:1] + cos * scan_x - sin * scan_y
     y = joint_q[:, 1:2] + sin * scan_x + cos * scan_y
     ground = surface(heights, terrain_of_env, spacing, x, y)[0]
-    return (joint_q[:, 2:3] - SCAN_OFFSET - ground).clamp(-1.0, 1.0) * SCAN_SCALE
+    return (joint_q[:, 2:3] - columns.SCAN_OFFSET - ground).clamp(-1.0, 1.0) * columns.SCAN_SCALE
 
 
 def rotate_inverse(quaternion: Tensor, vector: Tensor) -> Tensor:
@@ -100,17 +95,17 @@ def observation(
 ) -> Tensor:  # fmt: skip
     """The whole observation row without noise, shape (E, 12 + 3 J + scan points); ``down`` is (0, 0, -1)."""
     lin_vel, ang_vel = base_velocities(joint_q, joint_qd, base_com)
-    columns = [
-        lin_vel * LIN_VEL_SCALE,
-        ang_vel * ANG_VEL_SCALE,
+    row = [
+        lin_vel * columns.LIN_VEL_SCALE,
+        ang_vel * columns.ANG_VEL_SCALE,
         rotate_inverse(joint_q[:, 3:7], down.expand_as(lin_vel)),
         command * command_scale,
         joint_q[:, 7:] - default_joint_pos,
-        joint_qd[:, 6:] * JOINT_VEL_SCALE,
+        joint_qd[:, 6:] * columns.JOINT_VEL_SCALE,
         last_action,
         scan(joint_q, terrain_of_env, heights, scan_x, scan_y, spacing),
     ]
-    return torch.cat(columns, dim=1).clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    return torch.cat(row, dim=1).clamp_(-columns.OBSERVATION_LIMIT, columns.OBSERVATION_LIMIT)
 
 
 def penalties(
@@ -176,29 +171,22 @@ class ProbeTables:
     strip_radius: Tensor  # [m], (S,)
 
 
-def make_tables(
-    position: np.ndarray, strip_start: np.ndarray, strip_radius: np.ndarray, strip_body: np.ndarray, *, spacing: float,
-    device: torch.device,
-) -> ProbeTables:  # fmt: skip
-    """Tables of strips given as :class:`kernels.contact.Probes` gives them."""
-    lengths = np.diff(strip_start)
+def make_tables(probes: Any, spacing: float, device: torch.device) -> ProbeTables:
+    """Tables of strips given as :class:`kernels.contact.Probes`."""
+    names = ("position", "strip_start", "strip_radius", "strip_body")
+    position, start, strip_radius, strip_body = (getattr(probes, name).numpy() for name in names)
+    lengths = np.diff(start)
     radius = np.repeat(strip_radius, lengths)
-    probes = [np.flatnonzero(radius == value) for value in np.unique(radius)]
-    padded = np.minimum(strip_start[:-1, None] + np.arange(lengths.max()), strip_start[1:, None] - 1)
-
-    def tensor(array: np.ndarray) -> Tensor:
-        return torch.tensor(array, device=device)
-
+    groups = [np.flatnonzero(radius == value) for value in np.unique(radius)]
+    windows = [int(np.ceil(2.0 * radius[group[0]] / spacing - 1e-6)) + 1 for group in groups]
+    tensor = partial(torch.tensor, device=device)
     return ProbeTables(
         position=tensor(position),
         body=tensor(np.repeat(strip_body, lengths)),
         radius=tensor(radius),
-        groups=tuple(
-            (float(radius[group[0]]), int(np.ceil(2.0 * radius[group[0]] / spacing - 1e-6)) + 1, tensor(group))
-            for group in probes
-        ),
-        order=tensor(np.argsort(np.concatenate(probes))),
-        strip_probes=tensor(padded),
+        groups=tuple((float(radius[g[0]]), window, tensor(g)) for g, window in zip(groups, windows, strict=True)),
+        order=tensor(np.argsort(np.concatenate(groups))),
+        strip_probes=tensor(np.minimum(start[:-1, None] + np.arange(lengths.max()), start[1:, None] - 1)),
         strip_body=tensor(strip_body),
         strip_radius=tensor(strip_radius),
     )
