@@ -145,13 +145,8 @@ def collide_strips(
 ) -> None:
     """Append every environment's terrain contacts to ``contacts_out`` (whose count the caller has cleared).
 
-    Args:
-        body_q: Body poses in the world-local frame, transform array, shape (num_envs * bodies_per_env,).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        terrain: Height grids and their ceilings.
-        probes: Sphere probes of the robot.
-        layout: Strides of the flat model arrays.
-        contacts_out: Records; contacts past the capacity are counted but not written.
+    ``body_q`` are the poses in the world-local frame, shape (num_envs * bodies_per_env,). Contacts past the capacity
+    are counted but not written.
     """
     num_envs = terrain_of_env.shape[0]
     if body_q.shape[0] != num_envs * layout.bodies_per_env:
@@ -159,11 +154,5 @@ def collide_strips(
             f"body_q must hold {num_envs} x {layout.bodies_per_env} poses, got {body_q.shape[0]}: "
             "one robot per entry of terrain_of_env"
         )
-    inputs = [body_q, terrain_of_env, terrain, probes, layout]
-    wp.launch(
-        _collide_strips_kernel,
-        (probes.strip_radius.shape[0], num_envs),
-        inputs,
-        outputs=[contacts_out],
-        device=body_q.device,
-    )
+    inputs, size = [body_q, terrain_of_env, terrain, probes, layout], (probes.strip_radius.shape[0], num_envs)
+    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=body_q.device)

@@ -66,14 +66,7 @@ def _tell_solver_kernel(
 
 
 def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, solver_out: SolverState) -> None:
-    """Write coordinates, velocities and targets into mujoco_warp's data.
-
-    Args:
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
-        targets: Joint position targets in columns 7 and up, shape (num_envs, 7 + num_joints).
-        solver_out: ``qpos``, ``qvel`` and ``ctrl`` are written.
-    """
+    """Write coordinates, velocities and targets into mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
     inputs = [joint_q, joint_qd, targets]
     wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=[solver_out], device=joint_q.device)
@@ -103,20 +96,9 @@ def _ask_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], join
 
 
 def ask_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
-    """Read coordinates and velocities from mujoco_warp's data.
-
-    Args:
-        solver: Whose ``qpos`` and ``qvel`` are read.
-        joint_q_out: Joint coordinates, shape (num_envs, 7 + num_joints).
-        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints).
-    """
-    wp.launch(
-        _ask_solver_kernel,
-        (joint_q_out.shape[0], 1 + len(solver.column_of_joint)),
-        [solver],
-        outputs=[joint_q_out, joint_qd_out],
-        device=joint_q_out.device,
-    )
+    """Read coordinates and velocities from mujoco_warp's data."""
+    size, outputs = (joint_q_out.shape[0], 1 + len(solver.column_of_joint)), [joint_q_out, joint_qd_out]
+    wp.launch(_ask_solver_kernel, size, [solver], outputs=outputs, device=joint_q_out.device)
 
 
 @wp.kernel
@@ -129,10 +111,5 @@ def _ask_poses_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform])
 
 
 def ask_poses(solver: SolverState, body_q_out: Any) -> None:
-    """Read the poses of bodies from mujoco_warp's data.
-
-    Args:
-        solver: Whose ``xpos`` and ``xquat`` are read.
-        body_q_out: Transforms, world-local frame, shape (num_envs, bodies_per_env).
-    """
+    """Read the poses of bodies, world-local frame, shape (num_envs, bodies_per_env), from mujoco_warp's data."""
     wp.launch(_ask_poses_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)

@@ -56,54 +56,38 @@ class Range(NamedTuple):
 
 LEAD = Range(4, 16, whole=True)
 """Flat ground before an element [cells]."""
-_NONE = Range(0.0, 0.0)
-_UP_OR_DOWN = Range(-1.0, 1.0, hard="either")
 
+
+def _hard(low: float, high: float) -> Range:
+    return Range(low, high, hard="high")
+
+
+def _whole(low: int, high: int, hard: str = "") -> Range:
+    return Range(low, high, whole=True, hard=hard)
+
+
+_NONE = Range(0.0, 0.0)
+_WAY = Range(-1.0, 1.0, hard="either")
 PARAMETERS: dict[Kind, tuple[Range, Range, Range, Range]] = {
     # size [m], for a ramp and a cross slope a gradient; length [cells], for stairs the tread [m]; detail; turn
-    Kind.FLAT: (_NONE, Range(0, 60, whole=True, hard="low"), _NONE, _NONE),
-    Kind.RAMP: (Range(1 / 12, 1 / 3, hard="high"), Range(16, 48, whole=True, hard="high"), _NONE, _UP_OR_DOWN),
-    Kind.CROSS_SLOPE: (Range(1 / 48, 1 / 3, hard="high"), Range(30, 60, whole=True, hard="high"), _NONE, _UP_OR_DOWN),
-    Kind.SILL: (Range(0.013, 0.15, hard="high"), Range(1, 3, whole=True), _NONE, _NONE),
-    Kind.RAIL: (Range(0.02, 0.172, hard="high"), Range(0, 1, whole=True), _NONE, _NONE),
-    Kind.KERB: (Range(0.03, 0.25, hard="high"), _NONE, _NONE, _UP_OR_DOWN),
-    Kind.STEP: (Range(0.10, 0.40, hard="high"), _NONE, _NONE, _UP_OR_DOWN),
+    Kind.FLAT: (_NONE, _whole(0, 60, "low"), _NONE, _NONE),
+    Kind.RAMP: (_hard(1 / 12, 1 / 3), _whole(16, 48, "high"), _NONE, _WAY),
+    Kind.CROSS_SLOPE: (_hard(1 / 48, 1 / 3), _whole(30, 60, "high"), _NONE, _WAY),
+    Kind.SILL: (_hard(0.013, 0.15), _whole(1, 3), _NONE, _NONE),
+    Kind.RAIL: (_hard(0.02, 0.172), _whole(0, 1), _NONE, _NONE),
+    Kind.KERB: (_hard(0.03, 0.25), _NONE, _NONE, _WAY),
+    Kind.STEP: (_hard(0.10, 0.40), _NONE, _NONE, _WAY),
     # detail: steps
-    Kind.STAIRS: (
-        Range(0.12, 0.22, hard="high"),
-        Range(0.22, 0.35, hard="low"),
-        Range(2, 8, whole=True, hard="high"),
-        _UP_OR_DOWN,
-    ),
+    Kind.STAIRS: (_hard(0.12, 0.22), Range(0.22, 0.35, hard="low"), _whole(2, 8, "high"), _WAY),
     # detail: how many lie on each other
-    Kind.PALLET: (
-        Range(0.10, 0.16, hard="high"),
-        Range(16, 24, whole=True),
-        Range(1, 2, whole=True, hard="high"),
-        _NONE,
-    ),
-    Kind.DITCH: (Range(0.05, 0.80, hard="high"), Range(2, 16, whole=True, hard="high"), _NONE, _NONE),
+    Kind.PALLET: (_hard(0.10, 0.16), _whole(16, 24), _whole(1, 2, "high"), _NONE),
+    Kind.DITCH: (_hard(0.05, 0.80), _whole(2, 16, "high"), _NONE, _NONE),
     # detail: width of the beam [cells]; turn: how far left of the way its middle lies [cells]
-    Kind.BRIDGE: (
-        Range(0.20, 0.80, hard="high"),
-        Range(16, 40, whole=True, hard="high"),
-        Range(6, 20, whole=True, hard="low"),
-        Range(-10, 10, whole=True),
-    ),
+    Kind.BRIDGE: (_hard(0.20, 0.80), _whole(16, 40, "high"), _whole(6, 20, "low"), _whole(-10, 10)),
     # detail: side of a stone [cells]; turn: gap between two [cells]
-    Kind.STONES: (
-        Range(0.20, 0.60, hard="high"),
-        Range(20, 48, whole=True, hard="high"),
-        Range(4, 8, whole=True, hard="low"),
-        Range(2, 6, whole=True, hard="high"),
-    ),
+    Kind.STONES: (_hard(0.20, 0.60), _whole(20, 48, "high"), _whole(4, 8, "low"), _whole(2, 6, "high")),
     # detail: side of a block [cells]; turn: which of all rubbles, a phase in turns that -1 and 1 share
-    Kind.RUBBLE: (
-        Range(0.03, 0.20, hard="high"),
-        Range(16, 48, whole=True, hard="high"),
-        Range(2, 8, whole=True),
-        Range(-0.5, 0.5),
-    ),
+    Kind.RUBBLE: (_hard(0.03, 0.20), _whole(16, 48, "high"), _whole(2, 8), Range(-0.5, 0.5)),
 }
 """Ranges of an element's size, length, detail and turn, by its kind."""
 
@@ -317,13 +301,10 @@ def _rasterise_elements_kernel(elements: wp.array2d[Element], heights_out: wp.ar
 
 
 def lay_out(genes: Any) -> Any:
-    """The elements of courses, in order.
+    """The elements of courses, in order: an array of :class:`Element`, shape (num_terrains, 6).
 
     Args:
         genes: Warp array, shape (num_terrains, 36); clipped to [-1, 1], six an element in the order of :data:`GENES`.
-
-    Returns:
-        Warp array of :class:`Element`, shape (num_terrains, 6).
     """
     num_genes = MAX_ELEMENTS * GENES_PER_ELEMENT
     if genes.ndim != 2 or genes.shape[1] != num_genes:
@@ -348,12 +329,7 @@ def place(elements: Any) -> None:
 
 
 def rasterise_elements(elements: Any, heights_out: Any) -> None:
-    """Rasterise elements that lie already.
-
-    Args:
-        elements: As :func:`lay_out` and :func:`place` leave them, shape (num_terrains, num_elements).
-        heights_out: As of :func:`rasterise`.
-    """
+    """Rasterise elements that :func:`lay_out` or :func:`place` laid, shape (num_terrains, num_elements)."""
     wp.launch(_rasterise_elements_kernel, heights_out.shape, [elements], outputs=[heights_out], device=elements.device)
 
 

@@ -39,19 +39,6 @@ class Invalidity(IntEnum):
     OVERFLOW = 4
 
 
-_RUNNING = wp.constant(int(Outcome.RUNNING))
-_GOAL = wp.constant(int(Outcome.GOAL))
-_BASE_COLLISION = wp.constant(int(Outcome.BASE_COLLISION))
-_TIME_OUT = wp.constant(int(Outcome.TIME_OUT))
-_OUT = wp.constant(int(Outcome.OUT))
-_INVALID = wp.constant(int(Outcome.INVALID))
-_TILT = wp.constant(int(Outcome.TILT))
-_NO_INVALIDITY = wp.constant(int(Invalidity.NONE))
-_ACTION = wp.constant(int(Invalidity.ACTION))
-_STATE = wp.constant(int(Invalidity.STATE))
-_SPEED = wp.constant(int(Invalidity.SPEED))
-_OVERFLOW = wp.constant(int(Invalidity.OVERFLOW))
-
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
 
@@ -124,7 +111,7 @@ def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
 @wp.func
 def begin_episode(env: int, episodes_out: Episodes):
     """Set an episode running, with no step made."""
-    episodes_out.outcome[env] = _RUNNING
+    episodes_out.outcome[env] = int(Outcome.RUNNING)
     episodes_out.steps[env] = 0
     episodes_out.counted[env] = 0
     episodes_out.base_force[env] = 0.0
@@ -176,7 +163,7 @@ def _command_goal_kernel(
     """Grid (num_envs,)."""
     env = wp.tid()
     command = wp.vec3(0.0)
-    if outcome[env] == _RUNNING:
+    if outcome[env] == Outcome.RUNNING:
         command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), task)
     for k in range(3):
         command_out[env, k] = command[k]
@@ -195,14 +182,14 @@ def find_invalidity(
 ) -> int:  # fmt: skip
     """Why a step is invalid, if it is; causes go before what comes of them."""
     if not row_is_finite(action, env):
-        return _ACTION
+        return int(Invalidity.ACTION)
     if (overflow & task.overflow_mask) != 0:
-        return _OVERFLOW
+        return int(Invalidity.OVERFLOW)
     if not row_is_finite(joint_q, env) or not row_is_finite(joint_qd, env):
-        return _STATE
+        return int(Invalidity.STATE)
     if is_too_fast(joint_qd, env, task.max_speed):
-        return _SPEED
-    return _NO_INVALIDITY
+        return int(Invalidity.SPEED)
+    return int(Invalidity.NONE)
 
 
 @wp.func
@@ -210,20 +197,20 @@ def judge_state(
     joint_q: wp.array2d[float], base_force: float, invalidity: int, steps: int, task: Task, env: int
 ) -> int:
     """Outcome of an episode after its ``steps``-th step; the gravest of several wins."""
-    if invalidity != _NO_INVALIDITY:
-        return _INVALID
+    if invalidity != Invalidity.NONE:
+        return int(Outcome.INVALID)
     if base_force > task.base_force:
-        return _BASE_COLLISION
+        return int(Outcome.BASE_COLLISION)
     if projected_gravity(joint_q, env)[2] > task.max_gravity_z:
-        return _TILT
+        return int(Outcome.TILT)
     position = base_position(joint_q, env)
     if is_at_goal(position, task):
-        return _GOAL
+        return int(Outcome.GOAL)
     if is_out(position, task):
-        return _OUT
+        return int(Outcome.OUT)
     if steps >= task.max_steps:
-        return _TIME_OUT
-    return _RUNNING
+        return int(Outcome.TIME_OUT)
+    return int(Outcome.RUNNING)
 
 
 @wp.kernel
@@ -234,13 +221,7 @@ def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.arra
 
 
 def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
-    """Note how hard the bases are touched in a physics step after which the episodes are not judged.
-
-    Args:
-        geom_force: Contact forces of the physics step, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
-        episodes_out: Raises ``base_force``.
-    """
+    """Raise ``base_force`` to how hard bases are touched in a physics step after which no episode is judged."""
     inputs, device = [geom_force, geom_role], geom_force.device
     wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
 
@@ -261,7 +242,7 @@ def _latch_outcomes_kernel(
     """Grid (num_envs,)."""
     env = wp.tid()
     episodes_out.counted[env] = 0
-    if episodes_out.outcome[env] != _RUNNING:
+    if episodes_out.outcome[env] != Outcome.RUNNING:
         return
     steps = episodes_out.steps[env] + 1
     bits = overflow[env]
@@ -272,9 +253,9 @@ def _latch_outcomes_kernel(
     outcome = judge_state(joint_q, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
-    if outcome != _INVALID and steps >= task.first_counted_step:
+    if outcome != Outcome.INVALID and steps >= task.first_counted_step:
         episodes_out.counted[env] = 1
-    if outcome != _RUNNING:
+    if outcome != Outcome.RUNNING:
         episodes_out.outcome[env] = outcome
         episodes_out.invalidity[env] = invalidity
         episodes_out.final_pose[env] = wp.transform(base_position(joint_q, env), base_rotation(joint_q, env))
@@ -284,19 +265,10 @@ def latch_outcomes(
     joint_q: Any, joint_qd: Any, action: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
     contact_capacity: int, task: Task, episodes_out: Episodes,
 ) -> None:  # fmt: skip
-    """Judge every running episode after a step and latch its end.
+    """Judge every running episode after a step and latch its end; forget what forces were noted.
 
-    Args:
-        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        action: The step's actions as :func:`kernels.observation.apply_action` left them, shape (num_envs, num_joints).
-        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
-        overflow: Solver overflow bits of the step, shape (num_envs,).
-        contact_count: Terrain contacts found in the step, shape (1,).
-        contact_capacity: Contacts that fit.
-        task: Goal and limits.
-        episodes_out: Updated in place; forgets what forces were noted.
+    Coordinates and forces are those after the step, the action as :func:`kernels.observation.apply_action` left it.
+    ``overflow`` (num_envs,) are the solver's bits of the step; ``contact_count`` (1,) terrain contacts were found.
     """
     inputs = [joint_q, joint_qd, action, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
     wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
@@ -312,7 +284,7 @@ def _park_ended_kernel(
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
-    if outcome[env] == _RUNNING:
+    if outcome[env] == Outcome.RUNNING:
         return
     for k in range(joint_qd_out.shape[1]):
         joint_qd_out[env, k] = 0.0
@@ -330,19 +302,7 @@ def park_ended(outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_
 
     They would otherwise cost as much as the others, and more on their backs. Call it every control step: in between,
     they fall by millimetres.
-
-    Args:
-        outcome: Shape (num_envs,).
-        default_joint_pos: Default pose [rad], shape (num_joints,).
-        joint_q_out: Shape (num_envs, 7 + num_joints).
-        joint_qd_out: Shape (num_envs, 6 + num_joints).
-        targets_out: Joint targets in columns 7 and up, shape (num_envs, 7 + num_joints).
     """
     inputs = [outcome, default_joint_pos]
-    wp.launch(
-        _park_ended_kernel,
-        outcome.shape[0],
-        inputs,
-        outputs=[joint_q_out, joint_qd_out, targets_out],
-        device=outcome.device,
-    )
+    outputs = [joint_q_out, joint_qd_out, targets_out]
+    wp.launch(_park_ended_kernel, outcome.shape[0], inputs, outputs=outputs, device=outcome.device)

@@ -103,22 +103,11 @@ def tell_contacts(
 ) -> None:  # fmt: skip
     """Give each terrain contact the friction and softness of the patch that its point on the ground lies in.
 
-    Args:
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        ground: Maps of the terrains.
-        bodies: Of the robots' shapes.
-        layout: Strides of the flat model arrays.
-        contacts: What :func:`kernels.contact.collide_strips` found.
-        records_out: Columns beside them.
+    Contacts are those that :func:`kernels.contact.collide_strips` found.
     """
     inputs = [terrain_of_env, ground, bodies, layout, contacts]
-    wp.launch(
-        _tell_contacts_kernel,
-        contacts.shape0.shape[0],
-        inputs,
-        outputs=[records_out],
-        device=terrain_of_env.device,
-    )
+    capacity, device = contacts.shape0.shape[0], terrain_of_env.device
+    wp.launch(_tell_contacts_kernel, capacity, inputs, outputs=[records_out], device=device)
 
 
 @wp.func
@@ -174,12 +163,12 @@ def make_ground(num_terrains: int, device: str) -> Ground:
 
 
 def make_bodies(inverse_weight: np.ndarray, impedance: np.ndarray, time_constant: np.ndarray, device: str) -> Bodies:
-    """What a solver makes of stiffness and damping.
+    """What a solver makes of stiffness and damping, from arrays of shape (num_shapes,).
 
     Args:
-        inverse_weight: MuJoCo's ``invweight0`` of each shape's body, translational [1/kg], shape (num_shapes,).
-        impedance: Upper impedance of each shape's contacts, below 1, shape (num_shapes,).
-        time_constant: Contact time constant of each shape on firm ground [s], shape (num_shapes,).
+        inverse_weight: MuJoCo's ``invweight0`` of each shape's body, translational [1/kg].
+        impedance: Upper impedance of each shape's contacts, below 1.
+        time_constant: Contact time constant of each shape on firm ground [s].
         device: Warp device name.
     """
     bodies = Bodies()

@@ -21,11 +21,7 @@ def fits(words: int) -> bool:
 
 
 def worlds_of_block(words: int) -> int:
-    """How many worlds share a block of threads.
-
-    Args:
-        words: Words of memory that each needs, that :func:`fits`.
-    """
+    """How many worlds, each of words that :func:`fits`, share a block of threads."""
     return min(_MOST_WORLDS, _BLOCK_WORDS // words)
 
 
@@ -42,14 +38,6 @@ def snippet(body: Path, *, words: int, **values: Any) -> str:
 
 
 def launch(kernel: Any, num_worlds: int, inputs: list[Any], *, words: int, device: Any) -> None:
-    """Launches a kernel over all worlds.
-
-    Args:
-        kernel: Of a grid (num_worlds * lanes,).
-        num_worlds: How many there are.
-        inputs: Of the kernel.
-        words: Words of memory that a world needs.
-        device: Where.
-    """
+    """Launches a kernel of a grid (num_worlds * lanes,) over worlds that each need so many words of memory."""
     lanes = 1 if device.is_cpu else _WARP
     wp.launch(kernel, num_worlds * lanes, inputs=inputs, block_dim=worlds_of_block(words) * _WARP, device=device)

@@ -132,17 +132,8 @@ def write_observation(
 ) -> None:  # fmt: skip
     """Write one observation row an environment (columns: module docstring).
 
-    Args:
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
-        command: Commanded vx, vy [m/s] in the base's yaw frame and yaw rate [rad/s], shape (num_envs, 3).
-        last_action: Action of the step before, shape (num_envs, num_joints).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        terrain: Height grids.
-        sensors: Default pose, scan points, mass centre.
-        noise: Noise widths.
-        noise_seed: One integer on the device, to be advanced by the caller; shape (1,).
-        observation_out: Shape (num_envs, 12 + 3 * num_joints + num_scan_points).
+    The command is in the base's yaw frame. ``noise_seed`` is one integer on the device that the caller advances, shape
+    (1,); ``observation_out`` has shape (num_envs, 12 + 3 * num_joints + num_scan_points).
     """
     num_envs, num_joints = last_action.shape
     expected = (num_envs, NUM_BASE_COLUMNS + 3 * num_joints + sensors.scan_x.shape[0])
@@ -169,14 +160,7 @@ def _apply_action_kernel(
 def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: Any, targets_out: Any) -> None:
     """Turn actions into joint position targets [rad]: default pose + ``scale`` * clip(action, -100, 100).
 
-    One that is not finite becomes NaN, and its episode invalid.
-
-    Args:
-        action: Policy output, shape (num_envs, num_joints).
-        sensors: Holds the default pose.
-        scale: Radians per unit of action.
-        last_action_out: The clipped action, shape (num_envs, num_joints).
-        targets_out: Targets in columns 7 and up, shape (num_envs, 7 + num_joints).
+    One that is not finite becomes NaN, and its episode invalid. ``last_action_out`` is the clipped action.
     """
     if tuple(action.shape) != tuple(last_action_out.shape):
         raise ValueError(f"action must have shape {tuple(last_action_out.shape)}, got {tuple(action.shape)}")

@@ -67,18 +67,11 @@ def _sum_geom_forces_kernel(
 
 
 def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_out: Any) -> None:
-    """Sum the contact forces on each robot geom, world frame [N].
-
-    Args:
-        contacts: The solver's contacts and forces of the step just made.
-        column_of_geom: Column of each solver geom, -1 for others, shape (num_solver_geoms,).
-        geom_force_out: Vectors, shape (num_envs, num_geoms); overwritten.
-    """
+    """Sum the contact forces on each robot geom; ``column_of_geom`` is that of each solver geom, -1 for others."""
     geom_force_out.zero_()
     inputs = [contacts, column_of_geom]
-    wp.launch(
-        _sum_geom_forces_kernel, contacts.capacity, inputs, outputs=[geom_force_out], device=geom_force_out.device
-    )
+    device = geom_force_out.device
+    wp.launch(_sum_geom_forces_kernel, contacts.capacity, inputs, outputs=[geom_force_out], device=device)
 
 
 @wp.func
@@ -205,17 +198,7 @@ def add_penalties(
 ) -> None:  # fmt: skip
     """Add one physics step's raw penalties times ``dt`` to the sums, columns :data:`PENALTIES`.
 
-    Args:
-        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        base_com: Mass centre of the base in its frame [m].
-        command: Command held over the control step: vx, vy [m/s], yaw rate [rad/s]; shape (num_envs, 3).
-        geom_force: Contact forces, world frame [N], shape (num_envs, num_geoms).
-        geom_role: Role bits, shape (num_geoms,).
-        force_limit: Highest foot contact force that costs nothing [N].
-        dt: Physics step [s].
-        counted: 0 where the step does not count, shape (num_envs,).
-        sums_out: Sums so far, shape (num_envs, 6).
+    Where the int ``counted`` (num_envs,) is 0, nothing is added. Foot forces up to ``force_limit`` [N] cost nothing.
     """
     if tuple(sums_out.shape) != (counted.shape[0], len(PENALTIES)):
         raise ValueError(

@@ -14,7 +14,6 @@ import warp as wp
 from kernels.episode import Episodes, Outcome
 from kernels.rewards import Rewards
 
-_RUNNING = wp.constant(int(Outcome.RUNNING))
 _TAKEN = wp.constant(0)
 _READY = wp.constant(1)
 
@@ -54,16 +53,7 @@ class EpisodeQueue:
 def make_queue(
     num_envs: int, num_slots: int, num_replicas: int, num_penalties: int, *, rewarded: bool, device: str
 ) -> EpisodeQueue:
-    """Allocate an empty queue.
-
-    Args:
-        num_envs: Number of robots.
-        num_slots: Terrains that fit at once.
-        num_replicas: Episodes a terrain.
-        num_penalties: Columns of the penalty sums.
-        rewarded: Whether rewards are kept.
-        device: Warp device name.
-    """
+    """Allocate an empty queue for ``num_slots`` terrains at once; ``rewarded`` queues keep rewards too."""
     rows = num_slots * num_replicas
     queue = EpisodeQueue()
     queue.num_replicas = num_replicas
@@ -71,10 +61,14 @@ def make_queue(
     queue.seed = wp.zeros(num_slots, dtype=wp.uint32, device=device)
     queue.num_ended = wp.zeros(num_slots, dtype=int, device=device)
     queue.episode_of_env = wp.full(num_envs, -1, dtype=int, device=device)
-    queue.begins = wp.zeros(num_envs, dtype=int, device=device)
-    queue.busy = wp.zeros(num_envs, dtype=int, device=device)
-    for name in ("outcome", "invalidity", "steps"):
-        setattr(queue, name, wp.zeros(rows, dtype=int, device=device))
+    for name, size in {
+        "begins": num_envs,
+        "busy": num_envs,
+        "outcome": rows,
+        "invalidity": rows,
+        "steps": rows,
+    }.items():
+        setattr(queue, name, wp.zeros(size, dtype=int, device=device))
     queue.final_pose = wp.zeros(rows, dtype=wp.transform, device=device)
     queue.penalty_sums = wp.zeros((rows, num_penalties), dtype=float, device=device)
     queue.reward = wp.zeros(rows if rewarded else 0, dtype=float, device=device)
@@ -130,7 +124,7 @@ def _turn_over_kernel(
     row = queue_out.episode_of_env[env]
     if row >= 0:
         queue_out.busy[env] += 1
-    if stepped[env] == _RUNNING:
+    if stepped[env] == Outcome.RUNNING:
         return
     if row >= 0:
         _write_down(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
@@ -155,22 +149,11 @@ def turn_over(
 
     It moves no robot: :func:`kernels.restart.restart_episodes` does, where ``begins`` is 1.
 
-    Args:
-        stepped: :class:`kernels.episode.Outcome` of what each robot is stepped for, shape (num_envs,); not
-            ``episodes_out.outcome`` where a robot goes on after the crossing has ended.
-        rewards: Totals; empty where nothing is rewarded.
-        episodes_out: How each crossing ended; ``rng`` is written where one begins.
-        penalty_sums_out: Penalty sums of each robot, shape (num_envs, num_penalties); zero where one begins.
-        terrain_of_env_out: Terrain of each robot, shape (num_envs,); written where one begins.
-        queue_out: Updated in place.
+    ``stepped`` is the outcome of what each robot is stepped for; not ``episodes_out.outcome`` where a robot goes on
+    after the crossing has ended. Where an episode begins, ``rng`` and terrain are written and penalty sums are zero.
     """
-    wp.launch(
-        _turn_over_kernel,
-        stepped.shape[0],
-        inputs=[stepped, rewards],
-        outputs=[episodes_out, penalty_sums_out, terrain_of_env_out, queue_out],
-        device=stepped.device,
-    )
+    outputs = [episodes_out, penalty_sums_out, terrain_of_env_out, queue_out]
+    wp.launch(_turn_over_kernel, stepped.shape[0], [stepped, rewards], outputs=outputs, device=stepped.device)
 
 
 @wp.kernel

@@ -112,28 +112,14 @@ def restart_episodes(
     mask: Any, terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, sensors: Sensors, joint_q_out: Any,
     joint_qd_out: Any, last_action_out: Any, episodes_out: Episodes, rewards_out: Rewards,
 ) -> None:  # fmt: skip
-    """Put robots at a new randomised start, with nothing remembered of the episode before.
+    """Put robots at a new randomised start where the int ``mask`` (num_envs,) is not 0, with nothing remembered.
 
-    Args:
-        mask: Not 0 where an episode begins, int, shape (num_envs,).
-        terrain_of_env: Terrain of each environment, shape (num_envs,).
-        terrain: Height grids.
-        ranges: Nominal start and ranges.
-        sensors: Holds the default pose and the mass centre of the base.
-        joint_q_out: Joint coordinates, shape (num_envs, 7 + num_joints).
-        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints).
-        last_action_out: Action of the step before, shape (num_envs, num_joints).
-        episodes_out: Set running, zero steps; starts are drawn from ``rng``.
-        rewards_out: Nothing summed; empty where nothing is rewarded.
+    Starts are drawn from ``rng`` of the episodes, which run from then on. ``rewards_out`` is empty where nothing is
+    rewarded.
     """
     inputs = [mask, terrain_of_env, terrain, ranges, sensors]
-    wp.launch(
-        _restart_episodes_kernel,
-        terrain_of_env.shape[0],
-        inputs,
-        outputs=[joint_q_out, joint_qd_out, last_action_out, episodes_out, rewards_out],
-        device=joint_q_out.device,
-    )
+    outputs = [joint_q_out, joint_qd_out, last_action_out, episodes_out, rewards_out]
+    wp.launch(_restart_episodes_kernel, terrain_of_env.shape[0], inputs, outputs=outputs, device=joint_q_out.device)
 
 
 @wp.kernel

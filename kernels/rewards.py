@@ -18,9 +18,6 @@ TRACKING_VARIANCE = wp.constant(0.25)
 TOUCH_FORCE = wp.constant(1.0)
 MIN_COMMANDED_SPEED = wp.constant(0.1)
 
-_RUNNING = wp.constant(int(Outcome.RUNNING))
-_INVALID = wp.constant(int(Outcome.INVALID))
-
 
 @wp.struct
 class Motion:
@@ -270,10 +267,10 @@ class RewardWeights:
 
 
 def make_weights(weights: dict[str, float], *, only_positive: bool, falls: Collection[Outcome]) -> RewardWeights:
-    """Weights as a kernel argument.
+    """Weights of :data:`REWARDS` per second as a kernel argument.
 
     Args:
-        weights: Weight of each of :data:`REWARDS` per second.
+        weights: By name.
         only_positive: Clip the sum of the terms at 0; a fall is not clipped.
         falls: Outcomes that cost ``termination``.
     """
@@ -304,9 +301,9 @@ def _reward_steps_kernel(motion: Motion, weights: RewardWeights, outcome: wp.arr
     env = wp.tid()
     ended = outcome[env]
     running = rewards_out.running[env]
-    rewards_out.running[env] = wp.where(ended == _RUNNING, 1, 0)
+    rewards_out.running[env] = wp.where(ended == Outcome.RUNNING, 1, 0)
     reward = float(0.0)
-    if running == 1 and ended != _INVALID:
+    if running == 1 and ended != Outcome.INVALID:
         for k in range(_NUM_TERMS):
             weighted = weights.terms[k] * wp.static(_FUNCTIONS[k])(motion, rewards_out, env)
             reward += weighted
@@ -324,13 +321,7 @@ def reward_steps(motion: Motion, weights: RewardWeights, outcome: Any, rewards_o
     """Reward one control step: the weighted sum of all terms times the control step.
 
     A step is paid if its episode had not ended before. A step that ends in an invalid state pays no term; one that ends
-    in a fall pays its price too.
-
-    Args:
-        motion: What the step ended in.
-        weights: What it pays.
-        outcome: :class:`kernels.episode.Outcome` after the step, shape (num_envs,).
-        rewards_out: Updated, but for what :func:`remember_steps` writes.
+    in a fall pays its price too. ``outcome`` is that after the step.
     """
     inputs = [motion, weights, outcome]
     wp.launch(_reward_steps_kernel, outcome.shape[0], inputs, outputs=[rewards_out], device=outcome.device)
@@ -349,13 +340,6 @@ def _remember_steps_kernel(
 
 
 def remember_steps(action: Any, joint_qd: Any, rewards_out: Rewards, counter_out: Any) -> None:
-    """Keep what the next step's rewards are compared with, and count the step; its last launch.
-
-    Args:
-        action: Clipped action, shape (num_envs, num_joints).
-        joint_qd: Joint velocities, shape (num_envs, 6 + num_joints).
-        rewards_out: Writes ``previous_action`` and ``previous_joint_vel``.
-        counter_out: Control steps so far, shape (1,).
-    """
+    """Keep what the next step's rewards are compared with, and count the step in ``counter_out`` (1,)."""
     inputs = [action, joint_qd]
     wp.launch(_remember_steps_kernel, action.shape, inputs, outputs=[rewards_out, counter_out], device=action.device)

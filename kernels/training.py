@@ -18,8 +18,6 @@ STATISTICS = (
 )  # fmt: skip
 """Columns of the sums that training progress is read from; the outcomes count episodes."""
 
-_RUNNING = wp.constant(int(Outcome.RUNNING))
-_INVALID = wp.constant(int(Outcome.INVALID))
 # Columns of STATISTICS as a kernel needs them.
 _STEPS = wp.constant(STATISTICS.index("steps"))
 _EPISODES = wp.constant(STATISTICS.index("episodes"))
@@ -92,16 +90,7 @@ class Training:
 def make_training(
     columns: Any, levels: Any, *, num_joints: int, observation_size: int, first_count: int, device: str
 ) -> Training:
-    """Allocate what training keeps, all zero but for what is given.
-
-    Args:
-        columns: Terrain column of each environment, integers of shape (num_envs,).
-        levels: Terrain level of each environment, likewise.
-        num_joints: Number of actuated joints.
-        observation_size: Columns of the observation.
-        first_count: Where the counter starts: a number drawn from the seed.
-        device: Warp device name.
-    """
+    """Allocate what training keeps, zero but for terrain columns and levels, (num_envs,), and the first count."""
     num_envs = len(columns)
     training = Training()
     training.counter = wp.array([first_count], dtype=int, device=device)
@@ -131,14 +120,14 @@ def _record_steps_kernel(
     outcome = episodes.outcome[env]
     training_out.ended[env] = outcome
     training_out.statistics[env, _STEPS] += 1.0
-    if outcome != _RUNNING:
+    if outcome != Outcome.RUNNING:
         training_out.statistics[env, _EPISODES] += 1.0
         training_out.statistics[env, _OUTCOMES + outcome] += 1.0
         training_out.statistics[env, _EPISODE_STEPS] += float(episodes.steps[env])
         training_out.statistics[env, _EPISODE_REWARD] += rewards.total[env]
     if (overflow[env] & rules.overflow_mask) != 0:
         training_out.statistics[env, _OVERFLOW] += 1.0
-    if outcome != _INVALID:
+    if outcome != Outcome.INVALID:
         lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
         ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
         error = wp.vec2(lin_vel[0] - training_out.command[env, 0], lin_vel[1] - training_out.command[env, 1])
@@ -152,15 +141,7 @@ def record_steps(
 ) -> None:  # fmt: skip
     """Note how a judged and rewarded step ended, and add it to the statistics.
 
-    Args:
-        joint_q: Joint coordinates after the step, shape (num_envs, 7 + num_joints).
-        joint_qd: Joint velocities after the step, shape (num_envs, 6 + num_joints).
-        base_com: Mass centre of the base in its frame [m].
-        overflow: Solver overflow bits of the last physics step, shape (num_envs,).
-        rules: Which bits count.
-        episodes: Outcomes and steps.
-        rewards: Totals.
-        training_out: Writes ``ended``; adds to ``statistics``.
+    ``overflow`` (num_envs,) are the solver's bits of its last physics step.
     """
     inputs = [joint_q, joint_qd, base_com, overflow, rules, episodes, rewards]
     wp.launch(_record_steps_kernel, joint_q.shape[0], inputs, outputs=[training_out], device=joint_q.device)
@@ -190,10 +171,10 @@ def _promote_episodes_kernel(
     """Grid (num_envs,)."""
     env = wp.tid()
     outcome = episodes.outcome[env]
-    if outcome == _RUNNING:
+    if outcome == Outcome.RUNNING:
         return
     level = training_out.level[env]
-    if outcome != _INVALID:
+    if outcome != Outcome.INVALID:
         rng = _random_stream(training_out.counter[0], _STREAM_LEVEL, joint_q.shape[0], env)
         drawn = wp.randi(rng, 0, rules.num_levels)
         walked = wp.length(wp.vec2(joint_q[env, 0], joint_q[env, 1]) - episodes.start[env])
@@ -206,23 +187,10 @@ def _promote_episodes_kernel(
 def promote_episodes(
     joint_q: Any, episodes: Episodes, rules: Rules, terrain_of_env_out: Any, training_out: Training
 ) -> None:
-    """Move the ended episodes up or down the terrain levels by how far they came; an invalid one stays.
-
-    Args:
-        joint_q: Joint coordinates at the end, shape (num_envs, 7 + num_joints).
-        episodes: Outcomes and starts.
-        rules: Levels, columns and the distances that decide.
-        terrain_of_env_out: Tile of each environment, shape (num_envs,).
-        training_out: Updates ``level``.
-    """
+    """Move the ended episodes up or down the terrain levels by how far they came; an invalid one stays."""
     inputs = [joint_q, episodes, rules]
-    wp.launch(
-        _promote_episodes_kernel,
-        joint_q.shape[0],
-        inputs,
-        outputs=[terrain_of_env_out, training_out],
-        device=joint_q.device,
-    )
+    outputs = [terrain_of_env_out, training_out]
+    wp.launch(_promote_episodes_kernel, joint_q.shape[0], inputs, outputs=outputs, device=joint_q.device)
 
 
 @wp.kernel
@@ -281,15 +249,7 @@ def command_episodes(
     """Tell every robot what to do next, and push where that is due.
 
     Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
-    and headings become yaw rates.
-
-    Args:
-        joint_q: Joint coordinates, shape (num_envs, 7 + num_joints).
-        episodes: Steps.
-        rules: Ranges and intervals.
-        task: Goal, and how headings become yaw rates.
-        joint_qd_out: Joint velocities, shape (num_envs, 6 + num_joints); a push overwrites vx and vy.
-        training_out: Updates ``heading`` and ``command``.
+    and headings become yaw rates. A push overwrites vx and vy of ``joint_qd_out``.
     """
     inputs = [joint_q, episodes, rules, task]
     wp.launch(
