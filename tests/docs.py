@@ -5,7 +5,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,18 +29,7 @@ def code_of(page: str, language: str = "") -> list[str]:
     return [code for name, code in blocks if name == language]
 
 
-class Line(NamedTuple):
-    """A command line of a page."""
-
-    page: str
-    words: tuple[str, ...]
-    """Without variables of the environment before them."""
-
-    def __str__(self) -> str:
-        return shlex.join(self.words)
-
-
-def commands_of(page: str) -> list[Line]:
+def commands_of(page: str) -> list[str]:
     """Command lines in the code blocks of a page that call ``faultline`` or ``make``, through torchrun too."""
     lines = []
     for line in "\n".join(code_of(page)).splitlines():
@@ -53,11 +42,11 @@ def commands_of(page: str) -> list[Line]:
         if words and words[0].endswith("torchrun"):
             words = words[words.index("-m") + 1 :]
         if words and words[0] in _PROGRAMS:
-            lines.append(Line(page, tuple(words)))
+            lines.append(shlex.join(words))
     return lines
 
 
-def run_by_make(words: tuple[str, ...]) -> list[str]:
+def run_by_make(words: Sequence[str]) -> list[str]:
     """The last command that ``make`` would run, word by word; nothing runs.
 
     ``make`` runs without the environment: one that runs the tests would hand on its own flags.

@@ -143,16 +143,15 @@ def half_of(dose: Dose, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         rows: Of one controller, the easiest value first.
 
     Returns:
-        ``element``, ``parameter``, ``unit``, ``controller``, ``value``, ``interval`` and ``words``. The interval ends
-        where the limits of the goal rates pass a half. None stands for what lies beyond the values.
+        ``element``, ``parameter``, ``unit``, ``controller``, ``value`` and ``interval``. The interval ends where the
+        limits of the goal rates pass a half. None stands for what lies beyond the values.
     """
     known = [row for row in rows if row["goal_rate"] is not None]
     values = [row["value"] for row in known]
     value = _passes_half(values, [row["goal_rate"] for row in known])
     limits = [_passes_half(values, [row["interval"][end] for row in known]) for end in (0, 1)]
     about = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    interval = limits if dose.harder_up else limits[::-1]
-    return {**about, "value": value, "interval": interval, "words": _half_words(dose, known, value, interval)}
+    return {**about, "value": value, "interval": limits if dose.harder_up else limits[::-1]}
 
 
 def _passes_half(values: Sequence[float], rates: Sequence[float]) -> float | None:
@@ -165,29 +164,17 @@ def _passes_half(values: Sequence[float], rates: Sequence[float]) -> float | Non
     return values[last] + share * (values[first] - values[last])
 
 
-def _half_words(
-    dose: Dose, rows: Sequence[dict[str, Any]], value: float | None, interval: Sequence[float | None]
-) -> str:
-    if not rows:
-        return "too many episodes are invalid"
-    if value is None and rows[0]["goal_rate"] < FAILING_GOAL_RATE:
-        return f"fewer even at {dose.in_words(rows[0]['value'])}"
-    if value is None:
-        return f"more at every value, {'up' if dose.harder_up else 'down'} to {dose.in_words(rows[-1]['value'])}"
-    low, high = ("?" if limit is None else dose.in_words(limit) for limit in interval)
-    return f"at {dose.in_words(value)} ({low} to {high})"
-
-
 def show_dose(report: dict[str, Any]) -> None:
     """Prints the goal rates of every element by value and controller, and where under half reach the goal."""
     for element, title in report["titles"].items():
         rows = [row for row in report["dose"] if row["element"] == element]
-        halves = {half["controller"]: half["words"] for half in report["half"] if half["element"] == element}
+        lines = []
+        for half in (half for half in report["half"] if half["element"] == element):
+            rates = [row["goal_rate"] for row in rows if row["controller"] == half["controller"]]
+            low, high = (value_words(limit, None, ".2f") for limit in half["interval"])
+            passed = "-" if half["value"] is None else f"{half['value']:.2f} ({low} to {high})"
+            lines.append((half["controller"], *(value_words(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
         unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
-        lines = []
-        for controller, words in halves.items():
-            rates = [row["goal_rate"] for row in rows if row["controller"] == controller]
-            lines.append((controller, *(value_words(rate, None, ".0%") for rate in rates), words))
         head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots reach the goal")
         show_table(f"{title}: robots that reach the goal", head, lines)

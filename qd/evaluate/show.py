@@ -144,8 +144,6 @@ def show_pack_test(report: dict[str, Any]) -> None:
     """Prints what of a pack a controller fails, beside the pack's controllers."""
     rates = {"this": report["rates"], **report["beside"]}
     _show_pack_rates(f"pack {report['pack']['folder']} of {report['pack']['robot']}", rates)
-    if (report["seed"], report["episodes"]) != (report["pack"]["seed"], report["pack"]["episodes"]):
-        print("Episodes differ from those of the pack's controllers in number or start.")
     modes = {mode["mode"]: f"{mode['mode']}: {mode['ending']}, {mode['marked_by']}" for mode in report["pack"]["modes"]}
     for group in ("verdict", "mode", "cause", "kind"):
         rows = [

@@ -112,10 +112,6 @@ class Dose:
         """Whether larger values are harder."""
         return (self.parameter, self.kind) not in (("friction", None), ("width", Kind.BRIDGE))
 
-    def in_words(self, value: float) -> str:
-        """A value of the parameter with its unit."""
-        return self.quantities[self.parameter].in_words(value)
-
     def describe(self) -> str:
         """The obstacle and its other parameters in words: ``stairs up, tread 0.30 m, flight 5 steps``."""
         return ", ".join(
