@@ -76,7 +76,7 @@ class Film(Who, OnDevice, Which, Mapped):
 
     def execute(self) -> None:
         """Makes the films."""
-        from qd.show.cross import MapScale, read_own_terrain
+        from qd.show.cross import read_own_terrain
         from qd.show.elites import find_archive
         from qd.show.film import RECORDING, film_elites, film_map, film_recording
         from qd.workers.evaluator import resolve_device
@@ -87,10 +87,10 @@ class Film(Who, OnDevice, Which, Mapped):
         if self.terrain is not None and self.terrain.name.endswith(RECORDING):
             film_recording(self.terrain, self.look, robot=self.robot, policy=self.policy, out=self.out)
             return
-        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed, "out": self.out}
-        crossing["device"] = resolve_device(self.device)
+        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed, "out": self.out,
+                    "device": resolve_device(self.device)}  # fmt: skip
         if self.terrain is not None:
-            terrain = read_own_terrain(self.terrain, MapScale(self.size, self.scale, self.offset))
+            terrain = read_own_terrain(self.terrain, self.size, self.scale, self.offset)
             film_map(terrain, get_robot(self.robot or "anymal"), self.look, **crossing)
             return
         found = find_archive(self.robot, self.run, space=self.space)
@@ -123,11 +123,11 @@ class Cross(Who, OnDevice, Mapped):
 
     def execute(self) -> None:
         """Crosses the map, prints rates and costs, writes numbers and figure."""
-        from qd.show.cross import MapScale, cross_map, read_own_terrain
+        from qd.show.cross import cross_map, read_own_terrain
         from qd.workers.evaluator import resolve_device
         from sim.robots.find import get_robot
 
-        terrain = read_own_terrain(self.terrain, MapScale(self.size, self.scale, self.offset))
+        terrain = read_own_terrain(self.terrain, self.size, self.scale, self.offset)
         cross_map(
             terrain, get_robot(self.robot or "anymal"), self.policy, episodes=self.episodes, seed=self.seed,
             device=resolve_device(self.device), out=self.out,

@@ -29,17 +29,6 @@ OWN_FOLDER = RUNS / "terrains"
 _LONGEST_NAME = 120  # characters of a path; with robot, controller and ending a file may have 255
 
 
-class MapScale(NamedTuple):
-    """How large and how high a height map is, where its file does not say so."""
-
-    size_m: tuple[float, float] | None = None
-    """Along x and y [m]."""
-    scale_m: float | None = None
-    """A gray level [m]."""
-    offset_m: float | None = None
-    """Height of gray level 0 [m]."""
-
-
 class OwnTerrain(NamedTuple):
     """A terrain from a file."""
 
@@ -66,14 +55,14 @@ class OwnTerrain(NamedTuple):
         return Recordings(robot, device=device).all_of([wanted])[0]
 
 
-def read_own_terrain(file: Path, scale: MapScale | None = None) -> OwnTerrain:
-    """The terrain that a height map becomes, by the rules of :mod:`sim.maps.heightmap`.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is no height map, or a number is missing or out of range.
-    """
-    heightmap = read_heightmap(file, **(scale or MapScale())._asdict())
+def read_own_terrain(
+    file: Path,
+    size_m: tuple[float, float] | None = None,
+    scale_m: float | None = None,
+    offset_m: float | None = None,
+) -> OwnTerrain:
+    """The terrain that a height map becomes; arguments as of :func:`sim.maps.heightmap.read_heightmap`."""
+    heightmap = read_heightmap(file, size_m=size_m, scale_m=scale_m, offset_m=offset_m)
     return OwnTerrain(file, as_terrain(heightmap), fitted(heightmap), heightmap.ground)
 
 
@@ -87,26 +76,10 @@ def cross_map(
     device: str = "cpu",
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Crosses a map, prints rates and costs, writes numbers and figure.
-
-    Args:
-        terrain: The map.
-        robot: The robot.
-        policy: The controller; the shipped one if None.
-        episodes: Crossings.
-        seed: Draws them.
-        device: Warp device name.
-        out: File for the numbers; the figure stands beside it.
-
-    Returns:
-        What the JSON has.
-
-    Raises:
-        AllInvalidError: If no crossing is valid.
-    """
+    """Crosses a map, prints rates and costs, writes numbers and figure."""
     policy = policy or str(robot.policy_file)
-    who = who_crossed(robot, policy)
-    out = out or OWN_FOLDER / f"{terrain.name}-{who}.json"
+    crosser = who_crossed(robot, policy)
+    out = out or OWN_FOLDER / f"{terrain.name}-{crosser}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {terrain.file.resolve(), terrain.file.with_suffix(".json").resolve()}
     if given & {out.resolve(), figure.resolve()}:
@@ -127,17 +100,13 @@ def cross_map(
     }
     print(describe(report))
     write_atomically(out, to_json(report))
-    save_figure(figure, draw_paths(crossed, f"{who} on {terrain.file.name}: {_headline(report)}"))
+    save_figure(figure, draw_paths(crossed, f"{crosser} on {terrain.file.name}: {_headline(report)}"))
     print(f"Numbers: {out}\nFigure: {figure}")
     return report
 
 
 def numbers_of(crossed: Crossed) -> dict[str, Any]:
-    """Rates with 95 % intervals (Wilson), how episodes ended, and raw penalties, over the valid episodes of a terrain.
-
-    Args:
-        crossed: The crossings, with every penalty recorded.
-    """
+    """Rates with 95 % intervals (Wilson), ends and raw penalties, over the valid episodes; at least one is."""
     recording, count = crossed.recording, len(crossed.chosen)
     ended = {o.name.lower(): int((recording.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
     hits = {"success": count - ended["base_collision"], "goal": ended["goal"], "fallen": crossed.rates["fallen"].hits}
@@ -146,43 +115,35 @@ def numbers_of(crossed: Crossed) -> dict[str, Any]:
         "invalid_episodes": recording.num_episodes - count,
         "invalid_reasons": invalid_reasons(recording.result()),
         "rates": {
-            name: {
-                "rate": number / count if count else None,
-                "hits": number,
-                "interval": list(wilson_interval(number, count)) if count else None,
-            }
+            name: {"rate": number / count, "hits": number, "interval": list(wilson_interval(number, count))}
             for name, number in hits.items()
         },
         "outcomes": ended,
-        "duration_s": float(recording.duration_s[0, crossed.chosen].mean()) if count else None,
+        "duration_s": float(recording.duration_s[0, crossed.chosen].mean()),
         "penalties": {
             name: {"mean": float(column.mean()), "std": float(column.std()), "unit": look_of(name).unit}
             for name, column in zip(recording.penalty_names, crossed.penalties.T, strict=True)
-            if count
         },
     }
 
 
-_LABELS = {"goal": "goal reached", "success": 'no base collision ("success")', "fallen": "fallen"}
-
-
 def _headline(report: dict[str, Any]) -> str:
     count = report["episodes"] - report["invalid_episodes"]
-    words = {"goal": "goal", "success": "no base collision"}
-    return ", ".join(f"{label} {rate_words(report['rates'][name]['hits'], count)}" for name, label in words.items())
+    goal, success = (rate_words(report["rates"][name]["hits"], count) for name in ("goal", "success"))
+    return f"goal {goal}, no base collision {success}"
 
 
 def describe(report: dict[str, Any]) -> str:
     """The numbers of a terrain, in words."""
     count = report["episodes"] - report["invalid_episodes"]
     lines = [f"{report['robot']} with {report['policy']} on {report['terrain']}, {report['episodes']} episodes:"]
-    for name, label in _LABELS.items():
+    labels = {"goal": "goal reached", "success": 'no base collision ("success")', "fallen": "fallen"}
+    for name, label in labels.items():
         lines.append(f"  {label:30}{rate_words(report['rates'][name]['hits'], count):>30}")
     for name, cost in report["penalties"].items():
         label = f"{name} [{cost['unit']}]"
         lines.append(f"  {label:30}{cost['mean']:>17.2f} +- {cost['std']:<9.2f}")
-    if count:
-        lines.append(f"  {'duration [s]':30}{report['duration_s']:>17.1f}")
+    lines.append(f"  {'duration [s]':30}{report['duration_s']:>17.1f}")
     if report["invalid_episodes"]:
         why = reason_words(report["invalid_reasons"])
         lines.append(f"  {report['invalid_episodes']} invalid episodes are left out: {why}.")

@@ -100,13 +100,7 @@ class Crossed:
 
 
 def crossed_of(recording: Recording, penalties: tuple[str, ...], scales: tuple[float, ...]) -> Crossed:
-    """A recording of one terrain in numbers.
-
-    Args:
-        recording: Of one terrain.
-        penalties: Those of the archive.
-        scales: One each.
-    """
+    """A recording of one terrain in numbers."""
     outcome = recording.outcome[0]
     chosen = np.flatnonzero(outcome != Outcome.INVALID)
     columns = [recording.penalty_names.index(name) for name in penalties]
@@ -135,9 +129,9 @@ def penalties_by_place(crossed: Crossed, penalties: tuple[str, ...], edges: NDAr
     """
     recording = crossed.recording
     columns = [recording.penalty_names.index(name) for name in penalties]
-    found = np.zeros((len(edges) - 1, len(columns)))
+    amounts = np.zeros((len(edges) - 1, len(columns)))
     for k, episode in enumerate(crossed.chosen):
         sums = recording.penalties[0, episode, : recording.num_frames[0, episode]][:, columns].astype(np.float64)
-        places = np.clip(np.digitize(crossed.path(k)[1:, 0], edges) - 1, 0, len(found) - 1)
-        np.add.at(found, places, np.diff(sums, axis=0))
-    return found / (crossed.scales * max(1, len(crossed.chosen)))
+        places = np.clip(np.digitize(crossed.path(k)[1:, 0], edges) - 1, 0, len(amounts) - 1)
+        np.add.at(amounts, places, np.diff(sums, axis=0))
+    return amounts / (crossed.scales * max(1, len(crossed.chosen)))

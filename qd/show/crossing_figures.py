@@ -13,18 +13,11 @@ from qd.show.figures import look_of
 from sim.files.figures import new_figure
 from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
-_BELOW: dict[str, Any] = {"loc": "outside lower center", "ncols": 6, "frameon": False, "handlelength": 3}  # a legend
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
 def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> Figure:
-    """One terrain: its height map with the paths, its profile, and the penalties by place and by kind.
-
-    Args:
-        crossed: Its crossings.
-        penalties: Those of the archive.
-        title: Of the figure.
-    """
+    """One terrain: its height map with the paths, its profile, and the penalties by place and by kind."""
     figure = new_figure(12.0, 7.2)
     figure.suptitle(title)
     grid = figure.add_gridspec(3, 2, width_ratios=(2.6, 1.0), height_ratios=(3.2, 0.9, 1.1))
@@ -55,7 +48,7 @@ def draw_paths(crossed: Crossed, title: str) -> Figure:
     axes.set_title(title)
     axes.set_xlabel("x [m]")
     axes.set_xlim(*_x_limits(crossed))
-    figure.legend(handles=_legend(crossed), **_BELOW)
+    figure.legend(handles=_legend(crossed), loc="outside lower center", ncols=6, frameon=False, handlelength=3)
     return figure
 
 

@@ -12,14 +12,12 @@ from qd.fitness import FitnessCfg
 from qd.minimise import MinimalFound, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
 from qd.run.settings import SearchCfg, own_policy, suffix_of
-from sim.files.command import chosen_elites, command_line
-from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, is_same, label_suffix, spec_of
+from sim.files.command import chosen_elites
+from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import get_space, is_own
-
-_USUAL_ROBOT = "anymal"
+from sim.spaces.registry import get_space
 
 
 class Terrain(NamedTuple):
@@ -58,23 +56,15 @@ class Found:
         """What the genes mean."""
         return get_space(self.archive.space, self.archive.space_sha256)
 
-    @property
-    def go_on(self) -> str:
-        """How to let the search go on, for errors."""
-        searched, _ = self.as_searched()
-        code = searched if ControllerSpec.parse(searched).runs_code else None
-        more = {"resume": self.folder, "policy": code, "space": self.space.name if is_own(self.space.name) else None}
-        more["iterations"] = 2 * max(self.archive.iterations, 1)
-        return f"let its search go on with `{command_line('archive', robot=self.robot.spec, **more)}`"
-
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config."""
-        archive, cfg = self.archive, self._search()
+        archive, cfg = self.archive, self.search()
         if cfg is None:
             return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
         return cfg.policy, cfg.fitness
 
-    def _search(self) -> SearchCfg | None:
+    def search(self) -> SearchCfg | None:
+        """Settings of the search; None where the archive lies without them."""
         archive, file = self.archive, self.folder / CONFIG_FILE
         if not file.exists():
             return None
@@ -85,12 +75,8 @@ class Found:
         return cfg
 
     def policy(self, given: str | None = None) -> str:
-        """The controller to cross with: the one given, or that of the search.
-
-        Raises:
-            ValueError: If that of the search is code, lost or another one now.
-        """
-        cfg = self._search()
+        """The controller to cross with: the one given, or that of the search."""
+        cfg = self.search()
         if given is None and cfg is not None:
             return own_policy(self.run, cfg, self.robot)
         policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
@@ -103,10 +89,12 @@ class Found:
 
     def suffix(self, policy: str) -> str:
         """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``."""
-        cfg = self._search()
+        cfg = self.search()
         if cfg is None:
-            searched, own = self.archive.policy_sha256, str(self.robot.policy_file)
-            same = is_same(policy, own) if searched is None else controller_hash(policy) == searched
+            searched = self.archive.policy_sha256
+            same = controller_hash(policy) == searched
+            if searched is None:
+                same = is_same(policy, str(self.robot.policy_file))
             return "" if same else label_suffix(policy)
         return suffix_of(cfg, policy, self.robot)
 
@@ -115,15 +103,10 @@ class Found:
         return folder_for(self.run, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
 
     def minima(self) -> MinimalFound:
-        """The minimal terrains of its elites.
-
-        Raises:
-            FileNotFoundError: If there are none.
-        """
+        """The minimal terrains of its elites."""
         minima = read_minimal(self.folder, self.archive)
         if minima is None:
-            again = command_line("minimise", robot=self.robot.spec, run=self.run)
-            raise FileNotFoundError(f"{self.run} has no minimal terrains of its elites: make them with `{again}`")
+            raise FileNotFoundError(f"{self.run} has no minimal terrains: make them with `faultline minimise`")
         return minima
 
     def terrains(self, elite: str = "0", minimal: str | None = None) -> list[Terrain]:
@@ -147,19 +130,11 @@ class Found:
         ]  # fmt: skip
 
     def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
-        """The terrain that a command line names, where only one makes sense.
-
-        Raises:
-            ValueError: If there is none of that number, or several are named.
-        """
+        """The terrain that a command line names, where only one makes sense."""
         terrains = self.terrains(elite, minimal)
         if len(terrains) != 1:
             raise ValueError(f"one elite must be named here, got '{elite if minimal is None else minimal}'")
         return terrains[0]
-
-    def one(self, elite: str) -> int:
-        """Number of the only elite that a command line names."""
-        return self.terrain(elite).number
 
 
 def find_archive(named: str | None, run: Path | None = None, *, space: str | None = None) -> Found:
@@ -169,13 +144,8 @@ def find_archive(named: str | None, run: Path | None = None, *, space: str | Non
         named: The robot, as the command line names it; left out, that of the run.
         run: Run directory or archive file.
         space: Terrain space that the command line names.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        ValueError: If it is damaged, of another robot, of penalties that the robot does not have, or of a terrain space
-            that is not at hand.
     """
-    run = run or find_run(get_robot(named or _USUAL_ROBOT))
+    run = run or find_run(get_robot(named or "anymal"))
     archive = read_archive(run)
     robot = robot_of(archive.named(), named, run)
     check_space(archive, space)

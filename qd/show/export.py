@@ -1,6 +1,5 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
 from sim.files.records import provenance
 from sim.ground import GroundMaps
-from sim.maps.terrain_files import TYPICAL_BYTES, check_formats, write_terrain
+from sim.maps.terrain_files import check_formats, write_terrain
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.robots.find import robot_of
@@ -78,13 +77,7 @@ def source_of_archive(found: Found, elite: str = "0", minimal: str | None = None
 
 
 def source_of_pack(named: str, places: str = "all", robot: str | None = None) -> Source:
-    """Terrains of a pack.
-
-    Args:
-        named: As :func:`qd.evaluate.pack.pack_folder` takes it.
-        places: Their numbers, or ``all``.
-        robot: The robot that the command line names.
-    """
+    """Terrains of a pack."""
     folder = pack_folder(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
@@ -103,21 +96,7 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
 def export_terrains(
     source: Source, *, formats: Sequence[str] = FORMATS, out: Path | None = None, overwrite: bool = False
 ) -> list[Path]:
-    """Writes terrains as files that other programs read.
-
-    Args:
-        source: The terrains.
-        formats: Some of :data:`FORMATS`.
-        out: Folder to write to.
-        overwrite: Whether files of an earlier export are replaced.
-
-    Returns:
-        The files, the index last.
-
-    Raises:
-        ValueError: If there is no such format or no room, or files would be replaced; before anything is written.
-        OSError: If a file cannot be written.
-    """
+    """Writes terrains as files that other programs read."""
     formats, folder = list(dict.fromkeys(formats)), out or source.folder
     check_formats(formats)
     if source.ground and "npz" not in formats:
@@ -126,7 +105,6 @@ def export_terrains(
         )
     if not overwrite:
         _refuse_to_replace(folder, {*source.stems})
-    _check_room(folder, len(source.stems), formats)
     prepare_output(folder / INDEX_FILE)
     origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
@@ -156,12 +134,7 @@ def export_controller(policy: str | None, robot: RobotCfg, out: Path) -> None:
 
 
 def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
-    """An elite's numbers as JSON values: as found, and under ``fresh`` what 40 fresh episodes say, None if none did.
-
-    Args:
-        archive: Its archive.
-        elite: Its number.
-    """
+    """An elite's numbers as JSON values: as found, and under ``fresh`` what 40 fresh episodes say, None if none did."""
     names = ("fitness", "collision_rate", "goal_rate", "fallen_rate", "episodes")
 
     def numbers(values: Any) -> dict[str, Any]:
@@ -183,12 +156,3 @@ def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
     if replaced:
         names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
-
-
-def _check_room(folder: Path, count: int, formats: Sequence[str]) -> None:
-    needed = count * sum(TYPICAL_BYTES[ending] for ending in formats)
-    free = shutil.disk_usage(next(path for path in (folder, *folder.absolute().parents) if path.exists())).free
-    if needed > free:
-        raise ValueError(
-            f"{folder} must have room for {needed / 1e6:,.0f} MB, got {free / 1e6:,.0f} MB: leave stl out of --formats"
-        )

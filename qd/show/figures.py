@@ -67,16 +67,7 @@ def mode_words(mode: Mode) -> str:
 
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:
-    """Draws the figures of a search: its curves, its archive on parallel axes, and the spread of its elites.
-
-    Args:
-        folder: Where to write.
-        archive: What was found.
-        metrics: One row an iteration.
-
-    Returns:
-        The files.
-    """
+    """Draws the figures of a search: its curves, its archive on parallel axes, and the spread of its elites."""
     figures = {
         CURVES_FILE: draw_curves(archive, metrics),
         ARCHIVE_FIGURE_FILE: draw_archive(archive),
@@ -97,12 +88,7 @@ def _title(archive: Archive) -> str:
 
 
 def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
-    """QD score, archive size with reachable coverage, and mean fitness over the iterations, and mean STD if looked at.
-
-    Args:
-        archive: The archive at the end.
-        metrics: One row an iteration.
-    """
+    """QD score, archive size with reachable coverage, mean fitness, and mean STD if looked at, over the iterations."""
     looks = [row for row in metrics if row.get("mean_std") is not None]
     num_panels = 4 if looks else 3
     figure = new_figure(3.5 * num_panels, 3.4)
@@ -143,11 +129,7 @@ def _add_coverage_axis(axes: Axes, num_cells: int) -> None:
 
 
 def draw_archive(archive: Archive) -> Figure:
-    """Every elite as a line over one vertical axis a ratio, coloured by its fitness (the paper's archive figure).
-
-    Args:
-        archive: What to draw; of fresh values those that are valid, otherwise as found.
-    """
+    """Every elite as a line over one vertical axis a ratio, coloured by its fitness (the paper's archive figure)."""
     count = len(archive.penalties)
     figure = new_figure(1.6 * count + 1.4, 4.6)
     axes = figure.subplots()
@@ -211,11 +193,7 @@ def spread(archive: Archive) -> np.ndarray:
 
 
 def draw_spread(archive: Archive) -> Figure:
-    """How the elites spread over the intervals of each ratio, with and without base collisions.
-
-    Args:
-        archive: What to draw.
-    """
+    """How the elites spread over the intervals of each ratio, with and without base collisions."""
     counts = spread(archive)
     figure = new_figure(1.9 * len(counts) + 0.8, 3.2)
     collided = int(archive.collided.sum())
@@ -250,17 +228,7 @@ _CORRECTED = (
 def summary(
     archive: Archive, metrics: Sequence[dict[str, Any]], *, gpus: int, origin: dict[str, Any]
 ) -> dict[str, Any]:
-    """The numbers of a search, as ``archive.json`` has them.
-
-    Args:
-        archive: The result archive.
-        metrics: One row an iteration.
-        gpus: Most GPUs used at a time.
-        origin: Provenance.
-
-    Returns:
-        As JSON values; what fresh episodes say is None if nobody looked.
-    """
+    """The numbers of a search, as ``archive.json`` has them."""
     corrected = {} if archive.fresh is None else fresh_numbers(archive, archive.fresh)
     with_collision = int(archive.collided.sum())
     return {

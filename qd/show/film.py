@@ -2,7 +2,7 @@
 
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,34 +40,18 @@ def film_elites(
     device: str = "cpu",
     out: Path | None = None,
 ) -> list[Path]:
-    """Films of an archive's terrains, whose recordings are written before the first film is made.
+    """Films of an archive's terrains, in the run, in a folder ``out``, or one in a file ``out``.
 
-    Args:
-        found: The archive.
-        terrains: Some of its terrains.
-        cfg: How the films look.
-        policy: Another controller than was searched.
-        replicas: Episodes of each.
-        seed: Draws them.
-        device: Warp device name.
-        out: The film, or the folder of several.
-
-    Returns:
-        The films.
+    All recordings are written before the first film is made.
     """
     controller = found.policy(policy)
     outs = [Path(f"{found.output(terrain.stem, controller)}.mp4") for terrain in terrains]
     if out is not None:
         outs = [out / path.name for path in outs] if len(outs) > 1 or out.is_dir() else [out]
-    _check(cfg, replicas)
-    prepare_output(outs[0])
+    _check(cfg, outs, replicas)
     recordings = record_terrains(found, terrains, policy=controller, replicas=replicas, seed=seed, device=device)
-    for recording, path in zip(recordings, outs, strict=True):
-        write_recording(path.with_name(path.stem + RECORDING), recording)
     scales = dict(zip(found.archive.penalties, found.archive.scales, strict=True))
-    for recording, path in zip(recordings, outs, strict=True):
-        film(recording, found.robot, scales, cfg, path)
-    return outs
+    return _store_and_film(recordings, found.robot, scales, cfg, outs)
 
 
 def film_map(
@@ -80,33 +64,39 @@ def film_map(
     seed: int = 0,
     device: str = "cpu",
     out: Path | None = None,
-) -> Path:
-    """A film of a user's own terrain; arguments as of :func:`film_elites`."""
+) -> list[Path]:
+    """A film of a user's own terrain."""
     controller = policy or str(robot.policy_file)
-    out = out or OWN_FOLDER / f"{terrain.name}-{who_crossed(robot, controller)}.mp4"
-    _check(cfg, replicas)
-    prepare_output(out)
+    outs = [out or OWN_FOLDER / f"{terrain.name}-{who_crossed(robot, controller)}.mp4"]
+    _check(cfg, outs, replicas)
     print(f"{terrain.file}: {terrain.fitted}", flush=True)
     recording = terrain.record(robot, controller, replicas=replicas, seed=seed, device=device)
-    write_recording(out.with_name(out.stem + RECORDING), recording)
-    film(recording, robot, scales_of(robot, policy), cfg, out)
-    return out
+    return _store_and_film([recording], robot, scales_of(robot, policy), cfg, outs)
+
+
+def _store_and_film(
+    recordings: Sequence[Recording], robot: RobotCfg, scales: dict[str, float], cfg: FilmCfg, outs: list[Path]
+) -> list[Path]:
+    for recording, path in zip(recordings, outs, strict=True):
+        write_recording(path.with_name(path.stem + RECORDING), recording)
+    for recording, path in zip(recordings, outs, strict=True):
+        film(recording, robot, scales, cfg, path)
+    return outs
 
 
 def film_recording(
     file: Path, cfg: FilmCfg, *, robot: str | None = None, policy: str | None = None, out: Path | None = None
 ) -> list[Path]:
-    """Films of what was recorded; nothing is crossed.
+    """Films of what was recorded, beside the recording or in ``out``; nothing is crossed.
 
     Args:
         file: The recording, of one terrain or several.
         cfg: How the films look.
         robot: Name or settings file of the robot; the recording's if None.
         policy: Controller by whose scales penalties are drawn.
-        out: The film, or the folder of several; beside the recording if None.
+        out: The film, or the folder of several.
     """
     recording = read_recording(file)
-    _check(cfg)
     recorded = robot_of({**recording.origin, "robot": recording.robot}, robot, file)
     if recording.joint_names != recorded.joint_names:
         raise ValueError(f"{file} is of other joints than {recorded.name} has: give the --robot that was recorded")
@@ -114,17 +104,18 @@ def film_recording(
     outs = [(out or file.parent) / (f"{stem}.mp4" if count == 1 else f"{stem}-{k}.mp4") for k in range(count)]
     if out is not None and count == 1 and not out.is_dir():
         outs = [out]
-    prepare_output(outs[0])
+    _check(cfg, outs)
     for k, path in enumerate(outs):
         film(recording.of_terrain(k), recorded, scales_of(recorded, policy), cfg, path)
     return outs
 
 
-def _check(cfg: FilmCfg, replicas: int | None = None) -> None:
-    """Refuses an episode that is not crossed, or a machine without OpenGL, before minutes of crossing."""
+def _check(cfg: FilmCfg, outs: list[Path], replicas: int | None = None) -> None:
+    """Refuses an episode that is not crossed or a machine without OpenGL, and prepares the folder, before crossing."""
     if cfg.episode is not None and replicas is not None and cfg.episode >= replicas:
         raise ValueError(f"episode must be one of 0..{replicas - 1}, got {cfg.episode}")
     open_context(64, 64).free()
+    prepare_output(outs[0])
 
 
 def scales_of(robot: RobotCfg, policy: str | None) -> dict[str, float]:
@@ -138,12 +129,7 @@ def scales_of(robot: RobotCfg, policy: str | None) -> dict[str, float]:
 
 
 def film(recording: Recording, robot: RobotCfg, scales: dict[str, float], cfg: FilmCfg, out: Path) -> None:
-    """Films an episode of a recording of one terrain.
-
-    Raises:
-        ValueError: If there is no such episode, or no OpenGL.
-        OSError: If the film cannot be written.
-    """
+    """Films an episode of a recording of one terrain."""
     replicas = recording.replicas.tolist()
     if cfg.episode is not None and cfg.episode not in replicas:
         raise ValueError(f"episode {cfg.episode} was not recorded, expected one of {', '.join(map(str, replicas))}")
@@ -152,37 +138,16 @@ def film(recording: Recording, robot: RobotCfg, scales: dict[str, float], cfg: F
     shot = Shot(recording=recording, episode=episode, ghosts=ghosts, scales=scales)
     cameras = follow(shot, _DISTANCE * robot.default_base_height)
     replaced = " (replaced)" if out.exists() else ""
-    with (
-        Renderer(
-            robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT, shadows=cfg.shadows, ground=recording.ground
-        ) as renderer,
-        tqdm(
-            total=num_pictures(shot, cfg.fps), desc=f"filming {recording.labels[0]}", unit="picture", file=sys.stderr,
-            disable=None,
-        ) as bar,
-    ):  # fmt: skip
-        write_film(out, frames_of(shot, renderer, cameras, cfg.fps), cfg.fps, progress=bar.update)
+    look: dict[str, Any] = {"shadows": cfg.shadows, "ground": recording.ground}
+    with Renderer(robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT, **look) as renderer:
+        bar: dict[str, Any] = {"desc": f"filming {recording.labels[0]}", "unit": "picture", "disable": None}
+        pictures = frames_of(shot, renderer, cameras, cfg.fps)
+        write_film(out, tqdm(pictures, total=num_pictures(shot, cfg.fps), file=sys.stderr, **bar), cfg.fps)
     print(f"Film: {out}{replaced}", flush=True)
 
 
-def write_film(
-    path: Path, pictures: Iterator[NDArray[np.uint8]], fps: int, progress: Callable[[], object] | None = None
-) -> int:
-    """Encodes pictures as an MP4 (H.264) that plays everywhere, atomically.
-
-    Args:
-        path: File to write.
-        pictures: RGB, all of one shape, with even sides.
-        fps: Pictures a second.
-        progress: Called after every picture.
-
-    Returns:
-        How many pictures there were.
-
-    Raises:
-        OSError: If the film cannot be encoded or written.
-    """
-    done = 0
+def write_film(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: int) -> None:
+    """Encodes RGB pictures of one shape with even sides as an MP4 (H.264) that plays everywhere, atomically."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "film.mp4"
         writer: Any = None
@@ -195,11 +160,7 @@ def write_film(
                     )
                     writer.send(None)
                 writer.send(np.ascontiguousarray(picture))
-                done += 1
-                if progress is not None:
-                    progress()
         finally:
             if writer is not None:
                 writer.close()
         write_atomically(path, draft.read_bytes())
-    return done

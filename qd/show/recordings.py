@@ -56,10 +56,6 @@ class Wanted:
     ground: GroundMaps | None = field(default=None, compare=False)
     """Friction and softness beside heights."""
 
-    def __post_init__(self) -> None:
-        if self.replicas < 1 or self.seed < 0:
-            raise ValueError(f"episodes must be at least 1 and seed at least 0, got {self.replicas} and {self.seed}")
-
     @property
     def kind(self) -> tuple[Any, ...]:
         """What crossings have in common that one simulation makes side by side."""
@@ -93,7 +89,7 @@ def on_elite(
         policy=policy,
         replicas=replicas,
         seed=seed,
-        terrain_seed=int(episode_seeds(max(seed, 0), number, 1, stream=_STREAM)[0]),
+        terrain_seed=int(episode_seeds(seed, number, 1, stream=_STREAM)[0]),
         space=get_space(archive.space, archive.space_sha256).name,
     )
 
@@ -108,10 +104,9 @@ def on_heights(
     ground: GroundMaps | None = None,
 ) -> Wanted:
     """Crossings of a user's own terrain, with its ground; arguments as of :func:`on_elite`."""
-    terrain_seed = int(episode_seeds(max(seed, 0), 0, 1, stream=_OWN_STREAM)[0])
     return Wanted(
-        label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, terrain_seed=terrain_seed,
-        ground=ground,
+        label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, ground=ground,
+        terrain_seed=int(episode_seeds(seed, 0, 1, stream=_OWN_STREAM)[0]),
     )  # fmt: skip
 
 
@@ -120,23 +115,14 @@ Cross = Callable[[Sequence[Wanted], Callable[[float], None]], list[Recording]]
 
 
 class Simulation:
-    """Crosses terrains by simulation; a controller is loaded once.
-
-    Args:
-        robot: The robot.
-        device: Warp device name.
-    """
+    """Crosses terrains by simulation; a controller is loaded once."""
 
     def __init__(self, robot: RobotCfg, device: str) -> None:
         self._robot, self._device = robot, device
         self._rollouts: dict[tuple[str, int, int, str, bool], Rollout] = {}
 
     def prepare(self, first: Wanted, count: int = 1) -> Rollout:
-        """The rollout that crosses such terrains, so many at once; built if there is none yet.
-
-        Raises:
-            ValueError: If the controller cannot be loaded or does not fit the robot.
-        """
+        """The rollout that crosses such terrains, so many at once; built if there is none yet."""
         key = (first.policy, count, first.replicas, first.space, first.ground is not None)
         if key not in self._rollouts:
             self._rollouts[key] = Rollout(
@@ -180,7 +166,7 @@ class Recordings:
         self._cache = Cache(folder)
         self._at_once = AT_ONCE if on_gpu else 1
         self._cross = cross or Simulation(robot, device)
-        self._last: tuple[Wanted, Recording] | None = None
+        self._last: tuple[str, Recording] | None = None
 
     def read(self, wanted: Wanted) -> Recording | None:
         """The recording of some crossings; None if there is none, or it is damaged.
@@ -188,9 +174,8 @@ class Recordings:
         Of a controller whose code has no file only the last recording is found.
         """
         key = self._key(wanted)
-        if key is None:
-            found = self._last is not None and self._last[0] == wanted and _same_terrain(self._last[0], wanted)
-            return self._last[1] if self._last is not None and found else None
+        if controller_hash(wanted.policy) is None:
+            return self._last[1] if self._last is not None and self._last[0] == key else None
         try:
             recording = read_recording(self._cache.file(key))
         except (OSError, ValueError):
@@ -200,13 +185,13 @@ class Recordings:
 
     def may_keep(self, wanted: Wanted) -> bool:
         """Whether a recording of these crossings would be found again, and there is none yet."""
-        key = self._key(wanted)
-        return key is not None and not self._cache.file(key).exists()
+        return controller_hash(wanted.policy) is not None and not self._cache.file(self._key(wanted)).exists()
 
     def keep(self, wanted: Wanted, recording: Recording) -> None:
         """Stores a recording; prints a warning if it cannot be written."""
-        self._last, key = (wanted, recording), self._key(wanted)
-        if key is None:
+        key = self._key(wanted)
+        self._last = (key, recording)
+        if controller_hash(wanted.policy) is None:
             return
         try:
             self._cache.folder.mkdir(parents=True, exist_ok=True)
@@ -216,11 +201,7 @@ class Recordings:
             print(f"not stored: {error}", flush=True)
 
     def all_of(self, wanted: Sequence[Wanted]) -> list[Recording]:
-        """Recordings of all that is wanted, in its order; what is missing is crossed and stored, batch by batch.
-
-        Raises:
-            ValueError: If a controller cannot be loaded or does not fit the robot.
-        """
+        """Recordings of all that is wanted, in its order; what is missing is crossed and stored, batch by batch."""
         recordings = {k: recording for k, crossing in enumerate(wanted) if (recording := self.read(crossing))}
         missing = [k for k in range(len(wanted)) if k not in recordings]
         if missing:
@@ -245,23 +226,16 @@ class Recordings:
             numbers = [k for k in missing if wanted[k].kind == kind]
             yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
 
-    def _key(self, wanted: Wanted) -> str | None:
-        """What a recording's file is called; None if nobody can tell whether the controller has changed."""
-        controller = controller_hash(wanted.policy)
-        if controller is None:
-            return None
+    def _key(self, wanted: Wanted) -> str:
+        """Hash of all that a recording depends on."""
         maps = [] if wanted.ground is None else [wanted.ground.friction, wanted.ground.time_constant_s]
         arrays = [array.astype(np.float32).tobytes().hex() for array in (wanted.terrain, *maps)]
         parts = [
             *self._about,
-            controller,
+            controller_hash(wanted.policy) or wanted.policy,
             identity(wanted.space, get_space(wanted.space).sha256),
             wanted.terrain_seed,
             wanted.replicas,
             arrays,
         ]
         return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
-
-
-def _same_terrain(a: Wanted, b: Wanted) -> bool:
-    return np.array_equal(a.terrain, b.terrain) and a.ground == b.ground

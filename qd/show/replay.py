@@ -57,17 +57,7 @@ def replay(
     device: str = "cpu",
     out: Path | None = None,
 ) -> Replay:
-    """Crosses a terrain again, prints its numbers, and draws it with the robots' paths.
-
-    Args:
-        found: The archive.
-        terrain: One of its terrains.
-        policy: Another controller than was searched.
-        replicas: Episodes.
-        seed: Draws them.
-        device: Warp device name.
-        out: Figure to write.
-    """
+    """Crosses a terrain again, prints its numbers, and draws it with the robots' paths."""
     controller = found.policy(policy)
     out = out or Path(f"{found.output(terrain.stem, controller)}.png")
     if out.suffix != ".png":

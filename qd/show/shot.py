@@ -62,12 +62,7 @@ class Shot:
 
 
 def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
-    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties.
-
-    Args:
-        recording: Of one terrain.
-        scales: What each penalty is divided by.
-    """
+    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties."""
     outcome = recording.outcome[0]
     candidates = np.flatnonzero(outcome == np.bincount(outcome).argmax())
     shots = [Shot(recording=recording, episode=k, scales=scales) for k in candidates.tolist()]
@@ -172,13 +167,7 @@ def _lettered(view: Image, lines: tuple[str, str], clock: str) -> Image:
 
 
 class Panel:
-    """The lower part of a film, drawn once: the terrain's map with the paths, and the penalties over time.
-
-    Args:
-        shot: What the film shows.
-        width: Pixels.
-        height: Pixels.
-    """
+    """The lower part of a film, drawn once: the terrain's map with the paths, and the penalties over time."""
 
     def __init__(self, shot: Shot, width: int, height: int) -> None:
         figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)

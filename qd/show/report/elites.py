@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from qd.faults import elite_words
-from qd.groups import MAX_MODES, TOLERANCE, VERDICTS, Elites, Mode
+from qd.groups import MAX_MODES, TOLERANCE, VERDICTS, Mode
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate
 from qd.show.crossing_figures import draw_crossing
 from qd.show.figures import label_of, look_of, mode_words
@@ -116,14 +116,14 @@ def _how(shown: Shown) -> str:
         "Ward's clustering on the shares and on the rates of goal, base collision and fall, all fractions and "
         f"unweighted; of 2 to {MAX_MODES} groups the most whose mean silhouette is within {TOLERANCE} of the best"
     )
-    found = shown.modes.silhouettes
-    if not found:
+    silhouettes = shown.modes.silhouettes
+    if not silhouettes:
         return f"{how}. These elites are too few or too equal to be divided."
-    best = max(found, key=lambda count: found[count])
-    taken = len(shown.modes.modes)
+    best = max(silhouettes, key=lambda count: silhouettes[count])
+    count = len(shown.modes.modes)
     return (
-        f"{how}: {taken} have {found[taken]:.2f}, the best, {best}, {found[best]:.2f} (1: apart, 0: touching; under "
-        "one half the borders between them are soft)."
+        f"{how}: {count} have {silhouettes[count]:.2f}, the best, {best}, {silhouettes[best]:.2f} "
+        "(1: apart, 0: touching; under one half the borders between them are soft)."
     )
 
 
@@ -150,12 +150,12 @@ def _modes_table(shown: Shown) -> str:
 
 def _opened(shown: Shown, numbers: Sequence[int]) -> list[Picture]:
     """What the rows of some elites open: their terrains from above."""
-    found = []
-    for number in numbers:
-        content = shown.reliefs[shown.elites.place_of(number)]
-        shows = f"Elite {number} from above, start yellow and goal green; blue is below the start's level, brown above."
-        found.append(Picture(f"elite-{number}.jpg", content, shows))
-    return found
+    words = "from above, start yellow and goal green; blue is below the start's level, brown above."
+    contents = [shown.reliefs[shown.elites.place_of(number)] for number in numbers]
+    return [
+        Picture(f"elite-{number}.jpg", content, f"Elite {number} {words}")
+        for number, content in zip(numbers, contents, strict=True)
+    ]
 
 
 def detail_section(shown: Shown) -> list[Block]:
@@ -164,41 +164,16 @@ def detail_section(shown: Shown) -> list[Block]:
         return [absent(shown.not_crossed)]
     stubborn = sum(shown.crossed[number].rates[ARRIVED].hits == 0 for number in shown.worst)
     text = (
-        f"{choice_told(shown.elites, shown.worst, shown.steady)} Each was crossed {shown.episodes} times "
+        "Shown are the terrains on which the controller fails most, one of each way of failing first, no two alike "
+        f"while there are others ({', '.join(map(str, shown.worst))}), and those whose penalties vary least between "
+        f"episodes for their size, failed ones first ({', '.join(map(str, shown.steady))}). Each was crossed "
+        f"{shown.episodes} times "
         "afresh for this page, by the episodes that `faultline replay --elite N` shows; on "
         f"{stubborn} of the first {len(shown.worst)} no robot reached the goal. Scaled penalties: 1 is what a common "
         "one comes to on hard-random terrain."
     )
     first = shown.numbers[0]
     return [paragraph(text), *(_elite(shown, number, opened=number == first) for number in shown.numbers)]
-
-
-def choice_told(elites: Elites, worst: list[int], steady: list[int]) -> str:
-    """Which elites are shown, in a sentence that holds for any number of them.
-
-    Args:
-        elites: All elites.
-        worst: Numbers of the worst ones, and of others after them if too few fail.
-        steady: Numbers of those that vary least.
-    """
-    fails = {number: bool(elites.failing[elites.place_of(number)]) for number in worst}
-    failed, others = ([number for number in worst if fails[number] is kind] for kind in (True, False))
-    parts = []
-    if failed:
-        parts.append(
-            f"terrains on which the controller fails, one of each way of failing first, no two alike while there are "
-            f"others ({_list(failed)})"
-        )
-    if others:
-        parts.append(f"{'other ' * bool(failed)}terrains on which it does not fail ({_list(others)})")
-    parts.append(
-        f"terrains whose penalties vary least between episodes for their size, failed ones first ({_list(steady)})"
-    )
-    return f"Shown are {'; '.join(parts)}."
-
-
-def _list(numbers: list[int]) -> str:
-    return ", ".join(map(str, numbers))
 
 
 def _elite(shown: Shown, number: int, *, opened: bool) -> Folded:
@@ -258,11 +233,11 @@ def _penalty_table(shown: Shown, crossed: Crossed) -> str:
             label_of(name) + (f" [{look_of(name).unit}]" if look_of(name).unit else ""),
             f"{raw.mean():.2f}",
             f"{raw.std():.2f}",
-            f"{own.mean():.2f}",
-            f"{own.std():.2f}",
-            percent(float(own.mean()) / total),
+            f"{multiple.mean():.2f}",
+            f"{multiple.std():.2f}",
+            percent(float(multiple.mean()) / total),
         ]
-        for name, raw, own in zip(names, crossed.penalties.T, scaled.T, strict=True)
+        for name, raw, multiple in zip(names, crossed.penalties.T, scaled.T, strict=True)
     ]
     return table(["penalty an episode", "mean", "std", "mean, scaled", "std, scaled", "share"], rows)
 
@@ -286,15 +261,15 @@ def all_section(shown: Shown) -> list[Block]:
         rate = Rate(elites.hits("goal_rate", k), int(elites.counted[k]))
         rates = [float(values[k]) for values in (elites.goal_rate, elites.collision_rate, elites.fallen_rate)]
         goal, collision, fallen = (f"{100 * value:.0f}" for value in rates)
-        mode, family, found = int(shown.modes.labels[k]), int(families[k]), int(archive.iteration[number])
+        mode, family, iteration = int(shown.modes.labels[k]), int(families[k]), int(archive.iteration[number])
         judged = int(elites.verdict[k])
         shares, fitness, variation = elites.ratios[k].tolist(), elites.fitness[k], elites.variation[k]
         rows.append(
             [f"{number}", goal, rate.limits, VERDICTS[judged], collision, fallen, f"{mode or '-'}", f"{family}",
-             f"{fitness:.2f}", f"{variation:.2f}", f"{found}", *(f"{100 * share:.0f}" for share in shares)]
+             f"{fitness:.2f}", f"{variation:.2f}", f"{iteration}", *(f"{100 * share:.0f}" for share in shares)]
         )  # fmt: skip
         low = wilson_interval(*rate)[0]
-        values = [number, rates[0], low, judged, *rates[1:], mode, family, fitness, variation, found, *shares]
+        values = [number, rates[0], low, judged, *rates[1:], mode, family, fitness, variation, iteration, *shares]
         keys.append([f"{value:.5g}" for value in values])
     numbers = elites.numbers[order].tolist()
     links = [anchor_of(number) if number in shown.crossed else "" for number in numbers]

@@ -8,6 +8,7 @@ from qd.show.report.material import Shown
 from qd.show.report.page import Block, Folded, Picture, absent, counted, paragraph, percent, table
 from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, by_kind
 from sim.files.command import command_line
+from sim.files.intervals import value_words
 from sim.files.records import without_machine
 
 _TRAINED_ON = {
@@ -29,8 +30,7 @@ def tables_section(shown: Shown) -> list[Block]:
     kinds = by_kind(tables)
     return [
         *_of_others(shown, tables),
-        paragraph(_told(tables, kinds)),
-        *([paragraph(told)] if (told := f"{_worst(kinds)} {fates(tables)}".strip()) else []),
+        paragraph(_compared(tables, kinds)),
         *(measure_table(kinds, measure) for measure in MEASURES),
         *certified_table(kinds),
         Folded("Show the figure", drawn) if (drawn := _drawn(shown.material.tables_file.with_suffix(".png"))) else "",
@@ -53,46 +53,16 @@ def _drawn(figure: Path) -> list[Block]:
     return [Picture("tables.png", figure.read_bytes(), shows)] if figure.exists() else []
 
 
-def _from_first(tables: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """What became of held-out elites from the first controller to each other one."""
-    first = next(iter(tables["controllers"]))
-    pairs = {pair.partition(" -> "): found for pair, found in (tables["differences"].get(GENERATED) or {}).items()}
-    return {after: found for (before, _, after), found in pairs.items() if before == first}
-
-
 def most_mended(tables: dict[str, Any]) -> tuple[str, str] | None:
-    """How many of the held-out elites that the first controller fails the best one mends, and what that counts.
-
-    Args:
-        tables: The evaluation's.
-    """
-    pairs, first = _from_first(tables), next(iter(tables["controllers"]))
-    if not pairs:
+    """How many of the held-out elites that the first controller fails the best one mends, and what that counts."""
+    first = next(iter(tables["controllers"]))
+    changes = {pair.partition(" -> "): change for pair, change in (tables["differences"].get(GENERATED) or {}).items()}
+    of_first = {after: change for (before, _, after), change in changes.items() if before == first}
+    if not of_first:
         return None
-    best = max(pairs, key=lambda who: pairs[who]["mended"]["count"])
-    mended, failing = (pairs[best][kind]["count"] for kind in ("mended", "still_failing"))
+    best = max(of_first, key=lambda name: of_first[name]["mended"]["count"])
+    mended, failing = (of_first[best][kind]["count"] for kind in ("mended", "still_failing"))
     return f"elites held out of training that {first} fails and {best} mends", f"{mended} of {mended + failing}"
-
-
-def fates(tables: dict[str, Any]) -> str:
-    """What the other controllers make of the held-out elites that the first one fails, in a sentence; may be empty.
-
-    Args:
-        tables: The evaluation's.
-    """
-    pairs, first = _from_first(tables), next(iter(tables["controllers"]))
-    if not pairs:
-        return ""
-    compared = max(found["compared"] for found in pairs.values())
-    kinds = ("mended", "still_failing", "newly_broken")
-    counts = {who: [found[kind]["count"] for kind in kinds] for who, found in pairs.items()}
-    told = [f"{who} mends {mended} of {mended + failing}" for who, (mended, failing, _) in counts.items()]
-    told[0] += f" that {first} fails"
-    broken = [f"{number} by {who}" for who, (_, _, number) in counts.items() if number]
-    return (
-        f"Of {counted(compared, 'elite')} held out of training {', '.join(told)}; newly broken are "
-        f"{', '.join(broken) or 'none'}."
-    )
 
 
 def _command(shown: Shown) -> str:
@@ -109,7 +79,7 @@ def _command(shown: Shown) -> str:
     )
 
 
-def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
+def _compared(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     """Who was compared on what, in a sentence or two."""
     first = next(iter(kinds["controllers"]))
     sets = ", ".join(f"{_label(name)}: {count}" for name, count in tables["terrains"].items())
@@ -119,7 +89,7 @@ def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     )
     several = len(kinds["controllers"]) < len(tables["controllers"])
     text += ", of several trainings that differ in their seed over these." if several else "."
-    trained = [f"{who} on {what}" for who, what in _TRAINED_ON.items() if who in tables["controllers"]]
+    trained = [f"{label} on {what}" for label, what in _TRAINED_ON.items() if label in tables["controllers"]]
     text += (
         " No base collision is what the paper calls success. A robot that stands still or walks off has none either: "
         "it may have 100 % there and never reach the goal. Read the goal rate first."
@@ -127,61 +97,37 @@ def _told(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
 
 
-def _worst(kinds: dict[str, Any]) -> str:
-    """How all fare on the first one's hardest set, in a sentence; empty if nothing is known of that one."""
-    first, *others = kinds["controllers"]
-    known = {name: row for name, row in kinds["goal"].items() if row[first] is not None}
-    if not known:
-        return ""
-    hardest = min(known, key=lambda name: known[name][first])
-    rate = _value(kinds, "goal", hardest, first)
-    better = "".join(f"; {who} {_value(kinds, 'goal', hardest, who)}" for who in others)
-    return f"{first} fares worst on {_label(hardest)}: {rate} of its episodes reach the goal{better}."
-
-
 def _label(name: str) -> str:
     return SETS.get(name, name)
 
 
-def _value(tables: dict[str, Any], measure: str, name: str, who: str) -> str:
-    value, limits = tables[measure][name][who], tables["intervals"][measure][name][who]
-    if value is None:
-        return "-"
+def _value(tables: dict[str, Any], measure: str, name: str, controller: str) -> str:
+    value, limits = tables[measure][name][controller], tables["intervals"][measure][name][controller]
     if measure == "reward":
-        return f"{value:.1f}" + (f" ({limits[0]:.1f} to {limits[1]:.1f})" if limits else "")
-    return _with_limits(value, limits)
-
-
-def _with_limits(value: float | None, limits: list[float] | None) -> str:
+        return value_words(value, limits, ".1f")
     if value is None:
         return "-"
     return percent(value) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
 def measure_table(tables: dict[str, Any], measure: str) -> str:
-    """A measure of every controller on every set, with intervals.
-
-    Args:
-        tables: By kind of controller (:func:`qd.show.report.tables.by_kind`).
-        measure: One of :data:`qd.show.report.tables.MEASURES`.
-    """
+    """A measure of every controller on every set, with intervals."""
     controllers = list(tables["controllers"])
-    rows = [[_label(name), *(_value(tables, measure, name, who) for who in controllers)] for name in tables[measure]]
+    rows = [
+        [_label(name), *(_value(tables, measure, name, controller) for controller in controllers)]
+        for name in tables[measure]
+    ]
     return table([MEASURES[measure], *controllers], rows)
 
 
 def certified_table(kinds: dict[str, Any]) -> list[Block]:
-    """Goal rate and no base collision on certified terrains alone; nothing where none are known.
-
-    Args:
-        kinds: By kind of controller (:func:`qd.show.report.tables.by_kind`).
-    """
+    """Goal rate and no base collision on certified terrains alone; nothing where none are known."""
     known = {name: about for name, about in (kinds.get("certified") or {}).items() if about["terrains"]}
     if not known:
         return []
     rows = [
         [f"{_label(name)} ({about['terrains']} certified): {words}",
-         *(_value(kinds, key, name, who) + _role(about, all_) for who, all_ in kinds["members"].items())]
+         *(_value(kinds, key, name, controller) + _role(about, all_) for controller, all_ in kinds["members"].items())]
         for name, about in known.items() for key, words in CERTIFIED.items()
     ]  # fmt: skip
     text = (
@@ -194,9 +140,8 @@ def certified_table(kinds: dict[str, Any]) -> list[Block]:
 
 def _role(about: dict[str, Any], members: list[str]) -> str:
     """What controllers have to do with how terrains were certified, after a comma; empty if nothing."""
-    return "".join(
-        f", {role}" for role in sorted({about["chosen_by"][who] for who in members if who in about["chosen_by"]})
-    )
+    roles = {about["chosen_by"][name] for name in members if name in about["chosen_by"]}
+    return "".join(f", {role}" for role in sorted(roles))
 
 
 def changes_tables(tables: dict[str, Any]) -> list[Block]:
@@ -204,9 +149,9 @@ def changes_tables(tables: dict[str, Any]) -> list[Block]:
     first = next(iter(tables["controllers"]))
     from_first, others = [], []
     for name, pairs in tables["differences"].items():
-        for pair, found in pairs.items():
-            counts = [f"{found[kind]['count']}" for kind in FATES]
-            row = [f"{_label(name)}: {pair}", *counts, f"{found['compared']}"]
+        for pair, change in pairs.items():
+            counts = [f"{change[kind]['count']}" for kind in FATES]
+            row = [f"{_label(name)}: {pair}", *counts, f"{change['compared']}"]
             (from_first if pair.startswith(f"{first} -> ") else others).append(row)
     if not from_first and not others:
         return []

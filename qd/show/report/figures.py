@@ -16,12 +16,7 @@ _ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collisi
 
 
 def draw_modes(elites: Elites, modes: Modes) -> Figure:
-    """The failure modes: their mean shares, how their crossings end, and how well divisions separate.
-
-    Args:
-        elites: What was grouped.
-        modes: The groups.
-    """
+    """The failure modes: their mean shares, how their crossings end, and how well divisions separate."""
     figure = new_figure(12.0, max(3.4, 0.5 * len(modes.modes) + 2.2))
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 0.9))
     places = np.arange(len(modes.modes))

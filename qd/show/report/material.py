@@ -129,10 +129,10 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     found = find_archive(robot, run, space=space)
     archive = found.archive
     if not len(archive):
-        raise ValueError(f"{found.run} must have elites to report on, got an archive of none: {found.go_on}")
+        raise ValueError(f"{found.run} must have elites to report on, got an archive of none: let its search go on")
     searched, _ = found.as_searched()
     folder = RunDirectory(found.folder)
-    search = folder.read_cfg() if (folder.path / CONFIG_FILE).exists() else None
+    search = found.search()
     numbers = folder.read_summary()
     again = numbers.get("judged_by", {}).get("fresh")
     config = {} if search is None else folder.read_config()

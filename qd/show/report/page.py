@@ -123,17 +123,11 @@ def _row(row: Sequence[str], keys: Sequence[str] | None, link: str, opens: Pictu
 
 
 def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
-    """The whole page.
-
-    Args:
-        title: Of the page.
-        lead: What stands under it.
-        sections: In order.
-    """
-    links = "".join(f'<li><a href="#{escape(one.anchor)}">{escape(one.title)}</a></li>' for one in sections)
+    """The whole page."""
+    links = "".join(f'<li><a href="#{escape(part.anchor)}">{escape(part.title)}</a></li>' for part in sections)
     body = "".join(
-        f'<section id="{escape(one.anchor)}"><h2>{escape(one.title)}</h2>{"".join(map(_html, one.blocks))}</section>\n'
-        for one in sections
+        f'<section id="{escape(anchor)}"><h2>{escape(heading)}</h2>{"".join(map(_html, blocks))}</section>\n'
+        for heading, anchor, blocks in sections
     )
     style, script = ((_FOLDER / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     text = (
@@ -148,13 +142,7 @@ def render(title: str, lead: str, sections: Sequence[Section]) -> bytes:
 
 
 def picture(name: str, figure: Figure, shows: str) -> Picture:
-    """A figure as a part of the page.
-
-    Args:
-        name: Of its file, without .png.
-        figure: What to draw.
-        shows: What it shows, for who cannot see it.
-    """
+    """A figure as a part of the page."""
     return Picture(f"{name}.png", as_png(figure), shows)
 
 
@@ -171,9 +159,9 @@ def hours(seconds: float) -> str:
     return f"{seconds / 3600:,.0f} hours" if seconds > 36_000 else clock(seconds)
 
 
-def counted(number: int, one: str, many: str = "") -> str:
+def counted(number: int, noun: str, many: str = "") -> str:
     """A number with its noun: ``1 elite``, ``459 elites``."""
-    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
+    return f"{number:,} {noun if number == 1 else many or f'{noun}s'}"
 
 
 def pictures_of(sections: Sequence[Section]) -> list[Picture]:
@@ -191,24 +179,14 @@ def _pictures_in(block: Block) -> Iterator[Picture]:
 
 
 def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section]) -> Path:
-    """Writes figures and page, the page last: it is whole or as it was.
-
-    Args:
-        out: File of the page; its figures go to a folder beside it.
-        title: Of the page.
-        lead: What stands under it.
-        sections: In order.
-
-    Returns:
-        The file.
-    """
+    """Writes figures and page, the page last: it is whole or as it was."""
     page, pictures = render(title, lead, sections), pictures_of(sections)
     if len(page) > MAX_BYTES:
         raise ValueError(f"the page must have at most {MAX_BYTES:,} bytes, got {len(page):,}: show fewer --elites")
     figures = out.with_name(f"{out.stem}-figures")
     figures.mkdir(exist_ok=True)
-    for one in pictures:
-        write_atomically(figures / one.name, one.content)
+    for picture in pictures:
+        write_atomically(figures / picture.name, picture.content)
     write_atomically(out, page)
     print(f"{counted(len(pictures), 'figure')} under {figures}")
     print(f"Report: {out} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
@@ -216,11 +194,7 @@ def publish_page(out: Path, title: str, lead: str, sections: Sequence[Section]) 
 
 
 def origin_table(origin: Mapping[str, Any]) -> list[list[str]]:
-    """Rows of a table that says where numbers come from.
-
-    Args:
-        origin: Some of command, commit, device, versions, seed and date.
-    """
+    """Rows of a table that says where numbers come from."""
     rows = [[name, str(origin[name])] for name in ("command", "commit", "device", "seed", "date") if name in origin]
     versions = origin.get("versions")
     if isinstance(versions, dict):

@@ -27,10 +27,6 @@ def reliefs_of(genes: NDArray[np.float32], space: TerrainSpace) -> list[bytes]:
     """A picture of each terrain, as JPEG: blue below the start's level, brown above, slopes lit from one side.
 
     Slippery and soft patches are tinted.
-
-    Args:
-        genes: Shape (N, num_genes).
-        space: What they mean.
     """
     width = _WIDTHS[len(genes) > _FEW]
     lots = (genes[first : first + _AT_ONCE] for first in range(0, len(genes), _AT_ONCE))

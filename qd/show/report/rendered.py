@@ -61,9 +61,9 @@ def _camera(end: NDArray[np.float64], stands: float) -> Camera:
 
 def _ways(crossed: Crossed) -> list[tuple[NDArray[np.float64], tuple[float, float, float, float]]]:
     """The way of every base, in the colour of how it ended."""
-    found = []
+    ways = []
     for k, outcome in enumerate(crossed.outcome.tolist()):
         path = crossed.path(k)
         red, green, blue = (value / 255.0 for value in ImageColor.getrgb(ending_of(outcome).color)[:3])
-        found.append((np.vstack([path[::_POINT_EVERY], path[-1:]]), (red, green, blue, _OPACITY)))
-    return found
+        ways.append((np.vstack([path[::_POINT_EVERY], path[-1:]]), (red, green, blue, _OPACITY)))
+    return ways

@@ -57,7 +57,7 @@ def write_report(
         return write_rounds(run, robot, out)
     material = gather(robot, run, policy=policy, space=space, out=out)
     if not len(elites_of(material.archive, judged=True)):
-        raise ValueError(f"{material.run} must have elites to report on, got only invalid ones: {material.found.go_on}")
+        raise ValueError(f"{material.run} must have elites to report on, got only invalid ones: let its search go on")
     ranking = rank(material.archive, material.space, judged=True)
     shown = Shown(
         material=material,
@@ -81,7 +81,7 @@ def _with_crossings(shown: Shown, device: str, cross: Cross | None) -> Shown:
         on_elite(archive, number, policy=material.policy, replicas=shown.episodes, label=None)
         for number in shown.numbers
     ]
-    crossed = [crossed_of(one, archive.penalties, archive.scales) for one in recordings.all_of(wanted)]
+    crossed = [crossed_of(recording, archive.penalties, archive.scales) for recording in recordings.all_of(wanted)]
     return replace(shown, crossed=dict(zip(shown.numbers, crossed, strict=True)))
 
 

@@ -38,13 +38,7 @@ _LINES = (("#0072b2", "o"), ("#d55e00", "X"), ("#009e73", "s"), ("#cc79a7", "^")
 
 
 def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
-    """Writes the page; returns its file.
-
-    Args:
-        run: Directory of the hardening.
-        robot: The robot that the command line names.
-        out: File to write; report.html in the directory.
-    """
+    """Writes the page; returns its file."""
     content = _read(run, robot)
     out = out or run / "report.html"
     check_page(out)
@@ -105,11 +99,7 @@ def _number(count: int | None) -> str:
 
 
 def draw_faults(content: dict[str, Any]) -> Figure:
-    """What the search against every controller found, as bars.
-
-    Args:
-        content: Of ``rounds.json``.
-    """
+    """What the search against every controller found, as bars."""
     rows = content["rounds"]
     figure = new_figure(max(6.0, 1.5 * len(rows) + 2.0), 4.0)
     axes = figure.subplots()
@@ -143,11 +133,7 @@ def _rates(content: dict[str, Any]) -> list[Block]:
 
 
 def draw_rates(content: dict[str, Any]) -> Figure:
-    """Goal rate and success of every controller: a line a set over the rounds.
-
-    Args:
-        content: Of ``rounds.json``.
-    """
+    """Goal rate and success of every controller: a line a set over the rounds."""
     figure = new_figure(12.0, 4.6)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, measure in zip(panels, ("goal", "success"), strict=True):
@@ -164,11 +150,11 @@ def _draw_lines(axes: Axes, tables: dict[str, Any], measure: str) -> None:
     count = len(tables[measure])
     for k, (name, row) in enumerate(tables[measure].items()):
         colour, marker = _LINES[k % len(_LINES)]
-        there = [place for place, who in enumerate(controllers) if row[who] is not None]
-        rates = np.array([row[controllers[place]] for place in there])
-        limits = [tables["intervals"][measure][name][controllers[place]] for place in there]
+        known = [place for place, controller in enumerate(controllers) if row[controller] is not None]
+        rates = np.array([row[controllers[place]] for place in known])
+        limits = [tables["intervals"][measure][name][controllers[place]] for place in known]
         values, lengths = 100.0 * rates, 100.0 * bar_lengths(rates, limits)
-        places = np.array(there) + 0.06 * (k - (count - 1) / 2)
+        places = np.array(known) + 0.06 * (k - (count - 1) / 2)
         label = SETS.get(name, f"{name}, held out")
         axes.errorbar(places, values, lengths, color=colour, marker=marker, capsize=3, label=label, linewidth=1.2)
     axes.set_xticks(range(len(controllers)), controllers, rotation=20 if len(controllers) > 5 else 0)
@@ -187,7 +173,7 @@ def _choices(content: dict[str, Any]) -> list[Section]:
         "controller that is worse there than the one before, or on ordinary terrains more than a point worse than the "
         "base, is not kept. The next training then begins with the one before."
     )
-    rows = [[name, "kept" if one["kept"] else "not kept", one["why"]] for name, one in choices.items()]
+    rows = [[name, "kept" if choice["kept"] else "not kept", choice["why"]] for name, choice in choices.items()]
     blocks = [paragraph(text), table(["training", "", "why"], rows, words=True)]
     return [Section("Which trainings were kept", "choices", blocks)]
 

@@ -39,18 +39,18 @@ def lead_words(shown: Shown) -> str:
     elites, archive = shown.elites, shown.material.archive
     failing = int(elites.failing.sum())
     faults, count = archive.faults, count_faults(archive)
-    told = ""
+    words = ""
     if faults is not None and faults.certifiers and count is not None:
         what = "fault: a terrain" if count == 1 else "faults: terrains"
-        told = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller does not. "
-    told += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
+        words = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller does not. "
+    words += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
     most_first = sorted(shown.modes.modes, key=lambda mode: -len(mode.members))
     if not most_first:
-        return f"{told}."
+        return f"{words}."
     ways = "; ".join(
         f"{mode.deed} ({len(mode.members):,}, marked by {label_of(mode.marked_by)})" for mode in most_first
     )
-    return f"{told}, in {counted(len(most_first), 'way')}. The robot {ways}."
+    return f"{words}, in {counted(len(most_first), 'way')}. The robot {ways}."
 
 
 def outcome_section(shown: Shown) -> list[Block]:

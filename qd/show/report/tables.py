@@ -24,11 +24,11 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
         and the interval of that, under the kind's name with the number of its seeds. ``members`` says who is of it.
     """
     members: dict[str, list[str]] = {}
-    for who in tables["controllers"]:
-        members.setdefault(kind_of(who), []).append(who)
+    for controller in tables["controllers"]:
+        members.setdefault(kind_of(controller), []).append(controller)
     labels = {f"{kind} ({len(all_)} seeds)" if len(all_) > 1 else all_[0]: all_ for kind, all_ in members.items()}
-    found = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in labels.items()}}
-    found |= {"members": labels, "intervals": dict(tables["intervals"])}
+    joined = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in labels.items()}}
+    joined |= {"members": labels, "intervals": dict(tables["intervals"])}
     for measure in (*MEASURES, *(CERTIFIED if tables.get("certified") else ())):
         values, limits = {}, {}
         for name in tables[measure]:
@@ -36,8 +36,8 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
             pairs = {label: _of_kind(tables, measure, name, all_, several) for label, all_ in labels.items()}
             values[name] = {label: value for label, (value, _) in pairs.items()}
             limits[name] = {label: interval for label, (_, interval) in pairs.items()}
-        found[measure], found["intervals"][measure] = values, limits
-    return found
+        joined[measure], joined["intervals"][measure] = values, limits
+    return joined
 
 
 def _of_kind(

@@ -89,8 +89,8 @@ def find_show(
     """
     found = find_archive(robot, run, space=space)
     if not len(found.archive):
-        raise ValueError(f"{found.run} has no elites yet: {found.go_on}, or give another --run")
-    number = found.one(elite) if elite else None
+        raise ValueError(f"{found.run} has no elites yet: let its search go on, or give another --run")
+    number = found.terrain(elite).number if elite else None
     minima = read_minimal(found.folder, found.archive) if minimal is None else found.minima()
     if minima is not None and minimal is not None:
         number = minima.chosen(minimal, found.run)[0]

@@ -10,7 +10,7 @@ from PIL import Image
 
 from kernels.episode import Invalidity, Outcome
 from qd.show.commands import Cross
-from qd.show.cross import MapScale, cross_map, numbers_of, read_own_terrain
+from qd.show.cross import cross_map, numbers_of, read_own_terrain
 from qd.show.crossed import crossed_of, penalties_by_place
 from sim.files.command import run_command
 from tests.qd.recordings import NAMES, recording_of
@@ -84,7 +84,7 @@ def test_mistakes_are_refused_and_the_map_is_never_overwritten(anymal):
         np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
         with pytest.raises(ValueError, match="size"):
             read_own_terrain(Path(folder) / "hill.npz")
-        assert read_own_terrain(Path(folder) / "hill.npz", MapScale(size_m=(16.0, 8.0))).name == f"{folder}-hill.npz"
+        assert read_own_terrain(Path(folder) / "hill.npz", (16.0, 8.0)).name == f"{folder}-hill.npz"
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}

@@ -178,6 +178,7 @@ def test_films_of_elites_of_a_map_and_of_recordings(run):
     recording = read_recording(recorded)
     assert recording.outcome.shape == (1, 4) and recording.origin["seed"] == 3
     assert film("--terrain", str(recorded), "--look.episode", "1", "--out", "again.mp4") == 0
+    assert imageio_ffmpeg.count_frames_and_secs("again.mp4")[0] == 4
     assert Path("again.mp4").read_bytes() != films[1].read_bytes()  # episode 1 is not the typical one
     np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
     assert film("--terrain", "hill.npz", *crossing) == 0
