@@ -191,10 +191,8 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
     """Numbers of ``count`` elites of a run: separated by spaces or commas, or ``all``."""
     known = [str(number) for number in range(count)]
     words = known if split_words([text]) == ["all"] else split_words([text])
-    unknown = [word for word in words if word not in known]
-    if unknown or not words:
-        expected = f"all, or numbers of 0 to {count - 1}" if count else "one that has elites"
-        raise ValueError(f"{whose} has no elite {', '.join(unknown) or repr(text)}: expected {expected}")
+    if not words or not set(words) <= set(known):
+        raise ValueError(f"{whose} has no elite '{text}': expected all, or numbers of its {count} elites, from 0")
     return [int(word) for word in dict.fromkeys(words)]
 
 

@@ -207,22 +207,16 @@ def _load_script(path: Path, device: str, reason: Exception) -> Policy:
 
 
 def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None:
-    observation = torch.zeros((4, robot.observation_size), device=device)
-    expected = (4, robot.num_joints)
+    shape = (4, robot.observation_size)
     try:
         with torch.inference_mode():
-            action = policy(observation)
+            action = policy(torch.zeros(shape, device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
         reason = in_one_line(error) if ControllerSpec.parse(spec).runs_code else reason_of(error)
-        raise ValueError(
-            f"policy '{spec}' failed on observations of shape {tuple(observation.shape)} of '{robot.name}': {reason}"
-        ) from error
-    problem = action_problem(action, expected)
+        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of '{robot.name}': {reason}") from error
+    problem = action_problem(action, (4, robot.num_joints))
     if problem is not None:
-        raise ValueError(
-            f"policy '{spec}' must return actions of shape (num_envs, {robot.num_joints}) for robot '{robot.name}', "
-            f"{problem} for 4 environments"
-        )
+        raise ValueError(f"policy '{spec}' must return {robot.num_joints} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
 
