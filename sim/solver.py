@@ -95,7 +95,7 @@ def fits_dynamics(m: Any, d: Any) -> bool:
     unforced = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL
     joints, actuated = m.jnt_type.numpy(), m.actuator_trnid.numpy()[:, 0]
     free, bodies = joints == types.JointType.FREE, m.jnt_bodyid.numpy()
-    unlike = (
+    misfits = (
         m.opt.run_collision_detection or m.flg_surfacevel or any(vars(m.callback).values()) or m.nsensor,
         m.opt.integrator != types.IntegratorType.IMPLICITFAST or m.opt.disableflags & unforced,
         m.neq or m.ntendon or m.nflex or m.nmocap or m.nhistory or m.has_fluid or m.flg_adhesion,
@@ -108,11 +108,11 @@ def fits_dynamics(m: Any, d: Any) -> bool:
         m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
         (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
     )
-    return fits(m, d) and lanes.fits(tree_sizes_of(m).words) and not any(unlike)
+    return fits(m, d) and lanes.fits(tree_sizes_of(m).words) and not any(misfits)
 
 
 def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies but the world, those near their root first, and where each level of the trees begins among them."""
+    """Bodies but the world in order of depth, and where each depth begins."""
     parent = m.body_parentid.numpy()
     depth = np.zeros(m.nbody, int)
     for body in range(1, m.nbody):
@@ -127,7 +127,7 @@ def tree_sizes_of(m: Any) -> TreeSizes:
 
 
 def _floats(array: Any) -> Any:
-    """The same memory as numbers, shape (..., 10); whoever uses it keeps the array."""
+    """The same memory as numbers, shape (..., 10); the caller keeps the array."""
     return wp.array(ptr=array.ptr, dtype=float, shape=(*array.shape, 10), device=array.device)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any
 
@@ -84,15 +84,9 @@ def draw_starts(
     device: str,
     cfg: CrossingCfg | None = None,
 ) -> Starts:
-    """The starts of replicas 0 to ``count - 1`` of a terrain, those that :class:`sim.rollout.Rollout` gives them.
+    """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
-    Args:
-        robot: Robot settings.
-        heights: Height grid [m], shape (nrow, ncol).
-        seed: The terrain's seed, uint32.
-        count: Episodes.
-        device: Warp device name.
-        cfg: The crossing.
+    ``heights`` [m] have the shape (nrow, ncol); ``device`` is a Warp device.
     """
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
@@ -169,16 +163,16 @@ def cross(
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
 ) -> PlainCrossings:
-    """Run one crossing from each start in plain MuJoCo C.
+    """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
 
     Args:
         robot: Robot settings.
-        policy: The controller, on the CPU.
+        policy: The controller.
         heights: Height grid [m], shape (nrow, ncol).
         starts: Initial states.
         cfg: The crossing.
         time_constant_s: Contact time constant [s]; that of the robot's file if None.
-        ground: Friction and softness of the terrain.
+        ground: Friction and softness of this one terrain.
     """
     cfg = cfg or CrossingCfg()
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
@@ -293,7 +287,7 @@ def cross_terrains(
             progress(len(chunk.result().outcome))
             number = terrain_of.pop(chunk)
             if number not in terrain_of.values():
-                yield number, _joined([part.result() for part in chunks[number]])
+                yield number, _join([part.result() for part in chunks[number]])
 
 
 @contextmanager
@@ -318,10 +312,7 @@ def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[Proc
         pool.shutdown(cancel_futures=True)
 
 
-def _joined(parts: Sequence[PlainCrossings]) -> PlainCrossings:
-    """Crossings of one terrain that were run in parts, in their order."""
-    return PlainCrossings(
-        outcome=np.concatenate([part.outcome for part in parts]),
-        penalties=np.concatenate([part.penalties for part in parts]),
-        duration_s=np.concatenate([part.duration_s for part in parts]),
-    )
+def _join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
+    """Crossings of one terrain that were run in parts."""
+    names = [field.name for field in fields(PlainCrossings)]
+    return PlainCrossings(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -147,7 +147,6 @@ def _add_field(
 
 
 def _add_geom(root: ET.Element, name: str, position: tuple[float, float, float], looks: dict[str, str]) -> None:
-    """Adds ground."""
     # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
     # solmix 0: the stiffness of a contact is the robot's.
     geom = {"name": name, "friction": str(GROUND_FRICTION), "pos": " ".join(map(repr, position)), **looks}
@@ -161,11 +160,8 @@ class _Patch:
     """Ground of one geom."""
 
     rows: slice
-    """Its nodes along y."""
     cols: slice
-    """Along x."""
-    margin: Margins
-    """Nodes to add to them before and behind along y, and along x: those at the edge go on beyond it."""
+    margin: Margins  # nodes that continue the edge, before and behind along y, and along x
     friction: float
     time_constant_s: float
 
@@ -187,7 +183,6 @@ def _patches_of(ground: GroundMaps) -> list[_Patch]:
 
 
 def _nodes(span: tuple[int, int], count: int, nodes: int) -> slice:
-    """Nodes of the patches from one to before another, of so many along an axis."""
     first, end = (place * (nodes - 1) // count for place in span)
     return slice(first, end + 1)
 
@@ -267,7 +262,7 @@ def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
     Args:
         heights: Height grid [m], shape (nrow, ncol); beyond its edge the edge height continues.
         x: Points [m], any shape.
-        y: Likewise.
+        y: Points [m], of the same shape.
     """
     limit_row, limit_col = heights.shape[0] - 1, heights.shape[1] - 1
     column = np.clip(x / SPACING, 0.0, limit_col)

@@ -32,19 +32,19 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     )
 
 
-def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, flag: str = "run") -> RobotCfg:
+def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, flag: str = "run") -> RobotCfg:
     """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
     file names.
 
     Args:
-        there: What the file says: ``robot``, its name, and the rest of :func:`sim.files.records.identity`.
+        record: What the file says: ``robot``, its name, and the rest of :func:`sim.files.records.identity`.
         given: What the command line names, if anything.
         file: The file, for errors.
-        flag: The flag that names it, likewise.
+        flag: The flag that names it, for errors.
     """
-    name, robot = there["robot"], None if given is None else get_robot(given)
+    name, robot = record["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:
         raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --{flag}")
     if robot is None and name not in ROBOTS:
@@ -53,5 +53,5 @@ def robot_of(there: Mapping[str, Any], given: "str | RobotCfg | None", file: Pat
             "since no code runs that the command line does not name"
         )
     robot = robot or ROBOTS[name]
-    check_identity(there, robot, file, "make it anew")
+    check_identity(record, robot, file, "make it anew")
     return robot

@@ -48,9 +48,7 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
 def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.ModelBuilder, list[str]]:
     """One robot as :func:`build_robot` makes it, and what is wrong with it, one line each.
 
-    Args:
-        robot: Its settings.
-        wrong: Fields of the settings that cannot be compared with the model, since they are wrong by themselves.
+    Fields of the settings in ``wrong`` are not compared with the model.
     """
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
@@ -73,10 +71,8 @@ def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.Mod
     joints = joint_names(builder)
     problems += number_problems(builder, [leaf_name(label) for label in builder.body_label], joints)
     problems += drive_problems(builder, files.root, joints)
-    named = [] if "joint_names" in wrong else _joint_name_problems(builder, robot)
-    problems += named
-    if not named and "joint_names" not in wrong:
-        problems += _joint_value_problems(builder, robot, files, wrong)
+    if "joint_names" not in wrong:
+        problems += _joint_name_problems(builder, robot) or _joint_value_problems(builder, robot, files, wrong)
     roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
     geoms = [name for role in roles for name in getattr(robot, role)]
     problems += _unknown("geom", geoms, geom_names(builder), robot)
@@ -121,13 +117,13 @@ def merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
         if kind == newton.JointType.FIXED and parent >= 0:
             in_parent = model.joint_X_p[joint] * wp.transform_inverse(model.joint_X_c[joint])
             root[child], pose[child] = root[parent], pose[parent] * in_parent
-    merged = {}
+    masses = {}
     for body in set(root):
         parts = [k for k in range(model.body_count) if root[k] == body]
-        merged[model.body_label[body]] = _mass_of(model, parts, [pose[k] for k in parts])
+        masses[model.body_label[body]] = _mass_of(model, parts, [pose[k] for k in parts])
     model.collapse_fixed_joints()
     for body, label in enumerate(model.body_label):
-        mass, centre, inertia = merged[label]
+        mass, centre, inertia = masses[label]
         model.body_mass[body], model.body_com[body] = mass, wp.vec3(*centre)
         model.body_inertia[body] = wp.mat33(*inertia.ravel())
         model.body_inv_mass[body] = 1.0 / mass if mass > 0.0 else 0.0
@@ -144,9 +140,9 @@ def _mass_of(builder: Any, bodies: list[int], poses: list[Any]) -> tuple[float, 
     total = sum(mass)
     centre = np.average(centres, axis=0, weights=mass) if total > 0.0 else centres[0]
     inertia = np.zeros((3, 3))
-    for k, pose, m, own in zip(bodies, poses, mass, centres, strict=True):
+    for k, pose, m, centre_of_body in zip(bodies, poses, mass, centres, strict=True):
         turn = np.array(wp.quat_to_matrix(pose.q), dtype=np.float64).reshape(3, 3)
-        off = own - centre
+        off = centre_of_body - centre
         inertia += turn @ np.array(builder.body_inertia[k], dtype=np.float64).reshape(3, 3) @ turn.T
         inertia += m * (off @ off * np.eye(3) - np.outer(off, off))
     return total, centre, inertia
@@ -282,13 +278,7 @@ _AT_LEAST_0 = ("joint_target_ke", "joint_target_kd", "joint_armature", "joint_ef
 
 
 def number_problems(builder: newton.ModelBuilder, bodies: Sequence[str], joints: Sequence[str]) -> list[str]:
-    """What is wrong with masses, frames and joints, one line each.
-
-    Args:
-        builder: The robot, of which every joint but the first has one degree of freedom.
-        bodies: Names of its bodies.
-        joints: Names of its joints without that of its base.
-    """
+    """What is wrong with masses, frames and joints of a robot of single joints, one line each."""
     light = [name for name, mass in zip(bodies, builder.body_mass, strict=True) if not 0.0 < mass < np.inf]
     problems = (
         [f"every body must have a mass above 0, unlike {', '.join(light)}: give it an <inertial>"] if light else []
@@ -345,7 +335,7 @@ def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Seque
     direct = newton.solvers.SolverMuJoCo.CtrlSource.CTRL_DIRECT
     driven = [int(target[0]) for target, source in zip(targets, sources, strict=True) if source != direct]
     refs: Any = attributes["dof_ref"] or {}
-    found = {
+    mistakes = {
         "an actuator that pulls by itself": [f"number {k}" for k, source in enumerate(sources)
                                              if source == direct and any(biases[k])],
         "a gear other than 1 on an actuator": [f"number {k}" for k, gear in enumerate(gears)
@@ -356,7 +346,7 @@ def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Seque
     }  # fmt: skip
     return [
         f"{what} ({', '.join(names)}) is not understood: take it out (<position>, one a joint, and <motor> are)"
-        for what, names in found.items()
+        for what, names in mistakes.items()
         if names
     ]
 

@@ -5,7 +5,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers import expat
 
 _PACKAGE = "package://"
 _NUMBERS = """
@@ -42,15 +41,14 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
         visuals: Whether a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and
             can be read; the simulation needs none of it.
     """
-    lines: dict[ET.Element, int] = {}
-    root = _parse(model_file, lines, visuals=visuals)
+    root = _parse(model_file, visuals=visuals)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
-    _refuse_xacro(root, model_file, lines)
-    found = [f"{model_file}, line {lines[element]}: {text}" for element, text in _number_problems(root)]
+    _refuse_xacro(root, model_file)
+    problems = list(_number_problems(root))
     files = [model_file]
     if root.tag == "robot":
-        found += [f"{model_file}, line {lines[element]}: {text}" for element, text in _urdf_problems(root)]
+        problems += _urdf_problems(root)
         files += [_take_urdf_mesh(mesh, model_file) for mesh in root.iter("mesh") if mesh.get("filename")]
     else:
         files += _mjcf_files(root, (Path(os.path.abspath(model_file)),), model_file.parent)
@@ -61,20 +59,20 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     if foreign:
         raise ValueError(f"{model_file}: meshes must be STL or OBJ files, got {', '.join(foreign)}: convert them")
     every = tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files))
-    return ModelFiles(root=root, files=every, problems=tuple(found))
+    return ModelFiles(root=root, files=every, problems=tuple(f"{model_file}: {problem}" for problem in problems))
 
 
-def _refuse_xacro(root: ET.Element, file: Path, lines: dict[ET.Element, int]) -> None:
+def _refuse_xacro(root: ET.Element, file: Path) -> None:
     for element in root.iter():
         marks = [value for value in element.attrib.values() if "${" in value or "$(" in value]
-        if element.tag.startswith("xacro:") or marks:
+        if "xacro" in element.tag or marks:
             raise ValueError(
-                f"{file}, line {lines[element]}: a xacro file ({marks[0] if marks else f'<{element.tag}>'}), expected "
-                f"a URDF: make one of it first, `xacro {file.name} > {file.stem}.expanded.urdf`"
+                f"{file} is a xacro file ({marks[0] if marks else f'<{element.tag}>'}), expected a URDF: make one of "
+                f"it first, `xacro {file.name} > {file.stem}.expanded.urdf`"
             )
 
 
-def _number_problems(root: ET.Element) -> Iterator[tuple[ET.Element, str]]:
+def _number_problems(root: ET.Element) -> Iterator[str]:
     """Attributes that hold something else than the numbers they are for."""
     numbers = _NUMBERS.split()
     for element in root.iter():
@@ -83,7 +81,7 @@ def _number_problems(root: ET.Element) -> Iterator[tuple[ET.Element, str]]:
                 continue
             if not all(map(_is_number, value.split())):
                 comma = ": write a decimal point" if "," in value else ""
-                yield element, f'<{element.tag} {name}="{value}"> must be numbers{comma}'
+                yield f'<{element.tag} {name}="{value}"> must be numbers{comma}'
 
 
 def _is_number(word: str) -> bool:
@@ -94,61 +92,47 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _urdf_problems(root: ET.Element) -> Iterator[tuple[ET.Element, str]]:
+def _urdf_problems(root: ET.Element) -> Iterator[str]:
     """Links and joints that lack what a URDF's need."""
     links = [link.get("name") for link in root.findall("link")]
     for link in root.findall("link"):
         if not link.get("name"):
-            yield link, "a link without a name"
+            yield "a link without a name"
     for joint in root.findall("joint"):
         name, kind = f"joint {joint.get('name', 'without a name')}", joint.get("type", "")
         for end in ("parent", "child"):
             element = joint.find(end)
             link = None if element is None else element.get("link")
             if link is None:
-                yield joint, f'{name} has no <{end} link="...">'
+                yield f'{name} has no <{end} link="...">'
             elif link not in links:
-                yield joint, f"{name}: no link named {link}, the file has {', '.join(map(str, links))}"
+                yield f"{name}: no link named {link}, the file has {', '.join(map(str, links))}"
         if kind not in (*_MOVING, "fixed", "floating", "planar"):
-            yield joint, f"{name} must be of type {', '.join(_MOVING)} or fixed, got '{kind}'"
+            yield f"{name} must be of type {', '.join(_MOVING)} or fixed, got '{kind}'"
         limit = joint.find("limit")
         lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
         if kind in _MOVING[:2] and lacking:
             missing = "<limit>" if limit is None else " and ".join(lacking)
-            yield joint, f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
+            yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
 
 
 def joints_without_effort(root: ET.Element) -> list[str]:
     """Names of a URDF's moving joints whose limits say nothing of effort, or 0."""
-    found = []
+    joints = []
     for joint in root.findall("joint"):
         limit = joint.find("limit")
         effort = "0" if limit is None else limit.get("effort", "0")
         if joint.get("type") in _MOVING and _is_number(effort) and not float(effort) > 0.0:
-            found.append(joint.get("name", ""))
-    return found
+            joints.append(joint.get("name", ""))
+    return joints
 
 
-def _with_lines(file: Path, lines: dict[ET.Element, int]) -> ET.Element:
-    """The root of an XML file; the line of every element goes into ``lines``."""
-    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = lambda tag: builder.end(tag) and None
-    parser.CharacterDataHandler = builder.data
-    parser.Parse(file.read_bytes(), True)
-    return builder.close()
-
-
-def _parse(file: Path, lines: dict[ET.Element, int] | None = None, *, visuals: bool = False) -> ET.Element:
+def _parse(file: Path, *, visuals: bool = False) -> ET.Element:
     try:
-        root = _with_lines(file, {} if lines is None else lines)
+        root = ET.parse(file).getroot()
     except FileNotFoundError:
         raise ValueError(f"model file expected at {file}, no such file") from None
-    except (expat.ExpatError, OSError, ValueError) as error:
+    except (ET.ParseError, OSError, ValueError) as error:
         raise ValueError(f"{file} cannot be read as XML: {error}") from None
     for parent in list(root.iter()):
         for visual in parent.findall("visual") if root.tag == "robot" else ():
@@ -192,30 +176,24 @@ def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
 
 
 def _mjcf_files(root: ET.Element, within: tuple[Path, ...], main_folder: Path) -> list[Path]:
-    """Files that an MJCF names: meshes and included files, with the files that those name.
-
-    Args:
-        root: Of the XML.
-        within: Its file, behind those that include it.
-        main_folder: Where the file that includes it all lies, in which meshes are looked for first.
-    """
+    """Meshes and included files of an MJCF, which is the last of ``within``; meshes lie in ``main_folder`` first."""
     folder = within[-1].parent
     compiler: dict[str, str] = {}
     for element in root.iter("compiler"):
         compiler |= element.attrib
     folder_of_meshes = compiler.get("meshdir", compiler.get("assetdir", ""))
-    found: list[Path] = []
+    files: list[Path] = []
     for mesh in root.iter("mesh"):
         name = mesh.get("file")
         if name is not None:
             name = Path(name).name if compiler.get("strippath", "").lower() == "true" else name
             places = [place / folder_of_meshes / name for place in (main_folder, folder)] + [folder / name]
-            found.append(next((place for place in places if place.is_file()), places[0]))
+            files.append(next((place for place in places if place.is_file()), places[0]))
     for include in root.iter("include"):
         included = Path(os.path.abspath(folder / include.get("file", "")))
-        found.append(included)
+        files.append(included)
         if included in within:
             raise ValueError(f"{included} includes itself")
         if included.is_file():
-            found += _mjcf_files(_parse(included), (*within, included), main_folder)
-    return found
+            files += _mjcf_files(_parse(included), (*within, included), main_folder)
+    return files

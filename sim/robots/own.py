@@ -30,64 +30,68 @@ def load_robot(path: Path) -> RobotCfg:
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/own-robot.md)")
     if isinstance(robot.model_file, str):
         robot = replace(robot, model_file=Path(robot.model_file))
-    found = settings_problems(robot)
-    wrong = {line.split(" ", 1)[0] for line in found}
+    mistakes = settings_problems(robot)
+    wrong = {line.split(" ", 1)[0] for line in mistakes}
     file = path.resolve()  # of a link, the model lies beside what it points to
     if "model_file" not in wrong:
         robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
         with wp.ScopedDevice(host_device()):
             builder, of_model = read_robot(robot, wrong)
+            mistakes += of_model
             try:
                 make_probes(builder)
             except ValueError as error:
-                of_model.append(str(error))
-            found += of_model
-            if not found and not robot.default_base_height:
+                mistakes.append(str(error))
+            if not mistakes and not robot.default_base_height:
                 robot = replace(robot, default_base_height=start_height(robot, builder))
-    if found:
-        raise ValueError(f"{path}: {'; '.join(found)}")
+    if mistakes:
+        raise ValueError(f"{path}: {'; '.join(mistakes)}")
     return robot
 
 
 def settings_problems(robot: RobotCfg) -> list[str]:
     """What is wrong with settings by themselves, one line each; :func:`read_robot` compares them with the model."""
-    found = problems(robot)
-    wrong = {line.split(" ", 1)[0] for line in found}
+    mistakes = problems(robot)
+    wrong = {line.split(" ", 1)[0] for line in mistakes}
 
     def fine(*names: str) -> bool:
         return wrong.isdisjoint(names)
 
     if fine("name"):
         if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
-            found.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
+            mistakes.append(
+                f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}"
+            )
         elif robot.name in ROBOTS:
-            found.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
+            mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
     if fine(*_NAMES):
-        found += _name_problems(robot)
+        mistakes += _name_problems(robot)
     if (robot.stiffness is None) != (robot.damping is None):
-        found.append("stiffness and damping must be given together")
+        mistakes.append("stiffness and damping must be given together")
     least = 2.0 * robot.physics_dt if fine("physics_dt") else 0.0
     time_constant_s = robot.contact_time_constant_s
     if fine("contact_time_constant_s") and time_constant_s is not None and time_constant_s < least * (1.0 - 1e-9):
-        found.append(f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {time_constant_s:g}")
-    return found
+        mistakes.append(
+            f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {time_constant_s:g}"
+        )
+    return mistakes
 
 
 def _name_problems(robot: RobotCfg) -> list[str]:
-    found = [f"{name} must name at least one" for name in ("base_geoms", "foot_geoms", "joint_names")
+    mistakes = [f"{name} must name at least one" for name in ("base_geoms", "foot_geoms", "joint_names")
              if not getattr(robot, name)]  # fmt: skip
-    found += [f"{name} must hold each name once, got {', '.join(getattr(robot, name))}" for name in _NAMES
+    mistakes += [f"{name} must hold each name once, got {', '.join(getattr(robot, name))}" for name in _NAMES
               if len(set(getattr(robot, name))) < len(getattr(robot, name))]  # fmt: skip
     roles = {role: set(getattr(robot, role)) for role in ("base_geoms", "limb_geoms", "foot_geoms")}
     twice = sorted({name for a, b in itertools.combinations(roles.values(), 2) for name in a & b})
     if twice:
-        found.append(f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}")
+        mistakes.append(f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}")
     if not set(robot.penalties) <= set(PENALTIES) or len(robot.penalties) < 2:
-        found.append(f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}")
+        mistakes.append(f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}")
     strange = [name for name in getattr(robot.training, "steady_joints", ()) if name not in robot.joint_names]
     if strange:
-        found.append(f"training.steady_joints: no joint named {', '.join(strange)} in joint_names")
-    return found
+        mistakes.append(f"training.steady_joints: no joint named {', '.join(strange)} in joint_names")
+    return mistakes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -135,16 +135,16 @@ def _cover(hull: _Hull, tolerance: float) -> tuple[_Array, _Array] | None:
     squares = (samples * samples).sum(axis=1)
     gap = np.full(len(samples), np.inf)
     centres: list[_Array] = []
-    found: list[float] = []
+    chosen_radii: list[float] = []
     while gap.max() > goal:
-        if len(found) == MAX_MESH_PROBES:
+        if len(chosen_radii) == MAX_MESH_PROBES:
             return None
         centre, radius = _ball_at(samples[gap.argmax()], hull, radii, 0.9 * goal)
         centres.append(centre)
-        found.append(radius)
+        chosen_radii.append(radius)
         apart = np.sqrt(np.maximum(squares - 2.0 * samples @ centre + centre @ centre, 0.0))
         gap = np.minimum(gap, apart - radius)
-    return np.array(centres), np.array(found)
+    return np.array(centres), np.array(chosen_radii)
 
 
 def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
@@ -181,9 +181,9 @@ def _probes_of(content: bytes) -> HullProbes:
     hull = _hull_of(vertices)
     corners = np.unique(hull.triangles.reshape(-1, 3), axis=0)
     tolerance = min(MESH_TOLERANCE, SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
-    while (found := _cover(hull, tolerance)) is None:
+    while (balls := _cover(hull, tolerance)) is None:
         tolerance *= _GROWTH
-    return HullProbes(strips=tuple(_rows(*found, corners)), tolerance=tolerance)
+    return HullProbes(strips=tuple(_rows(*balls, corners)), tolerance=tolerance)
 
 
 def hull_probes(vertices: _Array) -> HullProbes:

@@ -138,7 +138,7 @@ class RobotCfg:
 
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
-        from kernels.penalties import BASE, FOOT, LIMB  # likewise
+        from kernels.penalties import BASE, FOOT, LIMB  # with Warp too
 
         return BASE * (geom in self.base_geoms) + FOOT * (geom in self.foot_geoms) + LIMB * (geom in self.limb_geoms)
 
@@ -181,10 +181,10 @@ class RobotCfg:
         Args:
             policy: The search's controller.
         """
-        there = read_json(self.scales_file) if self.scales_file.exists() else {}
-        if there.get("policy_sha256") in (None, controller_hash(policy)):
+        measured = read_json(self.scales_file) if self.scales_file.exists() else {}
+        if measured.get("policy_sha256") in (None, controller_hash(policy)):
             return None
-        return f"Penalties are scaled by those of {there.get('policy')}, with which {self.scales_file} was measured."
+        return f"Penalties are scaled by those of {measured.get('policy')}, with which {self.scales_file} was measured."
 
 
 def _is_positive(value: object) -> bool:

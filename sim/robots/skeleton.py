@@ -30,10 +30,10 @@ def robot_spec(robot: RobotCfg) -> Any:
         spec = _urdf_spec(robot) if read_model_files(robot.model_file).is_urdf else _mjcf_spec(robot)
     except Exception as error:  # MuJoCo's own type has no name
         raise _not_shown(robot, error) from None
-    found = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
-    if found != robot.joint_names or len(spec.joints) != len(found) + 1:
+    joints = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
+    if joints != robot.joint_names or len(spec.joints) != len(joints) + 1:
         raise ValueError(
-            f"robot '{robot.name}': {robot.model_file} has joints {', '.join(found)} for MuJoCo, expected a free base "
+            f"robot '{robot.name}': {robot.model_file} has joints {', '.join(joints)} for MuJoCo, expected a free base "
             f"and {', '.join(robot.joint_names)}"
         )
     return spec

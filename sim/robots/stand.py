@@ -211,43 +211,43 @@ def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
     return warnings
 
 
-def describe_standing(robot: RobotCfg, found: Standing) -> tuple[str, bool]:
+def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
     """The findings in words, and whether nothing has to be mended."""
-    carried = ", ".join(f"{name} {share:.0%}" for name, share in found.carried.items()) or "nothing"
-    first, last = found.height
+    carried = ", ".join(f"{name} {share:.0%}" for name, share in standing.carried.items()) or "nothing"
+    first, last = standing.height
     lines = [
-        f"On flat ground: base from {first:.3f} to {last:.3f} m, tilt {found.tilt_deg:.1f} degrees, joints at most "
-        f"{found.joint_error:.3f} rad off; its weight is on {carried}",
-        f"Dropped on rough ground: at most {found.contacts:.1f} contacts a robot on average (nconmax {robot.nconmax}) "
-        f"and {found.rows} constraint rows (njmax {robot.njmax})",
+        f"On flat ground: base from {first:.3f} to {last:.3f} m, tilt {standing.tilt_deg:.1f} degrees, joints at most "
+        f"{standing.joint_error:.3f} rad off; its weight is on {carried}",
+        f"Dropped on rough ground: at most {standing.contacts:.1f} contacts a robot on average (nconmax "
+        f"{robot.nconmax}) and {standing.rows} constraint rows (njmax {robot.njmax})",
     ]
-    wrong = []
-    if found.gap < -_SUNK:
-        wrong.append(
-            f"its feet start {-found.gap:.3f} m in the ground: default_base_height {found.right_height:.3f} is right, "
-            f"got {first:g}"
+    mistakes = []
+    if standing.gap < -_SUNK:
+        mistakes.append(
+            f"its feet start {-standing.gap:.3f} m in the ground: default_base_height {standing.right_height:.3f} is "
+            f"right, got {first:g}"
         )
-    if first > found.right_height + _FALL:
-        wrong.append(
-            f"it starts with its feet {found.gap:.3f} m over the ground and falls: default_base_height "
-            f"{found.right_height:.3f} is right, got {first:g}"
+    if first > standing.right_height + _FALL:
+        mistakes.append(
+            f"it starts with its feet {standing.gap:.3f} m over the ground and falls: default_base_height "
+            f"{standing.right_height:.3f} is right, got {first:g}"
         )
-    if found.lowest not in robot.foot_geoms:
-        wrong.append(f"in the default pose {found.lowest} is lower than the feet")
-    if not found.finite:
-        wrong.append("states became not finite: gains too high for physics_dt, or too little armature?")
-    if found.stands and found.restless > _RESTLESS:
-        wrong.append(
-            f"its feet bounce at rest: the force on them changes from step to step, between {found.bounce[0]:.1f} and "
-            f"{found.bounce[1]:.1f} times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 for a "
-            "dog of 13 kg), or a longer contact_time_constant_s"
+    if standing.lowest not in robot.foot_geoms:
+        mistakes.append(f"in the default pose {standing.lowest} is lower than the feet")
+    if not standing.finite:
+        mistakes.append("states became not finite: gains too high for physics_dt, or too little armature?")
+    if standing.stands and standing.restless > _RESTLESS:
+        mistakes.append(
+            f"its feet bounce at rest: the force on them changes from step to step, between {standing.bounce[0]:.1f} "
+            f"and {standing.bounce[1]:.1f} times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 "
+            "for a dog of 13 kg), or a longer contact_time_constant_s"
         )
-    if found.overflowed:
-        wrong.append("a buffer of the solver was too small: raise nconmax and njmax above the numbers above")
-    lines += [f"To mend: {text}" for text in wrong]
+    if standing.overflowed:
+        mistakes.append("a buffer of the solver was too small: raise nconmax and njmax above the numbers above")
+    lines += [f"To mend: {text}" for text in mistakes]
     lines.append(
         "It stands."
-        if found.stands
+        if standing.stands
         else "It does not stand by itself. A biped may fall; of others check gains, effort and default pose."
     )
-    return "\n".join(lines), not wrong
+    return "\n".join(lines), not mistakes

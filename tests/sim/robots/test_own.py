@@ -109,8 +109,8 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
     ("urdf", LIMIT, "", "FL_hip has no <limit>"),
-    ("urdf", FIRST_MASS, '<mass value="0,8"/>', 'dog.urdf, line 8: <mass value="0,8">'),
-    ("urdf", FIRST_MASS, '<mass value="${m}"/>', "line 8"),
+    ("urdf", FIRST_MASS, '<mass value="0,8"/>', '<mass value="0,8">'),
+    ("urdf", FIRST_MASS, '<mass value="${m}"/>', "xacro"),
     ("urdf", '<parent link="trunk"/>', "", "<parent link"),
     ("urdf", '<child link="FL_thigh"/>', '<child link="leg"/>', "leg"),
     ("urdf", '"revolute"', '"hinge"', "hinge"),
@@ -289,7 +289,7 @@ def test_a_mesh_of_a_file_is_read(tmp_path, kind):
     [
         ("urdf", "", 1.0, 0.01),  # a URDF says nothing of contact: friction 1, the time constant of the shipped robots
         ("mjcf", "", 0.8, 0.01),
-        ("mjcf", "\n    friction=0.6,\n    contact_time_constant_s=0.02,", 0.6, 0.02),
+        ("urdf", "\n    friction=0.6,\n    contact_time_constant_s=0.02,", 0.6, 0.02),
     ],
 )
 def test_contact_and_effort_reach_the_solver(tmp_path, device, kind, more, friction, time_constant_s):
