@@ -85,12 +85,9 @@ def test_results_name_no_path_of_the_machine_that_made_them():
     assert [str(file) for file in files if place.search(file.read_text())] == []
 
 
-@pytest.mark.parametrize(("digits", "off", "agrees"), [(3, 0, True), (2, 0, True), (3, 6e-3, False), (2, -1e-2, False)])
-def test_a_wrong_number_is_found(digits, off, agrees):
-    number = next(iter(numbers_of("README.md")))._replace(
-        file="results/anymal/tables.json", expression="goal.hand_crafted.base"
-    )
-    assert number._replace(text=f"{number.value + off:.{digits}f}").agrees is agrees
+def test_a_wrong_number_is_found():
+    number = next(numbers_of("README.md"))._replace(file="results/anymal/tables.json", expression="len(controllers)")
+    assert number._replace(text=f"{number.value:.3f}").agrees and not number._replace(text="0.006").agrees
 
 
 def settings_of(page: str, folder: Path) -> dict[str, str]:
@@ -106,9 +103,6 @@ def settings_of(page: str, folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize("page", ["README.md", "docs/own-robot.md"])
 def test_the_robot_is_read(page, tmp_path):
     assert "dog.py" in settings_of(page, tmp_path)
-    (tmp_path / "dog.xml").write_text(mjcf(drive=""))
-    with pytest.raises(ValueError, match="no gains for FL_hip"):
-        get_robot(str(tmp_path / "dog.py"))
     (tmp_path / "dog.xml").write_text(mjcf())
     dog = get_robot(str(tmp_path / "dog.py"))
     assert (dog.name, dog.num_joints, dog.observation_size) == ("dog", 8, 51)
@@ -215,15 +209,9 @@ def test_make_help_teaches_every_target_and_variable():
 
 @pytest.mark.parametrize("name", ["a b", "it's", '"#', "*ü\\", "`id`"])
 def test_make_hands_the_robot_on_as_it_is(name):
+    assert run_by_make(("make", "view")) == [".venv/bin/faultline", "view"]
     command = run_by_make(("make", "archive", f"ROBOT={name}", "ARGS=--preset small --seed 3"))
     assert command == [".venv/bin/faultline", "archive", "--robot", name, "--preset", "small", "--seed", "3"]
-
-
-@pytest.mark.parametrize("target", ["archive", "view"])
-def test_targets_call_the_command_of_their_name(target):
-    assert run_by_make(("make", target)) == [".venv/bin/faultline", target]
-    command = run_by_make(("make", target, "ROBOT=cassie"))
-    assert command == shlex.split(f".venv/bin/faultline {target} --robot cassie")
 
 
 def test_the_quick_tests_leave_out_what_takes_long():
