@@ -48,7 +48,8 @@ def test_a_trial_writes_its_file(name, tmp_path, monkeypatch):
             monkeypatch.setattr(script, function, crossing)
     without_figures(monkeypatch)
     monkeypatch.setattr(speed, "open_evaluator", open_made_up)
-    monkeypatch.setattr(tables, "crossings_folder", lambda robot: tmp_path / "crossings")
+    (tmp_path / "results").symlink_to(MAKE.parent)
+    monkeypatch.chdir(tmp_path)  # made-up crossings are stored under runs/ here
     out = tmp_path / "anymal" / FILES[name]
     script.main(["--small", "--device", "cpu", "--out", str(out)])
     report = json.loads(out.read_text())
