@@ -192,7 +192,7 @@ def chosen_elites(text: str, count: int, whose: object) -> list[int]:
     known = [str(number) for number in range(count)]
     words = known if split_words([text]) == ["all"] else split_words([text])
     if not words or not set(words) <= set(known):
-        raise ValueError(f"{whose} has no elite '{text}': expected all, or numbers of its {count} elites, from 0")
+        raise ValueError(f"{whose} has no elite {text}: expected all, or numbers of its {count} elites, from 0")
     return [int(word) for word in dict.fromkeys(words)]
 
 

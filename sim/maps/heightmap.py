@@ -195,8 +195,6 @@ def fitted(heightmap: Heightmap) -> str:
     (size_x, size_y), low, high = heightmap.size_m, heightmap.heights.min(), heightmap.heights.max()
     words = f"{columns} x {rows} nodes over {size_x:g} x {size_y:g} m, heights {low:.2f} to {high:.2f} m"
     for axis, side, whole in zip("xy", heightmap.size_m, _WHOLE, strict=True):
-        if side > whole + 1e-6:
-            words += f", cut to its middle {whole:g} m along {axis}"
-        elif side < whole - 1e-6:
-            words += f", continued by the height of its edge to {whole:g} m along {axis}"
+        if abs(side - whole) > 1e-6:
+            words += f", {'cut to its middle' if side > whole else 'continued by its edge to'} {whole:g} m along {axis}"
     return words if heightmap.ground is None else f"{words}, with friction or softness of its own"
