@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import InSpace, OfRobot, OnGround, Where, Who, peek
+from sim.files.command import InSpace, OfRobot, Where, Who, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -27,7 +27,7 @@ class ArchiveFitness:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive(Who, OnGround, Where):
+class Archive(Who, Where):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
@@ -47,7 +47,7 @@ class Archive(Who, OnGround, Where):
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
     space: str | None = None
     """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
-    file.py:CLASS. super_gaussian if left out."""
+    file.py:CLASS; behind any of them +friction, +softness or both. super_gaussian if left out."""
     replicas: int = 4
     """Episodes a terrain."""
     method: str | None = None
@@ -89,10 +89,10 @@ class Archive(Who, OnGround, Where):
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         if self.resume is None:
             robot, policy = get_robot(self.robot), None
-            space = load_space(self.space, self.ground)
+            space = load_space(self.space)
             cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
-        elif self.run_dir or self.ground:
-            raise ValueError("--resume goes on with a run as it is, got --run-dir or --ground too: leave them out")
+        elif self.run_dir:
+            raise ValueError("--resume goes on with a run as it is, got --run-dir too: leave it out")
         else:
             run = find_search(self.resume, robot=self.robot, policy=self.policy, space=self.space)
             robot, policy, cfg = run.robot, run.policy, run.cfg
@@ -209,7 +209,7 @@ class Minimise(Who, InSpace, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(Who, OnGround, Where):
+class Calibrate(Who, Where):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
     It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
@@ -240,7 +240,7 @@ class Calibrate(Who, OnGround, Where):
             compute=Compute.resolve(self.device, self.workers, self.num_envs),
             terrains=self.terrains,
             most_terrains=self.most_terrains,
-            space=load_space(self.space, self.ground),
+            space=load_space(self.space),
             seed=self.seed,
             out=self.out,
         )

@@ -89,23 +89,12 @@ def _check_map(name: str, values: NDArray[np.floating], allowed: NDArray[np.bool
         raise ValueError(f"{name} must be {words}, got {values[~allowed][0]:g} in one of the patches")
 
 
-def check_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
-    """What the ground is to have maps of, each once and in the order of :data:`GROUND_KINDS`."""
-    unknown = [kind for kind in kinds if kind not in GROUND_KINDS]
-    if unknown or not kinds:
-        raise ValueError(
-            f"unknown ground {', '.join(map(repr, unknown)) or 'of nothing'}: expected friction, softness or both "
-            "(--ground friction softness)"
-        )
-    return tuple(kind for kind in GROUND_KINDS if kind in kinds)
-
-
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     """The name of a space without its ground, and what that has maps of: ``course+friction`` is of ``course``."""
     found = _SUFFIX.search(name)
     if found is None or found.start() == 0:
         return name, ()
-    return name[: found.start()], check_kinds(found.group(1)[1:].split("+"))
+    return name[: found.start()], tuple(kind for kind in GROUND_KINDS if f"+{kind}" in found.group(1))
 
 
 def joined_name(name: str, kinds: Sequence[str]) -> str:

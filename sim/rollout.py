@@ -306,7 +306,6 @@ class Rollout:
         for _, episode in self._latches:
             episode.outcome.fill_(int(Outcome.TIME_OUT))
         self._queue.episode_of_env.fill_(-1)
-        self._queue.counts.zero_()
 
     def put(self, terrains: np.ndarray, seeds: np.ndarray, ground: GroundMaps | None = None) -> None:
         """Let every replica on some terrains be crossed, behind what is under way; waits for nothing.

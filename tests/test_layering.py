@@ -93,9 +93,7 @@ def test_few_imports_are_hidden_and_only_the_registry_loads_commands():
     hidden, offenders = 0, []
     for path in FILES:
         tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-        hidden += sum(
-            isinstance(node, ast.Import | ast.ImportFrom) and node.col_offset > 0 for node in ast.walk(tree)
-        )
+        hidden += sum(isinstance(node, ast.Import | ast.ImportFrom) and node.col_offset > 0 for node in ast.walk(tree))
         offenders += [path for _, name in imported_names(path, tree) if name.split(".")[1:2] == ["commands"]]
         offenders += [path for _, name in imported_names(path, tree) if ".show.commands" in name]
     assert offenders == []

@@ -115,8 +115,6 @@ class FinetuneCfg(TrainCfg):
     space: str | None = None
     """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a
     space of your own here too, for its elites and for a resumed training on it."""
-    ground: tuple[str, ...] | None = None
-    """What the ground of hard-random terrains differs in from patch to patch of 2 m: friction, softness, or both."""
     recipe: RecipeCfg = field(default_factory=RecipeCfg)
 
     @classmethod
@@ -154,8 +152,6 @@ class FinetuneCfg(TrainCfg):
             raise ValueError(f"num_envs must be at least as many as terrains, {self.terrains}, got {self.num_envs}")
         if self.mix != "generated" and self.archive:
             raise ValueError(f"mix {self.mix} takes no terrains from an archive, got --archive: leave it out")
-        if self.mix == "generated" and self.ground is not None:
-            raise ValueError("mix generated takes the ground of its archives, got --ground: leave it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,8 +192,6 @@ class HardenCfg:
     """Seed of everything drawn in searches and trainings."""
     space: str | None = None
     """Terrain space: super_gaussian, course, or one of your own, file.py:CLASS; super_gaussian if left out."""
-    ground: tuple[str, ...] | None = None
-    """What the ground differs in from patch to patch of 2 m: friction, softness, or both."""
     specialists: bool = False
     """Train a specialist for each search too, whose certificates count beside those of the panel."""
     search: RoundSearchCfg = field(default_factory=RoundSearchCfg)

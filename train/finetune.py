@@ -135,7 +135,7 @@ class Elites:
 def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
     """The elites to train on."""
     if cfg.mix != "generated":
-        space = load_space(cfg.space, cfg.ground)
+        space = load_space(cfg.space)
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]

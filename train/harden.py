@@ -78,7 +78,7 @@ def harden(
     """
     cfg, content = _begin(robot, cfg, run_dir, compute)
     hardening = _Hardening(
-        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=load_space(cfg.space, cfg.ground),
+        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=load_space(cfg.space),
         certifiers=certifiers, open_evaluator=open_evaluator, content=content,
         policies={"base": cfg.policy or str(robot.policy_file)}, start=cfg.policy,
     )  # fmt: skip

@@ -70,15 +70,6 @@ class InSpace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnGround:
-    """The option that gives terrains ground of their own, of which ever space they are."""
-
-    ground: tuple[str, ...] | None = None
-    """What the ground differs in from patch to patch of 2 m: friction, softness, or both; 32 genes each beside those of
-    the terrain space. As always if left out."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Which(InSpace):
     """Options that say which elite of which run."""
 

@@ -115,7 +115,7 @@ def crossing_model(
 
 _NO_SOFTNESS = (
     "plain MuJoCo cannot have soft ground that is not level, since a foot that sinks into its heightfield is pushed "
-    "aside by the facets beside it: leave MuJoCo C out, or softness (--ground friction)"
+    "aside by the facets beside it: leave MuJoCo C out, or +softness"
 )
 
 
@@ -222,7 +222,7 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
         if np.ptp(getattr(model, f"geom_{name}")[of_robot], axis=0).any():
             raise ValueError(
                 f"robot '{robot.name}': plain MuJoCo needs one {name} of all its geoms on ground with friction or "
-                "softness of its own, got several: leave --ground out"
+                "softness of its own, got several: leave +friction and +softness out"
             )
     first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]

@@ -1,9 +1,8 @@
 """Terrain spaces by name: the shipped ones, and those of a user that the command line named."""
 
 import shlex
-from collections.abc import Sequence
 
-from sim.ground import check_kinds, joined_name, split_name
+from sim.ground import joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.spaces.base import TerrainSpace
 from sim.spaces.course import COURSE
@@ -29,20 +28,14 @@ def identity(name: str, sha256: str | None) -> str:
     return joined_name(sha256 or base, kinds)
 
 
-def load_space(name: str | None, ground: Sequence[str] | None = None) -> TerrainSpace:
+def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's own is run, and :func:`get_space` finds it from then on.
 
     Args:
         name: A shipped space's name, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, for
             example ``course+friction+softness``; the paper's space if None.
-        ground: The maps of its ground, if the name does not say them.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
-    if ground is not None:
-        wanted = check_kinds(ground)
-        if kinds and kinds != wanted:
-            raise ValueError(f"the space {name} has its own ground, got --ground {' '.join(wanted)}: leave one out")
-        kinds = wanted
     if is_own(base):
         sha256 = controller_hash(base)
         if sha256 is None or not any((space.name, space.sha256) == (base, sha256) for space in _loaded):
@@ -60,7 +53,7 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     base, kinds = split_name(name)
     space = SPACES.get(base) or _find_loaded(base, sha256)
     if kinds and space.ground:
-        raise ValueError(f"the space {base} has ground of its own, got {name}: leave --ground out")
+        raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
     return OnGround(inner=space, kinds=kinds) if kinds else space
 
 

@@ -8,7 +8,7 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg
-from sim.ground import GroundMaps, check_kinds, joined_name, split_name
+from sim.ground import GroundMaps, joined_name, split_name
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.mujoco_c.model import crossing_model
 from sim.policy.loaders import load_policy
@@ -142,8 +142,6 @@ def test_names_say_what_the_ground_has():
     assert split_name("course") == ("course", ())
     assert split_name("a+b/x.py:Ridges+softness+friction") == ("a+b/x.py:Ridges", ("friction", "softness"))
     assert joined_name("course", ("friction",)) == "course+friction"
-    with pytest.raises(ValueError, match="ice"):
-        check_kinds(["friction", "ice"])
 
 
 def test_mujoco_c_has_no_soft_slopes_and_one_friction(anymal):

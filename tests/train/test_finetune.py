@@ -287,7 +287,6 @@ def test_what_is_left_out_is_the_robots_own_recipe_and_on_a_gpu_of_the_papers_si
     ("flags", "field"),
     [
         (["--mix", "hand-crafted", "--archive", "{dir}/archive"], "archive"),
-        (["--ground", "friction"], "ground"),
         (["--recipe.only", "failing"], "fresh episodes"),
         (["--policy", "{dir}/script.pt"], "script.pt"),
         (["--policy", "{dir}/std.pt"], "std_param"),

@@ -99,11 +99,11 @@ def test_words_are_the_numbers_of_the_device():
         np.testing.assert_allclose(values_of(kind, genes[0, first : first + 32]), values.ravel(), rtol=1e-5)
 
 
-def test_ground_is_named_by_the_space_or_beside_it(tmp_path):
+def test_ground_is_named_by_the_space(tmp_path):
     assert load_space(None).name == "super_gaussian" and load_space("course").name == "course"
-    assert load_space(None, ["softness", "friction"]) == BOTH == load_space(BOTH.name, ["friction", "softness"])
-    with pytest.raises(ValueError, match="softness"):
-        load_space("course+friction", ["softness"])
+    assert load_space("super_gaussian+softness+friction") == BOTH
+    with pytest.raises(ValueError, match="ice"):
+        load_space("course+ice")
     own = write_ridges(tmp_path)
     space = load_space(f"{own}+friction")
     assert (space.num_genes, space.name) == (3 + 32, f"{own}+friction")
