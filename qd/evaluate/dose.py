@@ -105,12 +105,6 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
     """What came of a dose for one controller, a row a value, the easiest first.
 
     A value with more than a quarter of invalid episodes has no rates.
-
-    Args:
-        name: Name of the dose.
-        dose: The dose.
-        controller: Name of the controller.
-        result: Crossings of its terrains, as :func:`dose_set` orders them.
     """
 
     def by_value(array: NDArray[Any]) -> NDArray[Any]:
@@ -137,10 +131,6 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
 
 def half_of(dose: Dose, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Where under half of the robots begin to reach the goal, by straight lines between the values.
-
-    Args:
-        dose: The dose.
-        rows: Of one controller, the easiest value first.
 
     Returns:
         ``element``, ``parameter``, ``unit``, ``controller``, ``value`` and ``interval``. The interval ends where the

@@ -110,14 +110,7 @@ def _group(rates: dict[str, np.ndarray], members: np.ndarray) -> dict[str, Any]:
 def summarise(
     result: RolloutResult, seed: int, *, types: np.ndarray | None = None, levels: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Rates over a set of terrains, with 95 % intervals and, where known, by type and level.
-
-    Args:
-        result: Crossings of the set.
-        seed: Of the bootstrap.
-        types: Index into ``CROSSING_TYPES`` of each terrain, shape (num_terrains,).
-        levels: Level of each terrain, likewise.
-    """
+    """Rates over a set of terrains, with 95 % intervals and, where known, by type and level."""
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
     everywhere = np.ones(len(result.outcome), bool)
     summary = _group(rates, everywhere)

@@ -24,7 +24,7 @@ from qd.evaluate.show import show_pack, show_pack_test
 from qd.faults import EPISODES, fresh_counts, judgement, rate_of
 from qd.fitness import FAILING_GOAL_RATE
 from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
-from qd.judge import find_search
+from qd.judge import certifiers_of, find_search
 from qd.minimise import read_minimal
 from qd.run.directory import RESULTS, RUNS
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
@@ -154,8 +154,8 @@ def make_pack(
 
     Args:
         run: Run directory.
-        controllers: Policy of each by its name; if empty, the files of the robot's results and its panel. The searched
-            one is always among them.
+        controllers: Policy of each by its name; if empty, the shipped one and the run's certifiers. The searched one is
+            always among them.
         compute: Where terrains are crossed.
         robot: Robot that the command line names.
         policy: The searched controller, where it is code or its file has moved.
@@ -172,7 +172,7 @@ def make_pack(
     search = find_search(run, robot=robot, policy=policy, space=space)
     cfg, body, searched, archive = search.cfg, search.robot, search.policy, search.read_archive()
     drawn_in = get_space(cfg.space, cfg.space_sha256)
-    controllers = {**(controllers or _published_controllers(body))}
+    controllers = {**(controllers or {"base": str(body.policy_file), **certifiers_of(search)})}
     if not any(is_same(searched, other) for other in controllers.values()):
         controllers = {"searched": searched, **controllers}
     for other in controllers.values():
@@ -223,17 +223,6 @@ def make_pack(
     return publish(out / PACK_FILE, measure, show_pack)
 
 
-def _published_controllers(robot: RobotCfg) -> dict[str, str]:
-    """The shipped controller as ``base``, and the files of the robot's results and its panel by their names."""
-    controllers = {"base": str(robot.policy_file)}
-    folder = RESULTS / robot.name
-    for file in (*sorted(folder.glob("*.pt")), *sorted((folder / "panel").glob("*.pt"))):
-        if not any(is_same(str(file), policy) for policy in controllers.values()):
-            name = file.stem if file.stem not in controllers else f"{file.parent.name}-{file.stem}"
-            controllers[name] = str(file)
-    return controllers
-
-
 def _check_judged(archive: Archive, run: Path) -> None:
     if archive.fresh is None:
         raise ValueError(f"{run} must be judged, got no fresh episodes: run `faultline judge` on it first")
@@ -248,10 +237,6 @@ def _check_judged(archive: Archive, run: Path) -> None:
 
 def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], Modes, int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
-
-    Args:
-        archive: With fresh values and fault counts.
-        run: Its directory, where minimal terrains are read.
 
     Returns:
         The terrains, the failure modes of the elites among them, and how many failing elites and minimal terrains are
@@ -320,10 +305,6 @@ def choose_terrains(candidates: Sequence[Candidate], size: int) -> list[Candidat
 
     Next comes a fault before a near-fault, then one of the family that was chosen least often, of the failure mode that
     was, of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
-
-    Args:
-        candidates: To choose from.
-        size: How many; fewer where there are fewer.
     """
     left, chosen = list(candidates), list[Candidate]()
     counts = {name: Counter[Any]() for name in ("family", "mode", "kind")}
@@ -365,11 +346,6 @@ def _rates(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
 def rates_over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
     """Means over terrains with 95 % intervals, bootstrap over families, as JSON values.
 
-    Args:
-        rows: What a controller made of each terrain.
-        abouts: What is known of each.
-        seed: Of the bootstrap.
-
     Returns:
         ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
         how many are ``failing``, and of their ``families`` in how many one is (``failing_families``).
@@ -393,10 +369,6 @@ def rates_by_group(
     abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]
 ) -> dict[str, list[dict[str, Any]]]:
     """How controllers fare by :data:`GROUPS`: mean goal rates and how many terrains fail.
-
-    Args:
-        abouts: What is known of each terrain.
-        rows: Controller -> what it made of each.
 
     Returns:
         Group -> its values, the most frequent first, each with ``terrains`` and, by controller, ``goal_rate`` (None

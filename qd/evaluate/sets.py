@@ -157,13 +157,7 @@ def elites_sha256(archive: Archive) -> str:
 
 
 def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archive:
-    """The archive of a search against a robot.
-
-    Args:
-        path: Run directory or archive file.
-        robot: The robot.
-        space: Terrain space that the command line names.
-    """
+    """The archive of a search against a robot."""
     archive = read_archive_of(robot, path, space)
     if archive.robot != robot.name:
         raise ValueError(f"archive {path} must be of robot {robot.name}, got {archive.robot}: give one of that robot")
@@ -171,14 +165,7 @@ def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archiv
 
 
 def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, space: str | None = None) -> Archive:
-    """The archive of another search, which shares no elite and no ancestor of one with the archive trained on.
-
-    Args:
-        path: Run directory or archive file.
-        archive_path: Where the archive trained on lies; None if there is none to be independent of.
-        robot: The robot.
-        space: Terrain space that the command line names.
-    """
+    """The archive of another search, which shares no elite and no ancestor of one with the archive trained on."""
     independent = read_elites(path, robot, space)
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")

@@ -180,16 +180,7 @@ def make_tables(
     episodes: int,
     seed: int,
 ) -> Tables:
-    """Everything that the tables say of crossings.
-
-    Args:
-        crossed: What controllers made of the terrains.
-        sets: The terrains.
-        robot: The robot.
-        controllers: The controllers by name.
-        episodes: On each terrain.
-        seed: Of bootstraps.
-    """
+    """Everything that the tables say of crossings."""
     means = _statistics(crossed, sets, lambda values, _: mean_of(values))
     return Tables(
         robot=robot.name,
@@ -266,15 +257,7 @@ def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, C
 def difference(
     before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int, families: Families = None
 ) -> Difference:
-    """What became of each terrain from one controller to another, and what the second gains in the mean.
-
-    Args:
-        before: What the first made of T terrains.
-        after: What the second made of the same.
-        numbers: Number of each terrain, shape (T,).
-        seed: Of the bootstrap over terrains.
-        families: Of terrains that are not independent, shape (T,).
-    """
+    """What became of each terrain from one controller to another, and what the second gains in the mean."""
     both = before.valid & after.valid
     kin = of_terrains(families, both)
     fails, then_fails = (both & (rates.values["goal"] < FAILING_GOAL_RATE) for rates in (before, after))
@@ -319,11 +302,7 @@ def _wilson_limits(measured: Measured) -> NDArray[np.float64]:
 
 
 def check_seeds(controllers: Mapping[str, str]) -> None:
-    """Refuses one training as several: the interval over its "seeds" would be none.
-
-    Args:
-        controllers: Policy of each controller by its name.
-    """
+    """Refuses one training as several: the interval over its "seeds" would be none."""
     known: dict[tuple[str, str], str] = {}
     for name, policy in controllers.items():
         if not re.fullmatch("[^@]+(@[^@]+)?", name):
@@ -336,10 +315,6 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
 
 def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[str, dict[str, dict[str, OverSeeds]]]:
     """Mean over the controllers of each kind that has several.
-
-    Args:
-        tables: By measure.
-        measures: Some of its measures.
 
     Returns:
         Measure -> set -> kind; empty where no kind has several.

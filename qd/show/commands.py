@@ -141,8 +141,8 @@ class PackFlags(Where):
     size: PositiveInt = 100
     """How many terrains. There are fewer if the run has fewer faults and near-faults."""
     controllers: tuple[str, ...] = ()
-    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base, all of
-    results/<robot>/*.pt, and the robot's panel. The searched controller is always among them."""
+    """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base and
+    the run's certifiers. The searched controller is always among them."""
     episodes: PositiveInt = 20
     """Episodes on each terrain."""
     seed: NonNegativeInt = 0

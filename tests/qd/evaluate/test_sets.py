@@ -15,7 +15,6 @@ from qd.evaluate.sets import (
     independent_set,
     make_sets,
     nearest_distance,
-    paper_terrains,
     plain_set,
     read_independent,
     set_rng,
@@ -158,10 +157,6 @@ def test_the_far_third_is_the_farthest():
     sets = make_sets(["generated", "generated_far"], 6, 0, archive=archive)
     nearest = nearest_distance(sets["generated"].terrains, archive.genes[split_elites(archive).train])
     assert set(sets["generated_far"].numbers) == set(sets["generated"].numbers[np.argsort(nearest)[-2:]])
-
-
-def test_the_papers_sizes():
-    assert (paper_terrains("anymal"), paper_terrains("cassie"), paper_terrains("mine")) == (300, 180, 300)
 
 
 def write_run(folder: Path, archive: Archive, robot, seed: int | None = None) -> Path:
