@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.run.directory import RUNS
-from qd.show.crossed import Crossed, crossed_of
-from qd.show.crossing_figures import draw_paths
+from qd.show.crossed import Crossed, crossed_of, draw_paths
 from qd.show.figures import look_of, save_figure
 from qd.show.recordings import Recordings, on_heights
 from qd.workers.evaluator import origin_of

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from qd.archive import Archive
 from qd.faults import elite_words
 from qd.fitness import Evaluation, evaluation_of
-from qd.show.crossed import crossed_of
-from qd.show.crossing_figures import draw_paths
+from qd.show.crossed import crossed_of, draw_paths
 from qd.show.elites import Found, Terrain
 from qd.show.figures import look_of, save_figure
 from qd.show.recordings import Recordings, on_elite

@@ -3,14 +3,19 @@
 from pathlib import Path
 from typing import Any
 
-from qd.evaluate.labels import FATES, SETS
+from qd.evaluate import labels
 from qd.show.report.material import Shown
 from qd.show.report.page import Block, Folded, Picture, absent, counted, paragraph, percent, table
-from qd.show.report.tables import CERTIFIED, GENERATED, MEASURES, by_kind
 from sim.files.command import command_line
 from sim.files.intervals import value_words
 from sim.files.records import without_machine
+from sim.policy.spec import kind_of
 
+MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward")}
+"""Measures shown, in words; the first two are fractions."""
+_GENERATED = labels.HELD_OUT[0]  # elites that were held out of training
+CERTIFIED = {name: labels.MEASURES[measure] for name, measure in labels.CERTIFIED.items()}
+"""Measures on certified terrains alone, in words."""
 _TRAINED_ON = {
     "C-HC": "hand-crafted terrains alone",
     "C-HR": "hand-crafted and hard-random ones",
@@ -56,7 +61,7 @@ def _drawn(figure: Path) -> list[Block]:
 def most_mended(tables: dict[str, Any]) -> tuple[str, str] | None:
     """How many of the held-out elites that the first controller fails the best one mends, and what that counts."""
     first = next(iter(tables["controllers"]))
-    changes = {pair.partition(" -> "): change for pair, change in (tables["differences"].get(GENERATED) or {}).items()}
+    changes = {pair.partition(" -> "): change for pair, change in (tables["differences"].get(_GENERATED) or {}).items()}
     of_first = {after: change for (before, _, after), change in changes.items() if before == first}
     if not of_first:
         return None
@@ -98,7 +103,7 @@ def _compared(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
 
 
 def _label(name: str) -> str:
-    return SETS.get(name, name)
+    return labels.SETS.get(name, name)
 
 
 def _value(tables: dict[str, Any], measure: str, name: str, controller: str) -> str:
@@ -150,15 +155,52 @@ def changes_tables(tables: dict[str, Any]) -> list[Block]:
     from_first, others = [], []
     for name, pairs in tables["differences"].items():
         for pair, change in pairs.items():
-            counts = [f"{change[kind]['count']}" for kind in FATES]
+            counts = [f"{change[kind]['count']}" for kind in labels.FATES]
             row = [f"{_label(name)}: {pair}", *counts, f"{change['compared']}"]
             (from_first if pair.startswith(f"{first} -> ") else others).append(row)
     if not from_first and not others:
         return []
-    head = ["terrains", *FATES.values(), "compared"]
+    head = ["terrains", *labels.FATES.values(), "compared"]
     text = (
         "Terrains that a controller fails, under half of its episodes reaching the goal, from the first controller to "
         "the second; of several trainings the first one:"
     )
     blocks: list[Block] = [paragraph(text), table(head, from_first)]
     return [*blocks, table(head, others, folded=f"Show {counted(len(others), 'other pair')}")] if others else blocks
+
+
+def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
+    """The tables with one column a kind of controller, where a kind was trained from several seeds.
+
+    Args:
+        tables: As :func:`qd.evaluate.tables.read_tables` gives them.
+
+    Returns:
+        The same, but for ``controllers``, measures and ``intervals``: of a kind of several those are the mean over them
+        and the interval of that, under the kind's name with the number of its seeds. ``members`` says who is of it.
+    """
+    members: dict[str, list[str]] = {}
+    for controller in tables["controllers"]:
+        members.setdefault(kind_of(controller), []).append(controller)
+    kinds = {f"{kind} ({len(all_)} seeds)" if len(all_) > 1 else all_[0]: all_ for kind, all_ in members.items()}
+    joined = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in kinds.items()}}
+    joined |= {"members": kinds, "intervals": dict(tables["intervals"])}
+    for measure in (*MEASURES, *(CERTIFIED if tables.get("certified") else ())):
+        values, limits = {}, {}
+        for name in tables[measure]:
+            several = tables["over_seeds"].get(measure, {}).get(name, {})
+            pairs = {label: _of_kind(tables, measure, name, all_, several) for label, all_ in kinds.items()}
+            values[name] = {label: value for label, (value, _) in pairs.items()}
+            limits[name] = {label: interval for label, (_, interval) in pairs.items()}
+        joined[measure], joined["intervals"][measure] = values, limits
+    return joined
+
+
+def _of_kind(
+    tables: dict[str, Any], measure: str, name: str, members: list[str], several: dict[str, Any]
+) -> tuple[float | None, list[float] | None]:
+    """Value and interval of a kind of controller on a set."""
+    if len(members) == 1:
+        return tables[measure][name][members[0]], tables["intervals"][measure][name][members[0]]
+    about = several.get(kind_of(members[0]), {"mean": None, "interval": None})
+    return about["mean"], about["interval"]

@@ -15,7 +15,7 @@ from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
 from qd.show.elites import Found, find_archive
 from qd.show.figures import summary
-from qd.show.report.relief import reliefs_of
+from qd.show.report.pictures import reliefs_of
 from sim.files.atomic import prepare_output
 from sim.policy.spec import ControllerSpec, spec_of
 from sim.robots.robot import RobotCfg

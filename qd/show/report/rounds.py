@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from qd.evaluate.labels import SETS
 from qd.evaluate.tables import as_tables
 from qd.run.directory import ROUNDS_FILE
-from qd.show.report.evaluation import changes_tables, measure_table
+from qd.show.report.evaluation import MEASURES, by_kind, changes_tables, measure_table
 from qd.show.report.material import check_page
 from qd.show.report.page import (
     Block,
@@ -24,7 +24,6 @@ from qd.show.report.page import (
     publish_page,
     table,
 )
-from qd.show.report.tables import MEASURES, by_kind
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.figures import bar_lengths, new_figure

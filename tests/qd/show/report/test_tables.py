@@ -11,8 +11,7 @@ from qd.archive import read_archive, write_archive
 from qd.evaluate.measures import measure
 from qd.evaluate.sets import TerrainSet
 from qd.evaluate.tables import make_tables
-from qd.show.report.evaluation import most_mended
-from qd.show.report.tables import by_kind
+from qd.show.report.evaluation import by_kind, most_mended
 from sim.files.atomic import to_json
 from sim.files.records import robot_identity
 from tests.qd.show.report.pages import DOT, Page
