@@ -17,7 +17,7 @@ from qd.show.elites import Found, find_archive
 from qd.show.figures import summary
 from qd.show.report.pictures import reliefs_of
 from sim.files.atomic import prepare_output
-from sim.policy.spec import ControllerSpec, spec_of
+from sim.policy.spec import SHIPPED, spec_of
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 
@@ -35,8 +35,6 @@ class Material:
     """The controller to cross with, if it is not the search's."""
     metrics: Metrics | None
     """One row an iteration, up to those of the archive."""
-    searched: str
-    """Controller of the search, :data:`sim.policy.spec.SHIPPED` where it lies without its config."""
     search: SearchCfg | None
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
@@ -76,12 +74,8 @@ class Material:
     @property
     def policy(self) -> str:
         """Controller to cross with: what was asked for, or that of the search."""
-        return spec_of(self.named_policy or self.searched, self.robot)
-
-    @property
-    def is_unnamed_code(self) -> bool:
-        """Whether that is code which only the run names: what a file names is never run."""
-        return self.named_policy is None and ControllerSpec.parse(self.searched).runs_code
+        searched = SHIPPED if self.search is None else self.search.policy
+        return spec_of(self.named_policy or searched, self.robot)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +124,6 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     archive = found.archive
     if not len(archive):
         raise ValueError(f"{found.run} must have elites to report on, got an archive of none: let its search go on")
-    searched, _ = found.as_searched()
     folder = RunDirectory(found.folder)
     search = found.search()
     numbers = folder.read_summary()
@@ -145,7 +138,6 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
         out=out,
         named_policy=policy,
         metrics=_metrics_of(folder, archive),
-        searched=searched,
         search=search,
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},

@@ -87,8 +87,6 @@ def _with_crossings(shown: Shown, device: str, cross: Cross | None) -> Shown:
 
 def _why_not_crossed(material: Material, device: str) -> str:
     """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
-    if material.is_unnamed_code:
-        return f"Left out: the search's controller {material.searched} is code, which runs only if --policy names it"
     try:
         if material.named_policy is None and material.search is not None:
             own_policy(material.run, material.search, material.robot)

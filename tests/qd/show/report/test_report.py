@@ -13,7 +13,6 @@ from qd.groups import elites_of, rank
 from qd.show.figures import summary
 from qd.show.report import page as page_module
 from qd.show.report import report
-from qd.show.report.material import gather
 from qd.show.report.page import MAX_BYTES, Section, absent, at_a_glance, paragraph, render, table
 from sim.files.atomic import to_json
 from sim.files.command import Interrupted
@@ -54,13 +53,9 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     assert len(crossed) == len(set(crossed)) == sum(name.startswith("elite-") for name in figures)
 
 
-def material_of(run):
-    return gather(None, run, policy=None, space=None, out=None)
-
-
 def test_the_page_has_the_numbers_of_the_files(whole):
     content = whole[0].read_text()
-    text, archive = Page(content.encode()).text, material_of(whole[0].parent).archive
+    text, archive = Page(content.encode()).text, read_archive(whole[0].parent)
     elites, numbers = elites_of(archive), summary(archive, rows(4), gpus=0, origin={})
     failing = int((archive.fresh.goal_rate < 0.5).sum())
     at = np.median(np.linspace(6.0, 14.0, 4)[1:])  # of elite 0 four made-up crossings end, the first at the goal
@@ -129,18 +124,7 @@ def test_crossings_are_stored_and_a_stopped_report_goes_on(reported, run):
     assert len(reported(episodes=3)[1]) == len(crossed) + 1  # other crossings
 
 
-def test_published_results_are_not_written_to(monkeypatch, tmp_path, run):
-    monkeypatch.chdir(tmp_path)
-    published = tmp_path / "results" / "anymal" / "archive"
-    published.parent.mkdir(parents=True)
-    run.rename(published)
-    material = material_of(None)
-    assert str(material.run) == "results/anymal/archive"
-    assert str(material.out) == "runs/anymal-published/report.html"
-
-
 def test_minimal_terrains_are_shown_where_there_are_some(reported, run):
-    assert "faultline minimise" in Page(reported()[0].read_bytes()).text
     (first, second), entries = minimal_of(run, 2)
     out = reported()[0]
     text = Page(out.read_bytes()).text
@@ -167,7 +151,7 @@ def test_faults_are_counted_where_other_controllers_crossed_what_fails(run, repo
     assert 0 < count < failing
     text = Page(reported()[0].read_bytes()).text
     assert f"{count} faults: terrains that C-G crosses and this controller does not" in text
-    assert f"{failing - count} failing elites are not known to be passable" in text
+    assert f"{failing - count} failing elites are not known" in text
     assert len(re.findall(r"(?<=\s)fault(?=\s)", text)) >= count  # a row each in the table of all elites
 
 
