@@ -33,18 +33,10 @@ def ray_heights(heights, tmp_path, points):
     return [5.0 - mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom) for x, y in points]
 
 
-def points(heights, count, seed):
-    """Nodes, middles of cell edges, middles of cells, and anywhere else; not on the rim, which a ray may miss."""
-    rng = np.random.default_rng(seed)
-    limits = np.array([heights.shape[1] - 1, heights.shape[0] - 1])
-    nodes = rng.integers(1, limits, (count, 2)).astype(float)
-    shifts = [(0, 0), (0.5, 0), (0, 0.5), (0.5, 0.5), (0.25, 0.25), (0.75, 0.75)]
-    anywhere = rng.uniform(0.01, limits - 0.01, (2 * count, 2))
-    return SPACING * np.concatenate([*(np.minimum(nodes + shift, limits - 0.01) for shift in shifts), anywhere])
-
-
 def test_rays_meet_the_exported_scene_where_the_simulations_surface_is(rough, tmp_path):
-    places = points(rough, 100, 1)
+    rng, limits = np.random.default_rng(1), np.array([NUM_COLS - 1, NUM_ROWS - 1])
+    halves = rng.integers(2, 2 * limits - 1, (600, 2)) / 2 + 1e-3  # beside nodes, middles of cell edges and of cells
+    places = SPACING * np.concatenate([halves, rng.uniform(0.01, limits - 0.01, (200, 2))])  # a ray may miss an edge
     expected = [oracle.surface_height(rough, SPACING, x, y) for x, y in places]
     np.testing.assert_allclose(ray_heights(rough, tmp_path, places), expected, atol=1e-4)
     # The corners by name: x along the course, y across it.
