@@ -47,8 +47,8 @@ Families = NDArray[np.int64] | None
 
 def mean_of(values: NDArray[np.float64]) -> float | None:
     """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
-    kept = values[~np.isnan(values)]
-    return float(kept.mean()) if len(kept) else None
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else None
 
 
 def interval_of(values: NDArray[np.float64], seed: int, families: Families) -> list[float] | None:

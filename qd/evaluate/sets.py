@@ -165,7 +165,7 @@ def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archiv
 
 
 def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, space: str | None = None) -> Archive:
-    """The archive of another search, which shares no elite and no ancestor of one with the archive trained on."""
+    """The archive of another search, which shares no elite and no ancestor with the one trained on, if there is one."""
     independent = read_elites(path, robot, space)
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")

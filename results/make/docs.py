@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate import paper
-from qd.evaluate.labels import SETS
+from qd.evaluate.labels import CERTIFIED, SETS
 from sim.files.intervals import value_words
 
 MARKED = re.compile(r"<!-- table: (?P<name>\w+)(?: (?P<robot>\w+))? -->\n.*?<!-- table: end -->", re.DOTALL)
@@ -55,17 +55,17 @@ def archive(folder: Path, robot: str) -> str:
     )  # fmt: skip
     published = {"iterations": 1000, "episodes": 4_000_000, **theirs}
     rows = [
-        (name.replace("_", " "), *(count(one.get(name)) for one in ours), count(published.get(name))) for name in names
+        (name.replace("_", " "), *(count(row.get(name)) for row in ours), count(published.get(name))) for name in names
     ]
-    shares = [f"{one['reachable_coverage']:.1%}" for one in ours]
+    shares = [f"{row['reachable_coverage']:.1%}" for row in ours]
     share = f"{theirs['elites'] / ours[0]['reachable_cells']:.1%}" if theirs else NONE
     fitness = f"about {theirs['fitness']}" if "fitness" in theirs else NONE
     rows += [
         ("share of the reachable cells", *shares, share),
-        ("mean fitness", *(f"{one['mean_fitness']:.1f}" for one in ours), fitness),
-        ("minutes", *(f"{one['wall_s'] / 60:.0f}" for one in ours), "about 480, two RTX 3070 Ti"),
+        ("mean fitness", *(f"{row['mean_fitness']:.1f}" for row in ours), fitness),
+        ("minutes", *(f"{row['wall_s'] / 60:.0f}" for row in ours), "about 480, two RTX 3070 Ti"),
     ]
-    return table(("archive", *(one.get("method") or "ours" for one in ours), "paper (CMA-MAE)"), rows)
+    return table(("archive", *(row.get("method") or "ours" for row in ours), "paper (CMA-MAE)"), rows)
 
 
 def controllers(folder: Path, robot: str) -> str:
@@ -74,34 +74,34 @@ def controllers(folder: Path, robot: str) -> str:
     theirs = paper.published(robot) or {}
     rows = []
     for name, label in SETS.items():
-        for who in tables["goal"].get(name, {}):
-            if "@" in who:
+        for controller in tables["goal"].get(name, {}):
+            if "@" in controller:
                 continue
-            cells = [_cell(tables, measure, name, who) for measure in ("goal", "success", "reward")]
-            numbers = [theirs.get(measure, {}).get(name, {}).get(who) for measure in ("success", "reward")]
+            cells = [_cell(tables, measure, name, controller) for measure in ("goal", "success", "reward")]
+            numbers = [theirs.get(measure, {}).get(name, {}).get(controller) for measure in ("success", "reward")]
             beside = NONE if None in numbers else f"{numbers[0]:.3f}, {numbers[1]:.1f}"
-            rows.append((f"{label} ({tables['terrains'][name]})", who, *cells, beside))
-        for who in tables["certified_goal"].get(name, {}):
-            if "@" not in who:
+            rows.append((f"{label} ({tables['terrains'][name]})", controller, *cells, beside))
+        for controller in tables["certified_goal"].get(name, {}):
+            if "@" not in controller:
                 about = tables["certified"][name]
-                role = about["chosen_by"].get(who)
-                known = f"{who} ({role})" if role else who
-                cells = [_cell(tables, measure, name, who) for measure in ("certified_goal", "certified_success")]
+                role = about["chosen_by"].get(controller)
+                known = f"{controller} ({role})" if role else controller
+                cells = [_cell(tables, measure, name, controller) for measure in CERTIFIED]
                 rows.append((f"{label}, certified ({about['terrains']})", known, *cells, NONE, NONE))
     header = ("terrains", "controller", "goal (95 %)", "no base collision (95 %)", "reward (95 %)", "paper")
     return table(header, rows)
 
 
-def _cell(tables: Json, measure: str, name: str, who: str) -> str:
+def _cell(tables: Json, measure: str, name: str, controller: str) -> str:
     """A mean with its interval over seeds where there are several, else over terrains."""
     form = ".1f" if measure == "reward" else ".3f"
-    seeds = tables["over_seeds"].get(measure, {}).get(name, {}).get(who)
+    seeds = tables["over_seeds"].get(measure, {}).get(name, {}).get(controller)
     if seeds is not None and seeds["mean"] is not None:
         return f"{value_words(seeds['mean'], seeds['interval'], form)}, {len(seeds['values'])} seeds"
-    return value_words(tables[measure][name][who], tables["intervals"][measure][name][who], form)
+    return value_words(tables[measure][name][controller], tables["intervals"][measure][name][controller], form)
 
 
-def differences(folder: Path, robot: str) -> str:
+def kind_differences(folder: Path, robot: str) -> str:
     """How much more often one kind of controller reaches the goal than another, over families and seeds."""
     rows = [
         (SETS[name], pair, value_words(row["goal"], row["interval"], "+.3f"))
@@ -241,8 +241,8 @@ def rounds(folder: Path, robot: str) -> str:
     searches = [("the last again", row) for row in numbers.get("searches", ())]
     searches += [("base again", row) for row in numbers.get("base_searches", ())]
     rows = [
-        (who, *(count(row.get(name)) for name in names))
-        for who, row in [*((row["controller"], row) for row in numbers["rounds"]), *searches]
+        (controller, *(count(row.get(name)) for name in names))
+        for controller, row in [*((row["controller"], row) for row in numbers["rounds"]), *searches]
     ]
     return table(("controller", *(name.replace("_", " ") for name in names)), rows)
 
@@ -250,7 +250,7 @@ def rounds(folder: Path, robot: str) -> str:
 TABLES: dict[str, Callable[[Path, str], str]] = {
     make.__name__: make
     for make in (
-        archive, controllers, differences, distances, ablation, search, agreement, speed, kernels, spaces, scale,
+        archive, controllers, kind_differences, distances, ablation, search, agreement, speed, kernels, spaces, scale,
         solver_options, penalty_ratios, rounds,
     )
 }  # fmt: skip

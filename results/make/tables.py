@@ -41,7 +41,7 @@ def train_controllers(script: Script) -> dict[str, str]:
     return controllers
 
 
-def difference(
+def kind_difference(
     first: NDArray[np.float64], second: NDArray[np.float64], families: NDArray[np.int64], seed: int
 ) -> dict[str, Any]:
     """How much more often the first kind of controller reaches the goal than the second.
@@ -68,15 +68,15 @@ def difference(
     return {"goal": mean, "interval": np.quantile(draws, [0.025, 0.975]).tolist()}
 
 
-def differences(
+def kind_differences(
     rates: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int
 ) -> dict[str, dict[str, Any]]:
-    """:func:`difference` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
+    """:func:`kind_difference` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
     kinds: dict[str, list[NDArray[np.float64]]] = {}
     for name, of_controller in rates.items():
         kinds.setdefault(name.partition("@")[0], []).append(of_controller)
     return {
-        f"{second} - {first}": difference(np.array(kinds[second]), np.array(kinds[first]), families, seed)
+        f"{second} - {first}": kind_difference(np.array(kinds[second]), np.array(kinds[first]), families, seed)
         for first, second in itertools.combinations(kinds, 2)
     }
 
@@ -113,12 +113,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         cache=crossings_folder(script.robot),
     )  # fmt: skip
     rates = {
-        name: {who: crossing_rates(result.outcome, "goal") for who, result in row.items()}
+        name: {controller: crossing_rates(result.outcome, "goal") for controller, result in row.items()}
         for name, row in crossed.items()
     }
     script.add(
         tables,
-        {"kind_differences": {name: differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
+        {"kind_differences": {name: kind_differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
     )
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
     arrays |= {f"{name}_family": families_of(of_set) for name, of_set in sets.items()}

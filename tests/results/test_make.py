@@ -84,15 +84,15 @@ def test_means_over_seeds():
 def test_difference_of_two_kinds_of_controllers():
     # Two families of two terrains: the first kind crosses all of one and half of the other, the second none.
     first, families = np.array([[1.0, 1.0, 0.5, 0.5]]), np.array([7, 7, 9, 9])
-    row = tables.difference(first, np.zeros((2, 4)), families, 0)
+    row = tables.kind_difference(first, np.zeros((2, 4)), families, 0)
     assert row["goal"] == pytest.approx(0.75)
     assert row["interval"] == pytest.approx([0.5, 1.0])  # a quarter of the resamples are of one family alone
     rates = {"C-HR": first[0], "C-G": np.ones(4), "C-G@1": np.full(4, 0.8)}
-    [(pair, row)] = tables.differences(rates, families, 0).items()
+    [(pair, row)] = tables.kind_differences(rates, families, 0).items()
     assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.9 - 0.75)
     # A terrain that is invalid for one controller counts for none.
     first[0, 0] = np.nan
-    assert tables.difference(first, np.zeros((2, 4)), families, 0)["goal"] == pytest.approx(2 / 3)
+    assert tables.kind_difference(first, np.zeros((2, 4)), families, 0)["goal"] == pytest.approx(2 / 3)
 
 
 def test_pages_say_what_the_files_say():
