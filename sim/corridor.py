@@ -33,12 +33,12 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     Returns:
         Float32 tensor on that device, shape (num_terrains, 41, 121).
     """
-    found = genes.new_empty(len(genes), *SHAPE)
+    heights = genes.new_empty(len(genes), *SHAPE)
     with wp.ScopedDevice(wp.device_from_torch(genes.device)):
         for first in range(0, len(genes), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            found[some] = (_sampled if space.any_spacing else _averaged)(genes[some], space)
-    return found
+            part = slice(first, first + _AT_ONCE)
+            heights[part] = (_sampled if space.any_spacing else _averaged)(genes[part], space)
+    return heights
 
 
 def corridor_ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:

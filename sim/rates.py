@@ -14,38 +14,21 @@ MAX_INVALID_SHARE = 0.25
 
 
 def counted_episodes(invalid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Episodes that count: the valid ones of terrains that are not invalid.
-
-    Args:
-        invalid: Which episodes are invalid, shape (..., num_episodes).
-
-    Returns:
-        Of the same shape.
-    """
+    """Episodes that count: the valid ones of terrains that are not invalid; shapes (..., num_episodes)."""
     usable = invalid.sum(axis=-1, keepdims=True) <= MAX_INVALID_SHARE * invalid.shape[-1]
     return ~invalid & usable
 
 
 def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Mean over the episodes that count, shape (...); NaN where there are none.
-
-    Args:
-        values: Of each episode, shape (..., num_episodes).
-        counted: Which episodes count, likewise.
-    """
+    """Mean of values (..., num_episodes) over the episodes that count, shape (...); NaN where there are none."""
     sums, counts = np.where(counted, values, 0.0).sum(axis=-1), counted.sum(axis=-1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
 def hits_of(outcome: NDArray[np.uint8], kind: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which episodes count as a hit, and which count at all.
+    """Which episodes count as a hit of one of :data:`KINDS`, and which count at all; one that still runs does not.
 
-    Args:
-        outcome: :class:`kernels.episode.Outcome`, shape (..., num_episodes); one that still runs does not count.
-        kind: One of :data:`KINDS`.
-
-    Returns:
-        Both of the same shape.
+    Both of the shape of the outcomes (:class:`kernels.episode.Outcome`), (..., num_episodes).
     """
     from kernels.episode import Outcome  # which imports Warp: not for `--help`
 
@@ -75,15 +58,15 @@ def agreement(
         (``success_bias``) with its 95 % bootstrap interval over terrains (``success_bias_interval``), and the mean of
         its size (``success_difference``), None without terrains.
     """
-    found: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
     for kind in KINDS:
         apart = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
         known = np.isfinite(apart)
         apart, kin = apart[known], None if families is None else families[known]
-        found |= {
+        numbers |= {
             "terrains": len(apart),
             f"{kind}_bias": float(apart.mean()) if len(apart) else None,
             f"{kind}_bias_interval": bootstrap_interval(apart, seed, families=kin),
             f"{kind}_difference": float(np.abs(apart).mean()) if len(apart) else None,
         }
-    return found
+    return numbers

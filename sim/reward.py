@@ -72,24 +72,12 @@ class Reward:
     def __init__(
         self, sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any, falls: Collection[Outcome]
     ) -> None:
-        """Allocate on the simulation's device.
-
-        Args:
-            sim: The robots.
-            cfg: What is paid.
-            command: Command the action answers, shape (num_envs, 3).
-            action: Clipped action of the step, shape (num_envs, num_joints).
-            falls: Outcomes that cost what a fall does.
-        """
+        """Allocate on the simulation's device; arguments as of :func:`make_motion`, and the outcomes that are falls."""
         robot = sim.robot
         self._motion = make_motion(sim, cfg, command=command, action=action)
         self._weights = make_weights(asdict(cfg.rewards), only_positive=cfg.only_positive, falls=falls)
         self.state = make_rewards(sim.num_envs, robot.num_joints, len(robot.geom_names), sim.device)
 
     def pay(self, outcome: Any) -> None:
-        """Reward the control step just made, before the next command is written.
-
-        Args:
-            outcome: :class:`kernels.episode.Outcome` after it, shape (num_envs,).
-        """
+        """Reward the control step just made, before the next command is written; ``outcome`` is that after it."""
         reward_steps(self._motion, self._weights, outcome, self.state)

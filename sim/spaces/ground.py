@@ -1,6 +1,6 @@
 """Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ from sim.spaces.base import Seed, TerrainSpace, clipped
 ABSENT = {"friction": 1.0, "softness": -1.0}
 """The gene of ground that changes nothing."""
 _BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
-_TOLD_FRICTION = 0.995  # rounded, what is above is 1.00
+_MOST_FRICTION = 0.995  # rounded, what is above is 1.00
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,11 @@ class OnGround(TerrainSpace):
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device (:mod:`kernels.ground`)."""
         for kind in self.kinds:
-            decode(kind, genes[:, self._columns(kind)].contiguous(), ground_out)
+            decode, maps = {
+                "friction": (decode_friction, ground_out.friction),
+                "softness": (decode_softness, ground_out.time_constant),
+            }[kind]
+            decode(genes[:, self._columns(kind)].contiguous(), maps)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Hard-random terrains of the space; every patch as it always is, or as slippery or soft as can be."""
@@ -127,21 +131,25 @@ class OnGround(TerrainSpace):
         What lies across the way has its ground behind it: ``kerb 0.15 m up (friction 0.25)``.
         """
         row = clipped(genes)
-        own = row[: self.inner.num_genes]
-        across = [words + self._ground_words(row, begin, end) for words, begin, end in self.inner.spans(own)]
-        told = [", ".join(across) or self.inner.describe(own)]
+        heights = row[: self.inner.num_genes]
+        across = [words + self._ground_words(row, begin, end) for words, begin, end in self.inner.spans(heights)]
+        lines = [", ".join(across) or self.inner.describe(heights)]
         for kind in self.kinds:
             right, left = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY]
-            told.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
-        return "\n".join(told)
+            lines.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
+        return "\n".join(lines)
 
     def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
         first, last = patches_at((begin, end), PATCH * COLS, COLS)
-        there = slice(first, last + 1)
-        return ground_words(
-            {kind: self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, there] for kind in self.kinds}
-        )
+        words = []
+        for kind in self.kinds:
+            values = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]
+            if kind == "friction" and values.min() < _MOST_FRICTION:
+                words.append(f"friction {values.min():.2f}")
+            if kind == "softness" and values.max() > 0.0:
+                words.append(f"soft, {values.max():.3f} s")
+        return f" ({', '.join(words)})" if words else ""
 
     def _columns(self, kind: str) -> slice:
         first = self.inner.num_genes + NUM_PATCHES * self.kinds.index(kind)
@@ -152,14 +160,6 @@ class OnGround(TerrainSpace):
         return values_of(kind, row[self._columns(kind)])
 
 
-def decode(kind: str, genes: Any, ground_out: Ground) -> None:
-    """Turns genes, a patch of a map each, into that map on the device; shape (num_terrains, rows * cols)."""
-    if kind == "friction":
-        decode_friction(genes, ground_out.friction)
-    else:
-        decode_softness(genes, ground_out.time_constant)
-
-
 def values_of(kind: str, genes: NDArray[np.float32]) -> NDArray[np.float64]:
     """Frictions, or time constants [s], of genes in [-1, 1]."""
     share = (genes.astype(np.float64) + 1.0) / 2.0
@@ -167,21 +167,6 @@ def values_of(kind: str, genes: NDArray[np.float32]) -> NDArray[np.float64]:
         return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
     tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
     return np.where(share > 0.0, tau, 0.0)
-
-
-def ground_words(values: Mapping[str, NDArray[np.float64]]) -> str:
-    """The worst of some ground in brackets, ``(friction 0.25, soft, 0.060 s)``; empty if all is as always.
-
-    Args:
-        values: As of :func:`values_of`, by kind.
-    """
-    told = []
-    for kind, there in values.items():
-        if kind == "friction" and there.min() < _TOLD_FRICTION:
-            told.append(f"friction {there.min():.2f}")
-        if kind == "softness" and there.max() > 0.0:
-            told.append(f"soft, {there.max():.3f} s")
-    return f" ({', '.join(told)})" if told else ""
 
 
 def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ from tests.bench.ceiling import (
     launch,
     multiply_add,
 )
-from tests.bench.timing import Timing, Variant, time_in_turns
 
 KERNELS = ("rasterise", "contact", "observation", "penalties", "contact_forces")
 
@@ -114,14 +113,6 @@ CEILING = Ceiling(
 )
 def test_what_bounds_a_kernel(work, seconds, share, bound_by):
     assert CEILING.judge(work, seconds) == (pytest.approx(share), bound_by)
-
-
-def test_variants_take_turns_after_a_warm_up():
-    played = []
-    variants = {name: Variant(replay=lambda name=name: played.append(name), launches=2, work=list) for name in "ab"}
-    seconds = time_in_turns(variants, "cpu", Timing(rounds=3))
-    assert played == ["a", "b"] * 4
-    assert seconds.keys() == {"a", "b"} and min(seconds.values()) > 0
 
 
 def test_command(tmp_path, device, capsys):

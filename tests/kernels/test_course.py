@@ -46,14 +46,6 @@ def test_courses_equal_the_builders(device):
     assert len(np.unique(kinds)) == len(Kind)  # every kind is among them
 
 
-def test_a_kerb_is_a_face_between_two_nodes(way):
-    # Flat ground of 5 cells, 0.25 m: the face stands between x = 4.25 m and x = 4.30 m.
-    up = way(element("kerb", lead=5, size=0.15, turn=1))
-    assert up[:6].tolist() == [0] * 6 and up[6:] == pytest.approx(0.15)
-    down = way(element("kerb", lead=5, size=0.15, turn=-1))
-    assert down[6:] == pytest.approx(-0.15)
-
-
 def test_stairs_have_their_risers_at_the_nearest_nodes(way):
     # Treads of 0.28 m are 5.6 cells: risers 0, 6 (5.6), 11 (11.2) cells behind the first, which stands at 0.2 m.
     ground = way(element("stairs", size=0.18, length=0.28, detail=3, turn=1))

@@ -104,16 +104,6 @@ def test_nearest_point(device, reach):
     assert near > 8
 
 
-def test_terrains_do_not_mix(device):
-    grids = np.stack([rough(17, 17, seed=k) for k in range(3)])
-    points = scatter(17, 17, 100)
-    terrain = make_terrain(grids, device)
-    for t in range(3):
-        alone = sample(make_terrain(grids[t : t + 1], device), points, 0.05, device)
-        for got, expected in zip(sample(terrain, points, 0.05, device, t), alone, strict=True):
-            np.testing.assert_array_equal(got, expected)
-
-
 def test_the_cut_of_a_cell_by_hand(device):
     # One cell of 0.05 m, only its (high x, high y) corner raised to 0.1: the cut runs between the two other corners, so
     # the low triangle is flat, and at (0.04, 0.04) the high one stands at 0.1 * (0.8 + 0.8 - 1) = 0.06.

@@ -19,10 +19,8 @@ BASE_COM = (-0.02, 0.01, 0.03)
 def starts_of(seeds, replicas, device):
     """What each start is drawn from, as a queue hands it out: replica by replica, terrain by terrain."""
     num_envs = len(seeds) * replicas
-    queue, waiting = (
-        make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device),
-        make_episodes(num_envs, device),
-    )
+    queue = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device)
+    waiting = make_episodes(num_envs, device)
     queue.seed.assign(np.uint32(seeds))
     make_ready(num_envs, queue)
     sums, terrain_of_env = wp.zeros((num_envs, 1), device=device), wp.zeros(num_envs, dtype=int, device=device)
@@ -124,20 +122,10 @@ def test_a_start_depends_on_its_seed_and_replica_alone(device, anymal):
     assert len(np.unique(qd[:, 0])) == 9
 
 
-def test_only_masked_rows_are_cleared(device):
-    rows = wp.array(np.arange(1, 13, dtype=np.float32).reshape(4, 3), device=device)
-    clear_rows(wp.array([0, 1, 0, 7], dtype=int, device=device), rows)
-    np.testing.assert_array_equal(rows.numpy(), [[1, 2, 3], [0, 0, 0], [7, 8, 9], [0, 0, 0]])
-
-
 @pytest.mark.parametrize("columns", [2, 64, 1801])
-def test_rows_that_are_not_finite_are_cleared_whole(device, columns):
-    rows = wp.array(np.full((2, columns), np.nan, np.float32), device=device)
-    clear_rows(wp.array([1, 0], dtype=int, device=device), rows)
-    assert not rows.numpy()[0].any()
-    assert np.isnan(rows.numpy()[1]).all()
-
-
-def test_wrong_mask_is_named(device):
-    with pytest.raises(ValueError, match=r"\(4,\), got \(3,\)"):
-        clear_rows(wp.zeros(3, dtype=int, device=device), wp.zeros((4, 2), dtype=float, device=device))
+def test_masked_rows_are_cleared_whole(device, columns):
+    rows = wp.array(np.full((3, columns), np.nan, np.float32), device=device)
+    clear_rows(wp.array([1, 0, 7], dtype=int, device=device), rows)
+    assert not rows.numpy()[[0, 2]].any() and np.isnan(rows.numpy()[1]).all()
+    with pytest.raises(ValueError, match="mask"):
+        clear_rows(wp.zeros(2, dtype=int, device=device), rows)

@@ -38,15 +38,8 @@ def make_rules(**changes):
 def make_batch(num_envs, *, outcome=Outcome.TIME_OUT, level=0, column=0, count=0):
     """Episodes and what training keeps beside them."""
     full = np.full(num_envs, 1, np.int32)
-    training = make_training(
-        full * column,
-        full * level,
-        num_joints=NUM_JOINTS,
-        observation_size=4,
-        first_count=count,
-        device=str(wp.get_device()),
-    )
-    episodes = make_episodes(num_envs, str(wp.get_device()))
+    sizes = {"num_joints": NUM_JOINTS, "observation_size": 4, "first_count": count, "device": str(wp.get_device())}
+    training, episodes = make_training(full * column, full * level, **sizes), make_episodes(num_envs)
     episodes.outcome.assign(np.broadcast_to(np.int32(outcome), num_envs))
     return episodes, training
 
@@ -72,13 +65,7 @@ def test_level_goes_up_down_or_stays():
     assert levels.tolist() == [2, 1, 1, 0, 0]
     assert terrain.tolist() == [level * NUM_COLUMNS + 2 for level in levels]
     assert promoted(0.0, 0.0)[0] == [1]  # told to stand
-
-
-def test_walking_far_counts_before_lagging_behind():
-    assert promoted(4.1, 1.0)[0] == [2]
-
-
-def test_level_zero_is_the_lowest():
+    assert promoted(4.1, 1.0)[0] == [2]  # far, though less than is due
     assert promoted(0.0, 1.0, level=0)[0] == [0]
 
 
@@ -177,9 +164,6 @@ def test_each_environment_is_pushed_once_an_interval():
         assert (joint_qd[:, 2:] == 9.0).all() and (joint_qd[~pushed[count]] == 9.0).all()
     assert (pushed.sum(axis=0) == 1).all()
     assert pushed.sum(axis=1).max() < num_envs / 2  # not all at once
-
-
-def test_no_pushes_when_told_so():
     assert (command(5, steps=1, push_steps=0)[1] == 9.0).all()
 
 
