@@ -8,7 +8,7 @@ import pytest
 
 from qd.archive import write_archive
 from qd.show.elites import find_archive
-from qd.show.export import export_controller, export_terrains, source_of_archive
+from qd.show.export import export_terrains, source_of_archive
 from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
 from tests.builders import fresh_values, small_archive
@@ -67,8 +67,3 @@ def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
     assert file.read_bytes() == b"mine"
     export("0", formats=("npz",), out=Path("out"), overwrite=True)
     assert file.read_bytes() != b"mine"
-
-
-def test_a_controller_is_exported_as_onnx(tmp_path, anymal):
-    export_controller(None, anymal, tmp_path / "a.onnx")
-    assert (tmp_path / "a.onnx").stat().st_size > 100_000

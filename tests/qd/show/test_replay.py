@@ -117,7 +117,7 @@ def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
     assert suffix_of(cfg, "mine/row.py:adapt@my model.onnx", robot) == "-row.py-adapt-my-model"
 
 
-def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path):
+def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     archive = tmp_path / "archive.npz"
     write_archive(archive, small_archive())
     found = find_archive(None, archive)
@@ -137,12 +137,9 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path):
     RunDirectory(tmp_path).begin_session(CFG, {"command": "", "commit": "", "device": "cpu"}, 0)
     with pytest.raises(ValueError, match=r"config\.json"):  # which has six penalties
         find_archive(None, tmp_path).as_searched()
-
-
-def test_a_run_names_its_robot_and_has_penalties_that_the_robot_has(tmp_path, cassie):
-    robot = {"robot": "cassie", **robot_identity(cassie)}
-    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), **robot))
-    assert find_archive(None, tmp_path).robot.name == "cassie"
-    write_archive(tmp_path / "archive.npz", dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
+    write_archive(archive, dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
     with pytest.raises(ValueError, match="penalties"):
-        find_archive("anymal", tmp_path)
+        find_archive("anymal", archive)
+    robot = {"robot": "cassie", **robot_identity(cassie)}
+    write_archive(archive, dataclasses.replace(small_archive(), **robot))
+    assert find_archive(None, archive).robot.name == "cassie"
