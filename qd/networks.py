@@ -56,14 +56,10 @@ class Networks(nn.ModuleList):
             Shape (batch, MEMBERS, num_out).
         """
         if maps.is_cuda:
-            return self.together(maps)
+            return self._through(maps.flatten(1, 2), slice(None))
         # One by one, since groups are slow on the CPU.
         members = (slice(member, member + 1) for member in range(MEMBERS))
         return torch.cat([self._through(maps[:, member].flatten(1, 2), member) for member in members], dim=1)
-
-    def together(self, maps: Tensor) -> Tensor:
-        """As :meth:`forward`, with all networks in one convolution."""
-        return self._through(maps.flatten(1, 2), slice(None))
 
     def judge(self, maps: Tensor) -> Tensor:
         """What each network says of the same maps; on CUDA in half precision, of which their words need no more.
@@ -80,12 +76,7 @@ class Networks(nn.ModuleList):
             return self._through(maps, slice(None)).float()
 
     def _through(self, rows: Tensor, members: slice) -> Tensor:
-        """What some of the networks say, shape (batch, networks, num_out).
-
-        Args:
-            rows: Maps that each of them sees, one network's after the other, or those that all of them see.
-            members: Which networks.
-        """
+        """What some of the networks say of maps for each of them or for all, shape (batch, networks, num_out)."""
         count = len(range(MEMBERS)[members])
         alike = rows.shape[1] < count * self._num_maps
         for index, layer in enumerate(self):

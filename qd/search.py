@@ -23,7 +23,6 @@ from qd.workers.evaluator import (
     EvaluatorCfg,
     OpenEvaluator,
     Pipeline,
-    WorkerStatus,
     check_policy,
     episode_seeds,
     open_evaluator,
@@ -139,21 +138,19 @@ def run_iterations(
         if samples:
             row |= _sample_elites(cfg, archive, pipeline)
         ended = time.perf_counter()
-        row |= _timing(row, ended - began, pipeline.status())  # from the end of the iteration before, so saving counts
+        wall_s = ended - began  # from the end of the iteration before, so saving counts
+        row |= {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
+        if (status := pipeline.status()) is not None:
+            row |= status._asdict()
         began = ended
         metrics.append(row)
         run.save(cfg, scheduler.state(), metrics, archive)
-        bar.show(row, pipeline.status())
+        bar.show(row, status)
 
 
 def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:
     """Seeds of a group's terrains, which are those of their places in the iteration."""
     return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
-
-
-def _timing(row: dict[str, Any], wall_s: float, status: WorkerStatus | None) -> dict[str, Any]:
-    workers = {"workers": status.workers, "retries": status.retries} if status else {}
-    return {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s, **workers}
 
 
 def samples_elites(cfg: SearchCfg, iteration: int) -> bool:

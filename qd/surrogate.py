@@ -54,26 +54,6 @@ class Prediction(NamedTuple):
         return self.numbers[..., -1].sinh()
 
     @property
-    def penalty_mean(self) -> Tensor:
-        """Scaled penalties, shape (MEMBERS, N, P)."""
-        return (self.numbers[..., : self.ratios.shape[-1]].exp() - _LEAST_PENALTY).clamp_min(0.0)
-
-    @property
-    def penalty_std(self) -> Tensor:
-        """Shape (MEMBERS, N, P)."""
-        return (self.numbers[..., self.ratios.shape[-1] : -1].exp() - _LEAST_PENALTY).clamp_min(0.0)
-
-    @property
-    def goal_rate(self) -> Tensor:
-        """Shape (MEMBERS, N)."""
-        return self.rates[..., 0].sigmoid()
-
-    @property
-    def collision_rate(self) -> Tensor:
-        """Shape (MEMBERS, N)."""
-        return self.rates[..., 1].sigmoid()
-
-    @property
     def collided(self) -> Tensor:
         """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
         return self.rates[..., 2] > 0.0
@@ -166,16 +146,13 @@ class Surrogate:
     def _train(self, steps: int) -> None:
         if self._maps is None:
             self._maps = self._map_units(self._genes)
-        targets = self._scaled(torch.from_numpy(self._targets).to(self.device).float())
+        middle, spread = torch.from_numpy(self._scale).to(self.device)
+        ratios, numbers, rates = self._split(torch.from_numpy(self._targets).to(self.device).float())
+        targets = torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
         shape = steps, BATCH, MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
         self._training.run(self._maps, targets, drawn, turned)
-
-    def _scaled(self, targets: Tensor) -> Tensor:
-        middle, spread = torch.from_numpy(self._scale).to(targets.device)
-        ratios, numbers, rates = self._split(targets)
-        return torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
 
     def _split(self, columns: Any) -> tuple[Any, Any, Any]:
         """Columns of ratios, numbers and rates."""
@@ -249,15 +226,7 @@ class Surrogate:
         return best.scatter_reduce(0, cells[inside], prediction.fitness.mean(0)[inside], "amax")
 
     def _search(self, num_proposals: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
-        """The inner loop: what adds most to the predicted archive, and what the networks disagree about.
-
-        Args:
-            num_proposals: Terrains to return.
-            elites: Genes of the elites, where it begins.
-            best: Fitness in each cell, expected or found, shape (num_cells,).
-            count: Terrains of which these are a part.
-            draw: What children are drawn from.
-        """
+        """The inner loop: what adds most to the predicted archive, and what the networks disagree about."""
         each = self.cfg.candidates * count
         genes = elites.new_empty(self.cfg.generations * each, elites.shape[1])
         gain, spread = elites.new_empty(2, len(genes))
@@ -267,10 +236,8 @@ class Surrogate:
             children = slice(first, first + each)
             genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
             prediction = self.predict(genes[children])
-            gain[children], spread[children] = (
-                self._gain(prediction, best),
-                prediction.ratios.std(0, correction=0).sum(1),
-            )
+            gain[children] = self._gain(prediction, best)
+            spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
             rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])
             survivors = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]

@@ -54,12 +54,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads the state of a search that :func:`save_checkpoint` wrote.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is truncated, damaged, foreign, or holds anything but the state of a search.
-    """
+    """Reads the state of a search that :func:`save_checkpoint` wrote, as data; a file of anything else is refused."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -100,11 +100,7 @@ class Cache:
         self.file(key).unlink(missing_ok=True)
 
     def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Stores the arrays of a key in one step.
-
-        Raises:
-            OSError: If they cannot be written.
-        """
+        """Stores the arrays of a key in one step."""
         self.folder.mkdir(parents=True, exist_ok=True)
         write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
         self.remove_least_used(but=key)

@@ -51,11 +51,7 @@ class Workers(NamedTuple):
 
 
 def parse_workers(text: str | None) -> Workers:
-    """Reads ``--workers``: ``4`` processes, ``ray``, or ``ray:4``; None for one process a core.
-
-    Raises:
-        ValueError: If it is something else.
-    """
+    """Reads ``--workers``: ``4`` processes, ``ray``, or ``ray:4``; None for one process a core."""
     if text is None:
         return Workers(on_ray=False, count=None)
     match = _WORKERS.fullmatch(text)
@@ -148,12 +144,7 @@ class Compute:
 
     @classmethod
     def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:
-        """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU.
-
-        Raises:
-            ValueError: If a value cannot be used, or the device is not there.
-            OSError: If there is no Ray cluster at RAY_ADDRESS.
-        """
+        """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU."""
         if num_envs is not None and num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         return cls(resolve_device(device, workers), workers, num_envs)
@@ -186,10 +177,6 @@ def resolve_device(name: str | None, workers: str | None = None) -> str:
     Args:
         name: What the user asked for.
         workers: Who works there, as :func:`parse_workers` takes it; the devices of a cluster are meant on Ray.
-
-    Raises:
-        ValueError: If the device is unknown or absent, or cannot have such workers.
-        OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
     on_ray, count = parse_workers(workers)
     if on_ray:
@@ -208,11 +195,7 @@ def origin_of(device: str, seed: int, workers: str | None = None) -> dict[str, A
 
 
 def check_policy(policy: str, robot: RobotCfg | str, device: str) -> None:
-    """Loads a controller and tries it on the robot, so that a bad one is found before any long work.
-
-    Raises:
-        ValueError: If it cannot be loaded or does not fit the robot.
-    """
+    """Loads a controller and tries it on the robot, so that a bad one is found before any long work."""
     # A cluster's GPUs need not be this machine's.
     here = device if device == "cpu" else resolve_device(None)
     load_policy(policy, get_robot(robot), device if here.startswith("cuda") else "cpu")
@@ -236,11 +219,7 @@ def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
 
 
 def _ray_workers() -> Any:
-    """The module of Ray workers: Ray takes seconds to import and need not be installed.
-
-    Raises:
-        ValueError: If Ray is not installed.
-    """
+    """The module of Ray workers: Ray takes seconds to import and need not be installed."""
     try:
         return importlib.import_module("qd.workers.ray_workers")
     except ModuleNotFoundError as error:
@@ -339,7 +318,7 @@ class Pipeline(ABC):
             terrains: As of a call, and so are seeds and progress.
             seeds: One a terrain.
             size: Terrains of a lot.
-            progress: Called now and then with the share that is done.
+            progress: Called with the share that is done.
 
         Yields:
             Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.
@@ -352,17 +331,17 @@ class Pipeline(ABC):
 
         def put_what_fits() -> None:
             while behind and (behind[0].stop - num_taken <= self.num_terrains or behind[0].start == num_taken):
-                own = behind.popleft()
-                self.put(terrains[own], seeds[own])
+                lot = behind.popleft()
+                self.put(terrains[lot], seeds[lot])
 
         self.clear()
-        for own in lots:
+        for lot in lots:
             put_what_fits()
-            share = (own.stop - own.start) / count
-            result = self.take(None if progress is None else _share_of(progress, own.start / count, share))
-            num_taken = own.stop
+            share = (lot.stop - lot.start) / count
+            result = self.take(None if progress is None else _share_of(progress, lot.start / count, share))
+            num_taken = lot.stop
             put_what_fits()  # before the result is looked at
-            yield own, result
+            yield lot, result
 
 
 class _Here(Pipeline):

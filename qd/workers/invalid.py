@@ -57,11 +57,7 @@ def invalid_iterations(metrics: Sequence[Mapping[str, Any]]) -> str | None:
 
 
 def refuse_all_invalid(result: RolloutResult) -> None:
-    """Does nothing if some episode is valid.
-
-    Raises:
-        AllInvalidError: If none is.
-    """
+    """Raises AllInvalidError if no episode is valid."""
     if result.invalid.size and result.invalid.all():
         words = invalid_words(invalid_reasons(result), result.invalid.size)
         raise AllInvalidError(f"no episode is valid, expected some: {words}")

@@ -64,12 +64,7 @@ class WorkerProcess:
         theirs.close()  # so that its death ends the stream here
 
     def send(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands out terrains to evaluate, behind those handed out before.
-
-        Raises:
-            ValueError: If the worker refused what it had before.
-            EvaluatorError: If it failed otherwise, or is dead.
-        """
+        """Hands out terrains to evaluate, behind those handed out before; raises what :meth:`receive` does."""
         try:
             self.connection.send((terrains, seeds))
         except OSError:

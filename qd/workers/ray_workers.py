@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from qd.workers.evaluator import EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
 from qd.workers.process import Crosser, EvaluatorError
-from qd.workers.shards import flaw_of, merged, taken
+from qd.workers.shards import copied, flaw_of, merged
 from sim.files.command import debugging
 from sim.files.records import code_fingerprint
 from sim.ground import joined_name, split_name
@@ -91,11 +91,7 @@ class RayWorker:
         self._cfg, self._controller, self._robot, self._space, self._build = cfg, controller, robot, space, build
 
     def prepare(self, num_terrains: int, code: str) -> None:
-        """Builds the simulation.
-
-        Raises:
-            ValueError: If it cannot be built as asked for, or this machine has other code.
-        """
+        """Builds the simulation; refuses to if this machine has other code."""
         if code_fingerprint(_ROOMS) != code:
             raise ValueError(f"{socket.gethostname()} has other code or packages: use the same commit everywhere")
         # The process may be killed at any time, so the folder must not live as long as it does.
@@ -153,12 +149,7 @@ class RayWorkers(Pipeline):
         self._taken_at = time.perf_counter()
 
     def open(self) -> None:
-        """Starts the workers and waits for them; once one is ready, no longer than a minute for the others.
-
-        Raises:
-            ValueError: If the simulation cannot be built as asked for.
-            EvaluatorError: If no worker comes.
-        """
+        """Starts the workers and waits for them; once one is ready, no longer than a minute for the others."""
         began = time.monotonic()
         while not self._idle or (self.status().workers < len(self._workers) and time.monotonic() - began < _GATHER_S):
             self._turn()
@@ -185,12 +176,7 @@ class RayWorkers(Pipeline):
         self._deal()
 
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Waits for the lot that was put in first.
-
-        Raises:
-            ValueError: If a worker refused its terrains.
-            EvaluatorError: If terrains failed five times, or no worker is left and none comes.
-        """
+        """Waits for the lot that was put in first."""
         lot, self._seen_at = self._lots[0], time.monotonic()
         while (done := sum(shard.result is not None for shard in lot)) < len(lot):
             self._turn()
@@ -204,7 +190,7 @@ class RayWorkers(Pipeline):
         return replace(merged([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
 
     def _shard_size(self) -> int:
-        """Terrains of a shard: smaller once the cluster has grown, never larger, for which workers have no room."""
+        """Terrains of a shard: fewer once the cluster has grown; never more, for which workers have no room."""
         self._size = min(self._size, self._cfg.terrains_of_worker)
         return self._size
 
@@ -255,7 +241,7 @@ class RayWorkers(Pipeline):
         if flaw is None:
             self._idle.append(worker)
             if shard is not None:
-                shard.result = taken(result, len(shard.terrains))
+                shard.result = copied(result)
             return
         with suppress(RayError):
             ray.kill(worker)
@@ -308,11 +294,7 @@ def open_ray_workers(cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Cro
 
 
 def connect(count: int | None) -> None:
-    """Joins the cluster that RAY_ADDRESS names, or starts Ray on this machine for ``count`` workers or one a device.
-
-    Raises:
-        OSError: If there is no cluster at RAY_ADDRESS.
-    """
+    """Joins the cluster that RAY_ADDRESS names, or starts Ray on this machine for ``count`` workers or one a device."""
     if ray.is_initialized():
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -337,12 +319,7 @@ def connect(count: int | None) -> None:
 
 
 def cluster_device(name: str | None, count: int | None) -> str:
-    """Device of the workers, ``cuda`` or ``cpu``; for None CUDA where the cluster has it.
-
-    Raises:
-        ValueError: If the device is absent, one GPU among several is named, or this machine has fewer GPUs than wanted.
-        OSError: If there is no cluster at RAY_ADDRESS.
-    """
+    """Device of the workers, ``cuda`` or ``cpu``; for None CUDA where the cluster has it."""
     if name not in (None, "cpu", "cuda"):
         raise ValueError(f"with workers on Ray the device must be cpu or cuda, got {name}")
     connect(count)

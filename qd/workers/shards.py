@@ -1,4 +1,4 @@
-"""Results of whole terrains taken apart, put together, and looked at before they are believed."""
+"""Results of whole terrains put together, and looked at before they are believed."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -11,14 +11,9 @@ from sim.rollout import RolloutResult
 _STEPS = ("physics_steps", "robot_steps", "busy_steps")
 
 
-def taken(result: RolloutResult, count: int, *, first: int = 0) -> RolloutResult:
-    """Some of a result's terrains: ``count`` from ``first`` on, and their share of what all took."""
-    part, total = slice(first, first + count), len(result.penalties)
-    # Copies, since what Ray delivers can only be read.
-    changes: dict[str, Any] = {name: value[part].copy() for name, value in _arrays(result).items()}
-    for name in _STEPS:  # parts make the whole again
-        changes[name] = getattr(result, name) * part.stop // total - getattr(result, name) * part.start // total
-    return replace(result, **changes, wall_s=result.wall_s * count / total)
+def copied(result: RolloutResult) -> RolloutResult:
+    """A result that can be written to, which what Ray delivers cannot."""
+    return replace(result, **{name: value.copy() for name, value in _arrays(result).items()})
 
 
 def merged(results: Sequence[RolloutResult], *, join: int) -> RolloutResult:

@@ -1,8 +1,8 @@
-"""Simulations for Ray workers, over the stand-in: good ones, and one that fails once in each way there is."""
+"""Simulations for workers, over the stand-in: good ones, and one that fails in each way there is."""
 
-import dataclasses
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from tests.qd import stand_in
 
 
 class Crosser:
-    """Evaluates by the stand-in."""
+    """Crosses by the stand-in."""
 
     def __init__(self, cfg, num_terrains: int) -> None:
         self.cfg, self.num_terrains = cfg, num_terrains
@@ -35,47 +35,33 @@ class Crosser:
         return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
 
 
-class Identified(Crosser):
-    """Notes its process in the positions of its results."""
-
-    def evaluate(self, terrains, seeds, *, progress=None):
-        result = super().evaluate(terrains, seeds, progress=progress)
-        result.final_position[:] = os.getpid()
-        return result
-
-
 class Failing(Crosser):
     """Fails as the policy's name says: ``<how>:<folder>:<times>``, so often in all, counted by files in the folder."""
 
+    def __init__(self, cfg, num_terrains: int) -> None:
+        super().__init__(cfg, num_terrains)
+        self.how, self.folder, self.times = cfg.policy.split(":")
+        if self.how == "build":
+            raise ValueError("policy 'x' does not fit:\nuse another")
+
     def evaluate(self, terrains, seeds, *, progress=None):
-        how, folder, times = self.cfg.policy.split(":")
-        for number in range(int(times)):
+        result = super().evaluate(terrains, seeds, progress=progress)
+        for number in range(int(self.times)):
             try:
-                (Path(folder) / str(number)).touch(exist_ok=False)
+                (Path(self.folder) / str(number)).touch(exist_ok=False)
             except FileExistsError:
                 continue
-            return self._fail(how, terrains, seeds)
-        return super().evaluate(terrains, seeds, progress=progress)
-
-    def _fail(self, how, terrains, seeds):
-        if how == "die":
-            os.kill(os.getpid(), signal.SIGKILL)
-        if how == "raise":
-            raise RuntimeError("the solver is broken")
-        if how == "refuse":
-            raise ValueError("terrains of another kind")
-        result = stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
-        if how == "nan":
-            result.penalties[0, 0, 0] = np.nan
-        if how == "short":
-            return dataclasses.replace(result, penalties=result.penalties[:-1])
-        if how == "nonsense":
-            return "all went well"
+            return self.fail(result)
         return result
 
-
-class Refusing(Crosser):
-    """Cannot be built."""
-
-    def __init__(self, cfg, num_terrains: int) -> None:
-        raise ValueError("policy 'x' does not fit:\nuse another")
+    def fail(self, result):
+        if self.how == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.how == "raise":
+            raise RuntimeError("the solver is broken")
+        if self.how == "refuse":
+            raise ValueError("terrains of another kind")
+        if self.how == "sleep":
+            time.sleep(60)
+        result.penalties[0, 0, 0] = np.nan
+        return result

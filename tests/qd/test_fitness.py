@@ -53,13 +53,6 @@ def test_an_invalid_episode_counts_nowhere():
     assert (evaluation.invalid_episodes.tolist(), evaluation.episodes.tolist()) == ([1], [4])
 
 
-def test_a_penalty_that_is_not_finite_makes_its_episode_invalid():
-    result = make_result([[[1, 20], [np.inf, 20], [3, 20], [3, 20]]])
-    evaluation = evaluation_of(result, CELLS, CFG)
-    assert evaluation.invalid_episodes.tolist() == [1]
-    assert np.isfinite(evaluation.fitness).all()
-
-
 @pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (20, False)])
 def test_more_than_a_quarter_of_invalid_episodes_make_a_terrain_invalid(num_invalid, valid):
     invalid = np.arange(20)[None] < num_invalid
@@ -92,9 +85,3 @@ def test_penalties_are_found_by_name():
 def test_scales_must_be_positive_one_a_penalty(scales):
     with pytest.raises(ValueError, match="scales must be"):
         evaluation_of(make_result([[[1, 10]] * 4]), CELLS, FitnessCfg(penalties=CFG.penalties, scales=scales))
-
-
-@pytest.mark.parametrize("weight", [{"alpha": float("nan")}, {"lam": float("inf")}])
-def test_weights_must_be_finite(weight):
-    with pytest.raises(ValueError, match="must be a finite number"):
-        FitnessCfg(penalties=("a", "b"), scales=(1.0, 1.0), **weight)

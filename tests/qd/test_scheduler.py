@@ -106,15 +106,6 @@ def test_seeds_make_the_difference():
     assert not np.array_equal(make_search(seed=1).ask(), make_search(seed=2).ask())
 
 
-def test_tell_answers_ask():
-    search = make_search()
-    with pytest.raises(RuntimeError, match="must follow ask"):
-        search.tell(told([0] * 12, [0.0] * 12), 1)
-    search.ask()
-    with pytest.raises(ValueError, match="evaluation must have 12 rows, got 3"):
-        search.tell(told([0] * 3, [0.0] * 3), 1)
-
-
 @pytest.mark.parametrize("method", [*METHODS, *JOINED])
 def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
     search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule=1, method=method, **BRIEF))
@@ -170,9 +161,3 @@ def test_of_fewer_emitters_than_methods_the_first_ones_count():
     search = make_search(SchedulerCfg(emitters=1, batch_size=2, method="map_elites+cma_mae"))
     assert [type(emitter) for emitter in search.emitters] == [IsoLineEmitter]
     assert search.archive is search.result  # nobody goes by CMA-MAE's
-
-
-@pytest.mark.parametrize("state", [{}, {"archive": 1, "result": 2, "emitters": []}])
-def test_a_state_of_something_else_is_refused(state):
-    with pytest.raises(ValueError, match="two archives, emitters"):
-        Scheduler.from_state(state)

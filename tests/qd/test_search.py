@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Pipeline, open_evaluator
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Pipeline
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from tests.builders import fresh_values
-from tests.qd import crossers, stand_in
+from tests.qd import stand_in
 from tests.qd.searches import CFG, rows_of, run, without_figures
 
 FILES = ["archive.json", "archive.npz", "checkpoint.bin", "config.json", "metrics.jsonl"]
@@ -160,24 +160,6 @@ def test_groups_are_put_in_ahead(tmp_path):
     assert pipeline.most == 3 and not pipeline.lots
 
 
-def test_there_are_no_more_groups_than_emitters(tmp_path):
-    run(tmp_path / "a", scheduler=dataclasses.replace(CFG.scheduler, groups=9))
-    run(tmp_path / "b", scheduler=dataclasses.replace(CFG.scheduler, groups=2))
-    assert (tmp_path / "a/archive.npz").read_bytes() == (tmp_path / "b/archive.npz").read_bytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("groups", [1, 2, 3])
-def test_who_crosses_the_lots_of_groups_changes_nothing(tmp_path, groups):
-    def by_two_processes(cfg):
-        return open_evaluator(dataclasses.replace(cfg, workers="2"), build=crossers.Crosser)
-
-    in_groups(tmp_path / "whole", groups)
-    for iterations in (1, 3, 5):  # extended twice
-        in_groups(tmp_path / "pieces", groups, open_evaluator=by_two_processes, iterations=iterations)
-    assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
-
-
 def never(cfg):
     raise AssertionError("nothing is left to evaluate")
 
@@ -234,17 +216,6 @@ def test_an_interrupt_leaves_finished_iterations(tmp_path):
     run(path, iterations=3)
     run(tmp_path / "whole", iterations=3)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
-
-
-def test_a_simulation_that_cannot_be_built_leaves_no_directory(tmp_path):
-    @contextmanager
-    def refusing(cfg: EvaluatorCfg):
-        raise ValueError("policy 'x' does not fit")
-        yield
-
-    with pytest.raises(ValueError, match="does not fit"):
-        run(tmp_path / "run", open_evaluator=refusing)
-    assert not (tmp_path / "run").exists()
 
 
 SLOW_SEARCH = """

@@ -16,7 +16,6 @@ from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
 from sim.corridor import SHAPE, corridor_heights
 from sim.spaces.base import clipped
-from sim.spaces.course import COURSE
 from sim.spaces.registry import get_space, load_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
@@ -49,7 +48,7 @@ def small_steps():
 def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
     """What each network says, on the host in double precision."""
     found = search.predict(torch.from_numpy(genes).to(search.device))
-    names = ("ratios", "fitness", "penalty_mean", "penalty_std", "goal_rate", "collision_rate", "collided")
+    names = ("ratios", "fitness", "collided")
     return {name: getattr(found, name).cpu().numpy().astype(float) for name in names}
 
 
@@ -83,42 +82,7 @@ def test_what_it_learned_holds_for_other_terrains(learned):
     error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
     assert error < 0.7 * spread
     assert np.corrcoef(np.arcsinh(found["fitness"]).mean(axis=0), np.arcsinh(truth.fitness))[0, 1] > 0.6
-    total = found["penalty_mean"].mean(axis=0).sum(axis=1)
-    assert np.corrcoef(np.log(total), np.log(truth.penalty_mean.sum(axis=1)))[0, 1] > 0.6
-    assert (found["penalty_std"] >= 0.0).all()
-    assert found["goal_rate"].mean() > 0.8  # all robots of the stand-in reach the goal, none collides
-    assert found["collision_rate"].mean() < 0.2 and found["collided"].mean() < 0.1
-
-
-def test_it_learns_from_friction_where_heights_say_nothing():
-    space = get_space("super_gaussian+friction")
-
-    def slipped(seed: int, count: int):
-        genes = space.uniform_random(count, seed)
-        genes[:, 7:64:8] = 0.0  # no bump has a height
-        beside_the_way = genes[:, 64:].reshape(count, 4, 8)[:, 1:3, 1:7].mean(axis=1)
-        noise = np.random.default_rng(seed).uniform(0.9, 1.1, (count, 4, 6))
-        penalties = (0.01 + (1.0 - beside_the_way) ** 2)[:, None] * noise * stand_in.SCALES
-        return genes, evaluation_of(stand_in.make_result(penalties), CELLS, FITNESS)
-
-    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=12)
-    search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))
-    for seed in range(4):
-        genes, told = slipped(seed, 100)
-        search.learn(genes, told)
-    genes, truth = slipped(9, 150)
-    mean = predicted(search, genes)["ratios"].mean(axis=0)
-    error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
-    assert error < 0.5 * spread
-    assert len(search.propose(10, genes, truth.cell, truth.fitness, genes[:0])) == 10
-
-
-def test_grouped_networks_are_the_same_as_one_by_one(learned):
-    maps = mapped(learned, SUPER_GAUSSIAN.hard_random(5, 6))[:, None].expand(-1, module.MEMBERS, -1, -1, -1)
-    with torch.no_grad():
-        one_by_one = learned._networks(maps)
-        together = learned._networks.together(maps)
-    torch.testing.assert_close(together, one_by_one, rtol=1e-4, atol=1e-5)
+    assert found["collided"].mean() < 0.1  # none of the stand-in's robots collides
 
 
 def test_what_lies_along_the_way_is_the_same_wherever_it_lies_but_for_its_place(learned):
@@ -204,13 +168,6 @@ def test_it_learns_and_proposes_on_every_device(device, name, tmp_path, monkeypa
     assert np.median(apart) < 0.005  # devices may round an element of a course to another node
 
 
-def test_networks_of_another_shape_are_refused_when_loaded():
-    state = make_surrogate().__getstate__()
-    state["learned"][0]["weights"] = state["learned"][0]["weights"][:1]
-    with pytest.raises(ValueError, match="networks of another shape"):
-        make_surrogate().__setstate__(state)
-
-
 def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     cfg = SchedulerCfg(emitters=2, batch_size=16, explore_share=0.0, disagree_share=0.0, candidates=20, generations=2)
     learned.cfg = cfg
@@ -292,7 +249,7 @@ def test_the_newest_are_kept(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE, get_space("course+friction")], ids=lambda space: space.name)
+@pytest.mark.parametrize("space", [get_space("course+friction")], ids=lambda space: space.name)
 def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
     cfg = SchedulerCfg(
         emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,

@@ -38,14 +38,6 @@ def test_round_trip(tmp_path):
     assert path.stat().st_size < 16 << 20
 
 
-def test_truncation_anywhere_is_noticed(saved):
-    whole = saved.read_bytes()
-    for size in [0, 5, 30, 61, 62, 63, *np.random.default_rng(0).integers(0, len(whole), 40)]:
-        saved.write_bytes(whole[:size])
-        with pytest.raises(ValueError, match=r"another file|truncated or damaged"):
-            load_checkpoint(saved)
-
-
 def test_a_flipped_bit_anywhere_is_noticed(saved):
     whole = saved.read_bytes()
     for position in np.random.default_rng(1).integers(0, len(whole), 100):

@@ -34,11 +34,6 @@ def test_wide_has_as_many_episodes_and_small_fits_a_laptop():
     assert (small.episodes_per_iteration, small.replicas) == (128, 4)
 
 
-def test_an_unknown_preset_is_refused():
-    with pytest.raises(ValueError, match="huge"):
-        preset("huge", robot())
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [("iterations", 0), ("replicas", -1), ("intervals", 0), ("intervals", 100), ("seed", -1), ("seed", 1.5)],

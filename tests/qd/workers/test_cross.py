@@ -66,10 +66,6 @@ def assert_same(result, expected):
 EXPECTED = stand_in.evaluate(GENES, SEEDS, 20)
 
 
-def test_a_result_has_a_row_a_terrain_in_order():
-    assert_same(cross_all(StandIn()), EXPECTED)
-
-
 def test_cached_crossings_are_the_same_bit_for_bit_and_take_no_time(tmp_path):
     first = cross_all(StandIn(), tmp_path)
     again = StandIn()
@@ -130,16 +126,19 @@ def test_nothing_is_stored_of_a_controller_whose_code_has_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "rename", "empty"])
+@pytest.mark.parametrize("damage", ["flip", "rename", "lacks"])
 def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, damage):
     cross_all(StandIn(), tmp_path)
     lots = sorted(tmp_path.iterdir())
     content = bytearray(lots[0].read_bytes())
+    content[len(content) // 2] ^= 255
     if damage == "rename":
         lots[1].replace(lots[0])
+    elif damage == "flip":
+        lots[0].write_bytes(content)
     else:
-        content[len(content) // 2] ^= 255
-        lots[0].write_bytes({"cut": content[:-100], "flip": content, "empty": b""}[damage])
+        cache = Cache(tmp_path)
+        cache.write(lots[0].stem, {k: v for k, v in cache.read(lots[0].stem).items() if k != "outcome"})
     capsys.readouterr()
     again = StandIn()
     assert_same(cross_all(again, tmp_path), EXPECTED)
@@ -149,18 +148,6 @@ def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, dam
     after = StandIn()
     cross_all(after, tmp_path)
     assert after.crossed == []
-
-
-def test_a_file_of_the_cache_that_lacks_an_array_is_crossed_again(tmp_path):
-    cross_all(StandIn(), tmp_path)
-    cache = Cache(tmp_path)
-    key = cache.keys()[0]
-    arrays = cache.read(key)
-    del arrays["outcome"]
-    cache.write(key, arrays)
-    again = StandIn()
-    assert_same(cross_all(again, tmp_path), EXPECTED)
-    assert len(again.crossed) in (1, 2)
 
 
 def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
@@ -175,15 +162,6 @@ def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
     assert cache.keys() == ["a", "c", "d"]
     Cache(tmp_path, most_bytes=10).write("e", block)
     assert cache.keys() == ["e"]
-
-
-def test_the_cache_reads_what_was_written_and_nothing_else(tmp_path):
-    cache = Cache(tmp_path / "new")
-    assert cache.read("a") is None
-    cache.write("a", {"x": np.arange(3), "y": np.zeros((2, 0), np.uint8)})
-    np.testing.assert_array_equal(cache.read("a")["x"], [0, 1, 2])
-    assert cache.read("a")["y"].shape == (2, 0)
-    assert cache.read("a", ["y"]).keys() == {"y"}
 
 
 def test_a_simulation_stays_open_for_calls_that_agree():
@@ -212,11 +190,6 @@ def test_no_terrains_open_nothing():
     result = cross_all(opened, genes=GENES[:0], seeds=SEEDS[:0], reward=True)
     assert result.penalties.shape == (0, 20, 6) and result.reward.shape == result.outcome.shape == (0, 20)
     assert opened.cfgs == []
-
-
-def test_seeds_must_be_one_a_terrain():
-    with pytest.raises(ValueError, match="seeds"):
-        cross_all(StandIn(), seeds=SEEDS[:3])
 
 
 def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):

@@ -14,12 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.episode import Outcome
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, resolve_device
-from qd.workers.shards import flaw_of
 from tests.builders import free_port
-from tests.qd import cluster_run, crossers, stand_in
-from tests.qd.workers.test_evaluator import same
+from tests.qd import crossers, stand_in
 
 pytestmark = pytest.mark.ray
 
@@ -40,125 +37,48 @@ def cluster():
     ray.shutdown()
 
 
-def expected(count):
-    return stand_in.evaluate(GENES[:count], SEEDS[:count], 4)
+def assert_crossed(result, terrains):
+    expected = stand_in.evaluate(GENES[terrains], SEEDS[terrains], 4)
+    np.testing.assert_array_equal(result.penalties, expected.penalties)
+    np.testing.assert_array_equal(result.outcome, expected.outcome)
 
 
-@pytest.mark.parametrize("name", ["{}/model.pt", "{}/mine.py:act", "{}/mine.py:adapt@{}/model.pt", "os.path:join"])
-def test_the_files_of_a_controller_travel(tmp_path, name):
-    from qd.workers.ray_workers import PackedCode
+def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
+    def interrupt(share: float) -> None:
+        raise KeyboardInterrupt
 
-    here, there = tmp_path / "here", tmp_path / "there"
-    here.mkdir()
-    content = {"model.pt": b"weights", "mine.py": b"x = 1"}
-    for file, text in content.items():
-        (here / file).write_bytes(text)
-    assert PackedCode.of(name.format(here, here)).unpacked(there) == name.format(there, there)
-    sent = {file.name: file.read_bytes() for file in there.iterdir()}
-    assert sent == {file: text for file, text in content.items() if file in name}
-
-
-@pytest.mark.parametrize("workers", [1, 3])
-def test_how_terrains_are_spread_changes_nothing(cluster, workers):
-    with open_evaluator(dataclasses.replace(CFG, workers=f"ray:{workers}"), build=crossers.Crosser) as evaluate:
+    with open_evaluator(dataclasses.replace(CFG, workers="ray:3"), build=crossers.Crosser) as evaluate:
         for count in (1, 8, 21):
-            seen = []
-            assert same(evaluate(GENES[:count], SEEDS[:count], seen.append), expected(count))
-            assert seen == sorted(seen) and seen[-1] == 1.0
-        assert evaluate.status().retries == 0
-
-
-def test_lots_come_out_in_the_order_that_they_were_put_in(cluster):
-    with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
+            assert_crossed(evaluate(GENES[:count], SEEDS[:count]), slice(count))
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(GENES[:8], SEEDS[:8], interrupt)
         for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
             evaluate.put(GENES[lot], SEEDS[lot])
-        sizes = [len(evaluate.take().outcome) for _ in range(3)]
-    assert sizes == [5, 2, 14]
+        for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
+            assert_crossed(evaluate.take(), lot)
+        assert evaluate.status() == (3, 0)
 
 
-@pytest.mark.parametrize("how", ["die", "raise", "nan", "short", "nonsense"])
-def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, capsys, how):
+@pytest.mark.parametrize("how", ["die", "raise", "nan"])
+def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, how):
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:3")
     with open_evaluator(cfg, build=crossers.Failing) as evaluate:
         for _ in range(3):
-            assert same(evaluate(GENES, SEEDS), expected(21))
+            assert_crossed(evaluate(GENES, SEEDS), slice(21))
         assert evaluate.status().retries == 3
-    assert capsys.readouterr().err.count("crossed again") == 3
 
 
-@pytest.mark.parametrize(("how", "error"), [("refuse", ValueError), ("nan", EvaluatorError)])
-def test_terrains_that_fail_everywhere_end_the_evaluation(cluster, tmp_path, how, error):
+@pytest.mark.parametrize(("how", "error"), [("refuse", ValueError), ("nan", EvaluatorError), ("build", ValueError)])
+def test_what_fails_everywhere_ends_the_evaluation(cluster, tmp_path, how, error):
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:99")
-    with open_evaluator(cfg, build=crossers.Failing) as evaluate, pytest.raises(error, match=r"5 times|another kind"):
+    with pytest.raises(error), open_evaluator(cfg, build=crossers.Failing) as evaluate:
         evaluate(GENES[:8], SEEDS[:8])
-
-
-def test_a_refusal_to_build_comes_before_any_work_and_for_debugging_with_its_traceback(cluster, monkeypatch):
-    monkeypatch.setenv("FAULTLINE_DEBUG", "1")
-    with (
-        pytest.raises(ValueError, match=r"(?s)policy 'x' does not fit.*crossers\.py\", line \d+"),
-        open_evaluator(CFG, build=crossers.Refusing),
-    ):
-        pass
 
 
 def test_a_worker_of_other_code_is_refused(cluster, monkeypatch):
     monkeypatch.setattr("qd.workers.ray_workers.code_fingerprint", lambda rooms: "of this machine")
-    with pytest.raises(ValueError, match="other code"), open_evaluator(CFG, build=crossers.Crosser):
+    with pytest.raises(ValueError, match="code"), open_evaluator(CFG, build=crossers.Crosser):
         pass
-
-
-def test_what_an_interrupted_evaluation_had_under_way_is_of_no_later_one(cluster):
-    def interrupt(share: float) -> None:
-        raise KeyboardInterrupt
-
-    with open_evaluator(CFG, build=crossers.Crosser) as evaluate:
-        with pytest.raises(KeyboardInterrupt):
-            evaluate(GENES[:8], SEEDS[:8], interrupt)
-        part = slice(13, 21)
-        assert same(evaluate(GENES[part], SEEDS[part]), stand_in.evaluate(GENES[part], SEEDS[part], 4))
-
-
-def test_leaving_ends_the_workers(cluster):
-    with open_evaluator(CFG, build=crossers.Identified) as evaluate:
-        pids = set(evaluate(GENES[:2], SEEDS[:2]).final_position[..., 0].astype(int).ravel().tolist())
-    end = time.monotonic() + 20
-    while any(os.path.exists(f"/proc/{pid}") for pid in pids):
-        assert time.monotonic() < end, "a worker outlives its evaluator"
-        time.sleep(0.1)
-
-
-def test_devices_that_cannot_be_had(cluster, monkeypatch):
-    with pytest.raises(ValueError, match="device"):
-        resolve_device("cuda:1", "ray:2")
-    monkeypatch.setattr("qd.workers.ray_workers.num_devices", lambda device: 0)
-    with pytest.raises(ValueError, match="GPU"):
-        resolve_device("cuda", "ray")
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"penalties": np.ones((2, 4, 6))},
-        {"penalties": np.ones((3, 4, 5))},
-        {"penalties": np.full((3, 4, 6), -1.0)},
-        {"penalties": np.full((3, 4, 6), np.inf)},
-        {"outcome": np.full((3, 4), Outcome.INVALID, np.uint8)},  # without a reason
-        {"duration_s": np.zeros((3, 4), np.float32)},
-        {"physics_steps": 0},
-        {"reward": np.full((3, 4), np.nan)},
-        {"reward": np.zeros((3, 3))},
-    ],
-    ids=lambda changes: next(iter(changes)),
-)
-def test_a_result_that_cannot_be_true_is_known(changes):
-    assert flaw_of(expected(3), 3, 4) is None
-    assert flaw_of(dataclasses.replace(expected(3), **changes), 3, 4)
-
-
-def listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 class Node:
@@ -189,29 +109,44 @@ def children(pid: int) -> list[int]:
     return direct + [further for child in direct for further in children(child)]
 
 
+GROWING_RUN = """
+import sys, time
+from tests.qd import crossers
+from tests.qd.workers.test_ray_workers import CFG, GENES, SEEDS, open_evaluator, resolve_device
+resolve_device("cpu", "ray")
+with open_evaluator(CFG.__class__(**{**vars(CFG), "workers": "ray"}), build=crossers.Crosser) as evaluate:
+    for line in sys.stdin:  # how many workers to wait for
+        while True:
+            total = evaluate(GENES, SEEDS).penalties.sum()
+            if evaluate.status().workers == int(line):
+                break
+            time.sleep(0.1)
+        print("crossed", int(line), repr(float(total)), flush=True)
+"""
+
+
 def test_a_cluster_is_used_as_it_grows_and_shrinks():
     port = free_port()
     token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": uuid.uuid4().hex * 2}  # Ray's nodes ask each other for one
     nodes = [Node({**os.environ, **token}, "--head", f"--port={port}", "--include-dashboard=false")]
-    environment = {**os.environ, **token, "RAY_ADDRESS": f"127.0.0.1:{port}"}
-    total = repr(float(stand_in.evaluate(cluster_run.GENES, cluster_run.SEEDS, 4).penalties.sum()))
+    environment = {**os.environ, **token, "RAY_ADDRESS": f"127.0.0.1:{port}", "PYTHONPATH": str(ROOT)}
+    total = repr(float(stand_in.evaluate(GENES, SEEDS, 4).penalties.sum()))
     try:
         end = time.monotonic() + PATIENCE_S
-        while not listens(port):
-            assert time.monotonic() < end
+        while time.monotonic() < end:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
             time.sleep(0.1)
         run = subprocess.Popen(
-            [sys.executable, "-m", "tests.qd.cluster_run"], cwd=ROOT, env=environment, text=True,
+            [sys.executable, "-c", GROWING_RUN], cwd=ROOT, env=environment, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
 
         def ask(workers: int) -> list[str]:
             run.stdin.write(f"{workers}\n")
             run.stdin.flush()
-            for line in run.stdout:  # Ray says this and that in between
-                if line.startswith("found "):
-                    return line.split()[1:]
-            return []
+            return next((line.split()[1:] for line in run.stdout if line.startswith("crossed ")), [])
 
         assert ask(1) == ["1", total]
         nodes.append(Node({**os.environ, **token}, f"--address=127.0.0.1:{port}"))
@@ -219,8 +154,7 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
         nodes.pop().kill()
         assert ask(1) == ["1", total]
         _, errors = run.communicate(timeout=60)
-        assert run.returncode == 0, errors
-        assert "Traceback" not in errors
+        assert run.returncode == 0 and "Traceback" not in errors, errors
     finally:
         for node in nodes:
             node.kill()
@@ -229,5 +163,5 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
 def test_no_cluster_at_the_address_is_an_error(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{free_port()}")
     monkeypatch.setattr("ray.is_initialized", lambda: False)  # other tests have a Ray of their own
-    with pytest.raises(OSError, match=r"no Ray cluster at RAY_ADDRESS=127.0.0.1:\d+"):
+    with pytest.raises(OSError, match="RAY_ADDRESS"):
         resolve_device("cpu", "ray:2")
