@@ -3,12 +3,7 @@
 import dataclasses
 import json
 import os
-import signal
-import subprocess
-import sys
-import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -138,26 +133,20 @@ class Lost(Pipeline):
         yield self
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("groups", [2, 3])
-def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path, groups):
-    """Five emitters make groups of two and three, or of one, two and two; elites are sampled at times."""
-    whole = in_groups(tmp_path / "whole", groups)
+def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
+    """Five emitters make groups of one, two and two, which are put in ahead; elites are sampled at times."""
+    pipeline = Lost(99)
+    whole = in_groups(tmp_path / "whole", 3, open_evaluator=pipeline.opened)
+    assert pipeline.most == 3 and not pipeline.lots
     assert whole.iterations == 5 and len(whole) > 10
     expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
     # Lost within the second iteration, at the sample at its end, and within the third, of five.
-    for lots in (groups + 1, 2 * groups, 2 * groups + 2):
+    for lots in (4, 6, 8):
         path = tmp_path / f"lost-{lots}"
-        with pytest.raises(EvaluatorError, match="a worker process died"):
-            in_groups(path, groups, open_evaluator=Lost(lots).opened)
-        in_groups(path, groups)
+        with pytest.raises(EvaluatorError):
+            in_groups(path, 3, open_evaluator=Lost(lots).opened)
+        in_groups(path, 3)
         assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, lots
-
-
-def test_groups_are_put_in_ahead(tmp_path):
-    pipeline = Lost(99)
-    in_groups(tmp_path / "run", 3, open_evaluator=pipeline.opened)
-    assert pipeline.most == 3 and not pipeline.lots
 
 
 def never(cfg):
@@ -216,48 +205,6 @@ def test_an_interrupt_leaves_finished_iterations(tmp_path):
     run(path, iterations=3)
     run(tmp_path / "whole", iterations=3)
     assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
-
-
-SLOW_SEARCH = """
-import signal, sys, time
-from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from sim.files.command import run_command
-from tests.qd import searches, stand_in
-
-@contextmanager
-def slow(cfg):
-    def evaluate(genes, seeds):
-        time.sleep(0.3)
-        return stand_in.evaluate(genes, seeds)
-    yield stand_in.Stub(evaluate)
-
-@dataclass
-class Slow:
-    path: Path
-
-    def execute(self):
-        searches.run(self.path, iterations=500, open_evaluator=slow)
-
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
-sys.exit(run_command(Slow, sys.argv[1:], name="slow"))
-"""
-
-
-def test_ctrl_c_ends_without_a_traceback(tmp_path):
-    path = tmp_path / "run"
-    program = subprocess.Popen(
-        [sys.executable, "-c", SLOW_SEARCH, "--path", str(path)],
-        stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2], env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-    )  # fmt: skip
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not ((path / "metrics.jsonl").exists() and len(rows_of(path)) >= 2):
-        time.sleep(0.05)
-    program.send_signal(signal.SIGINT)
-    errors = program.communicate(timeout=60)[1]
-    assert program.returncode == 130
-    assert "Traceback" not in errors and f"--resume {path}" in errors
 
 
 def invalid_from(iteration, share):

@@ -36,7 +36,7 @@ def test_wide_has_as_many_episodes_and_small_fits_a_laptop():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("iterations", 0), ("replicas", -1), ("intervals", 0), ("intervals", 100), ("seed", -1), ("seed", 1.5)],
+    [("iterations", 0), ("intervals", 100), ("seed", 1.5)],
 )
 def test_values_out_of_range_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name} must"):
@@ -46,10 +46,8 @@ def test_values_out_of_range_are_named(name, value):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("emitters", 0), ("batch_size", 1), ("method", "ppo"), ("method", "cma_me+"), ("method", "cma_me+cma_me"),
-        ("learning_rate", 1.5), ("iso_sigma", -1.0), ("line_sigma", float("inf")), ("crossover_share", 1.5),
-        ("disagree_share", 0.9), ("training_steps", 0), ("restart_rule", 0), ("sigma0", 0.0), ("sigma0", float("nan")),
-        ("sigma0", 1e30),  # its square is no float32
+        ("emitters", 0), ("method", "ppo"), ("method", "cma_me+cma_me"), ("learning_rate", 1.5),
+        ("disagree_share", 0.9), ("sigma0", float("nan")), ("sigma0", 1e30),  # its square is no float32
     ],
 )  # fmt: skip
 def test_values_of_the_scheduler_out_of_range_are_named(name, value):
@@ -66,7 +64,7 @@ def test_settings_survive_json():
 
 @pytest.mark.parametrize(
     "change",
-    [{"scheduler": "wide"}, {"fitness": {}}, {"replicas": 0}, {"robot_sha256": None}, {"certified_by": []}],
+    [{"scheduler": "wide"}, {"fitness": {}}, {"certified_by": []}],
 )
 def test_settings_of_something_else_are_refused_by_name(change):
     settings = as_settings(preset("small", robot())) | change

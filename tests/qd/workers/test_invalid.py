@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Invalidity
-from qd.workers.invalid import AllInvalidError, invalid_iterations, invalid_reasons, invalid_words, tell_invalid
+from qd.workers.invalid import AllInvalidError, invalid_iterations, invalid_words, tell_invalid
 from tests.qd.stand_in import make_result
 
 FINE, ACTION, SPEED = Invalidity.NONE, Invalidity.ACTION, Invalidity.SPEED
@@ -14,12 +14,6 @@ def result_of(codes):
     result = make_result(np.ones((*np.shape(codes), 1)), invalid=np.array(codes) != FINE)
     result.invalidity[:] = codes
     return result
-
-
-def test_reasons_are_counted_the_most_frequent_first():
-    result = result_of([[ACTION, SPEED, FINE], [FINE, SPEED, SPEED]])
-    assert list(invalid_reasons(result).items()) == [("speed", 3), ("action", 1)]
-    assert invalid_reasons(result_of([[FINE]])) == {}
 
 
 def test_more_than_one_in_twenty_is_reported_with_the_remedy_of_the_most_frequent_reason():
