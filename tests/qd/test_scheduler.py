@@ -76,16 +76,6 @@ def test_an_invalid_terrain_is_never_an_elite():
     assert sorted(search.elites()["cell"].tolist()) == [6, 7, 8, 9, 10, 11]
 
 
-def test_cell_of_an_elite_is_the_cell_of_its_ratios():
-    search = make_search()
-    advance(search, 1, 10)
-    elites = search.elites()
-    assert len(elites["cell"]) > 5
-    assert np.array_equal(CELLS.cell_of(elites["ratios"]), elites["cell"])
-    assert (np.diff(elites["fitness"]) <= 0).all()
-    assert np.abs(elites["genes"]).max() <= 1.0
-
-
 @pytest.mark.parametrize("method", [*METHODS, *JOINED, "cma_mae+map_elites", "cma_mae+map_elites+surrogate"])
 def test_a_saved_search_goes_on_bit_for_bit(method, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut

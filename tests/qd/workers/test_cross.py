@@ -198,15 +198,6 @@ def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tm
     assert cross_all(StandIn(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
 
 
-def test_several_controllers_cross_by_name(tmp_path):
-    controllers = {"shipped": POLICY, "other": str(get_robot("cassie").policy_file)}
-    results = cross(controllers, GENES, SEEDS, robot="anymal", compute=TWO_WORKERS, replicas=20, cache=tmp_path,
-                    open_evaluator=StandIn())  # fmt: skip
-    assert results.keys() == controllers.keys()
-    for result in results.values():
-        assert_same(result, EXPECTED)
-
-
 def test_mujoco_c_gives_the_robots_penalties_and_is_stored_apart(tmp_path, monkeypatch):
     """Columns follow the robot's penalties, of which the records of MuJoCo C hold all six in their fixed order."""
     calls = []
