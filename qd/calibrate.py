@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from qd.run.directory import RUNS
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
-from qd.workers.shards import merged
+from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import identity
@@ -86,7 +86,7 @@ def calibrate(
                     label=f"hard-random terrains {done + 1:,} to {count:,}",
                 )
             )  # fmt: skip
-            result, done = merged(results, join=1), count
+            result, done = join_results(results, join=1), count
             if done < terrains:
                 sums = np.asarray(result.penalties)[~result.invalid].sum(axis=0).tolist()
                 if absent := [name for name, value in zip(result.penalty_names, sums, strict=True) if not value]:

@@ -93,7 +93,7 @@ class Evaluation:
         }
 
 
-def concatenated(evaluations: Sequence[Evaluation]) -> Evaluation:
+def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
     names = [field.name for field in fields(Evaluation)]
     return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})

@@ -28,7 +28,7 @@ from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fault_words, fres
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
 from qd.groups import families_of
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed
-from qd.run.settings import SearchCfg, as_settings, is_searched, own_policy
+from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
@@ -169,7 +169,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     if space is not None:
         load_space(space)  # one of a user's own, which the run's name then finds
     robot_cfg = robot_of(as_settings(cfg), robot, run)
-    controller = own_policy(run, cfg, robot_cfg) if policy is None else spec_of(policy, robot_cfg)
+    controller = find_policy(run, cfg, robot_cfg) if policy is None else spec_of(policy, robot_cfg)
     if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
     space_now = get_space(cfg.space, cfg.space_sha256).name  # where its code is now

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.faults import fresh_numbers
-from qd.fitness import Evaluation, concatenated, evaluation_of
+from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.judge import drawn_elites, fresh_values
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import ProgressBar, clock, plan
@@ -29,7 +29,7 @@ from qd.workers.evaluator import (
     origin_of,
 )
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
-from qd.workers.shards import merged
+from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.policy.spec import spec_of
@@ -124,17 +124,17 @@ def run_iterations(
             result = pipeline.take(bar.within(iteration, group, num_groups))
             refuse_all_invalid(result)
             evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
-            told_at = time.perf_counter()
+            emitters_began = time.perf_counter()
             scheduler.tell(evaluation, iteration, group)
             genes = scheduler.ask(group)
-            search_s += time.perf_counter() - told_at
+            search_s += time.perf_counter() - emitters_began
             if goes_ahead:
                 pipeline.put(genes, _group_seeds(cfg, scheduler, iteration + 1, group))
             results.append(result)
             evaluations.append(evaluation)
         num_under_way = num_groups if goes_ahead else 0
         archive = archive_of(cfg, scheduler, iteration)
-        row = metrics_row(archive, merged(results, join=1), concatenated(evaluations), iteration, search_s)
+        row = metrics_row(archive, join_results(results, join=1), join_evaluations(evaluations), iteration, search_s)
         if samples:
             row |= _sample_elites(cfg, archive, pipeline)
         ended = time.perf_counter()

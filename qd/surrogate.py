@@ -17,7 +17,7 @@ from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Networks, Training
 from qd.run.presets import SchedulerCfg
-from qd.variation import varied
+from qd.variation import vary_elites
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.spaces.base import TerrainSpace, clipped
@@ -271,7 +271,7 @@ class Surrogate:
         return torch.where(reached, cells, -1)
 
     def _vary(self, pool: Tensor, count: int, draw: torch.Generator) -> Tensor:
-        return varied(pool, count, self.cfg, self.space.genes_per_part, draw)
+        return vary_elites(pool, count, self.cfg, self.space.genes_per_part, draw)
 
     def __getstate__(self) -> dict[str, Any]:
         """Plain values and arrays; maps are made again."""

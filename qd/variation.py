@@ -6,7 +6,9 @@ from torch import Tensor
 from qd.run.presets import SchedulerCfg
 
 
-def varied(pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
+def vary_elites(
+    pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | None, draw: torch.Generator
+) -> Tensor:
     """Children beside the lines between elites (Vassiliades and Mouret 2018), clipped.
 
     A share of them takes each of its parts from a further elite with a chance of a half, where the space has parts.

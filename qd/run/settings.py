@@ -135,7 +135,7 @@ def suffix_of(cfg: SearchCfg, policy: str, robot: RobotCfg) -> str:
     return "" if is_searched(cfg, policy, robot) else label_suffix(policy)
 
 
-def own_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
+def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
     """The controller that a run was searched with, which must be what it was.
 
     Code runs only if the command line names it, so a controller that is code is refused here.

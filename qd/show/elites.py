@@ -11,7 +11,7 @@ from qd.archive import Archive, read_archive
 from qd.fitness import FitnessCfg
 from qd.minimise import MinimalFound, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
-from qd.run.settings import SearchCfg, own_policy, suffix_of
+from qd.run.settings import SearchCfg, find_policy, suffix_of
 from sim.files.command import chosen_elites
 from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
@@ -78,7 +78,7 @@ class Found:
         """The controller to cross with: the one given, or that of the search."""
         cfg = self.search()
         if given is None and cfg is not None:
-            return own_policy(self.run, cfg, self.robot)
+            return find_policy(self.run, cfg, self.robot)
         policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
         if given is None and searched not in (None, digest := controller_hash(policy)):
             raise ValueError(

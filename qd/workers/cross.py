@@ -30,8 +30,8 @@ from qd.workers.evaluator import (
     open_evaluator,
     parse_workers,
 )
-from qd.workers.invalid import tell_invalid
-from qd.workers.shards import merged
+from qd.workers.invalid import report_invalid
+from qd.workers.shards import join_results
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
@@ -80,8 +80,8 @@ class Cache:
         if not file.is_file():
             return None
         try:
-            wanted = [name for name in array_names(file) if names is None or name in (*names, _KEY)]
-            arrays = read_arrays(file, wanted)
+            stored = [name for name in array_names(file) if names is None or name in (*names, _KEY)]
+            arrays = read_arrays(file, stored)
             if str(arrays.pop(_KEY, "")) != key:
                 raise ValueError("it is another key's")
             self.touch(key)
@@ -270,7 +270,7 @@ class Crossings:
                 stored.write(terrains[numbers], seeds[numbers], result)
             parts.append((numbers, result))
         result = _in_order(parts)
-        tell_invalid(result, label or policy, all_ok=invalid_ok)
+        report_invalid(result, label or policy, all_ok=invalid_ok)
         return result
 
     def _stored_crossings(self, cfg: EvaluatorCfg, how: How) -> _Stored | None:
@@ -382,7 +382,7 @@ def _lot_size(cfg: EvaluatorCfg) -> int:
 def _in_order(parts: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> RolloutResult:
     """One result of parts that hold some of the terrains each."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
-    return take_terrains(merged([result for _, result in parts], join=1), order)
+    return take_terrains(join_results([result for _, result in parts], join=1), order)
 
 
 def take_terrains(result: RolloutResult, numbers: NDArray[np.intp]) -> RolloutResult:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
-from qd.workers.shards import merged
+from qd.workers.shards import join_results
 from sim.device import resolve_device as resolve_warp_device
 from sim.files.records import provenance
 from sim.policy.loaders import load_policy
@@ -105,12 +105,12 @@ class EvaluatorCfg:
     @property
     def envs_of_worker(self) -> int:
         """Robots of a worker, at least 4: by default so many that they seldom wait (results/anymal/speed.json)."""
-        wanted = self.num_envs
-        if wanted is None:
+        num_envs = self.num_envs
+        if num_envs is None:
             episodes = self.num_terrains * self.num_replicas
-            wanted = episodes if self.lots == 1 else int(_RUNNING_SHARE * episodes)
-            wanted = min(wanted, _MOST_ENVS[self.device.partition(":")[0]] * self.num_workers)
-        return max(_MIN_ROWS, -(-wanted // self.num_workers))
+            num_envs = episodes if self.lots == 1 else int(_RUNNING_SHARE * episodes)
+            num_envs = min(num_envs, _MOST_ENVS[self.device.partition(":")[0]] * self.num_workers)
+        return max(_MIN_ROWS, -(-num_envs // self.num_workers))
 
     @property
     def terrains_of_worker(self) -> int:
@@ -307,7 +307,7 @@ class Pipeline(ABC):
         """
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
-        return merged([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
+        return join_results([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
 
     def in_lots(
         self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
@@ -327,10 +327,10 @@ class Pipeline(ABC):
         if seeds.shape != (count,) or count == 0:
             raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
-        behind, num_taken = deque(lots), 0
+        behind, num_crossed = deque(lots), 0
 
         def put_what_fits() -> None:
-            while behind and (behind[0].stop - num_taken <= self.num_terrains or behind[0].start == num_taken):
+            while behind and (behind[0].stop - num_crossed <= self.num_terrains or behind[0].start == num_crossed):
                 lot = behind.popleft()
                 self.put(terrains[lot], seeds[lot])
 
@@ -339,7 +339,7 @@ class Pipeline(ABC):
             put_what_fits()
             share = (lot.stop - lot.start) / count
             result = self.take(None if progress is None else _share_of(progress, lot.start / count, share))
-            num_taken = lot.stop
+            num_crossed = lot.stop
             put_what_fits()  # before the result is looked at
             yield lot, result
 
@@ -400,7 +400,7 @@ class _Processes(Pipeline):
             if progress is not None:
                 progress(sum(shares.values()) / len(shares))
         self._lots.popleft()
-        return merged(list(parts.values()), join=0)
+        return join_results(list(parts.values()), join=0)
 
     def clear(self) -> None:
         """Waits for what is under way."""

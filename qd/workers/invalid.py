@@ -63,7 +63,7 @@ def refuse_all_invalid(result: RolloutResult) -> None:
         raise AllInvalidError(f"no episode is valid, expected some: {words}")
 
 
-def tell_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -> None:
+def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -> None:
     """Prints why episodes are invalid where over 5 % are, in a line that leaves progress bars whole.
 
     Args:

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from qd.workers.evaluator import EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
 from qd.workers.process import Crosser, EvaluatorError
-from qd.workers.shards import copied, flaw_of, merged
+from qd.workers.shards import copied, flaw_of, join_results
 from sim.files.command import debugging
 from sim.files.records import code_fingerprint
 from sim.ground import joined_name, split_name
@@ -99,8 +99,8 @@ class RayWorker:
             folder, cfg = Path(name), self._cfg
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
             if self._space is not None:
-                own = self._space.unpacked(folder / "space")
-                cfg = replace(cfg, space=joined_name(own, split_name(cfg.space)[1]))
+                code = self._space.unpacked(folder / "space")
+                cfg = replace(cfg, space=joined_name(code, split_name(cfg.space)[1]))
             cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
             self._crosser = self._build(cfg, num_terrains)
 
@@ -146,7 +146,7 @@ class RayWorkers(Pipeline):
         self._waiting: deque[_Shard] = deque()
         self._retries = self._failed_starts = 0
         self._grown_at, self._seen_at = -_GROW_EVERY_S, time.monotonic()  # when the cluster and a worker were looked at
-        self._taken_at = time.perf_counter()
+        self._result_at = time.perf_counter()
 
     def open(self) -> None:
         """Starts the workers and waits for them; once one is ready, no longer than a minute for the others."""
@@ -170,7 +170,7 @@ class RayWorkers(Pipeline):
         size = self._shard_size()
         lot = [_Shard(terrains[k : k + size], seeds[k : k + size]) for k in range(0, len(terrains), size)]
         if not self._lots:
-            self._taken_at = time.perf_counter()
+            self._result_at = time.perf_counter()
         self._lots.append(lot)
         self._waiting.extend(lot)
         self._deal()
@@ -186,8 +186,8 @@ class RayWorkers(Pipeline):
             progress(1.0)
         self._lots.popleft()
         now = time.perf_counter()
-        wall_s, self._taken_at = now - self._taken_at, now
-        return replace(merged([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
+        wall_s, self._result_at = now - self._result_at, now
+        return replace(join_results([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
 
     def _shard_size(self) -> int:
         """Terrains of a shard: fewer once the cluster has grown; never more, for which workers have no room."""

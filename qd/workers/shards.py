@@ -16,7 +16,7 @@ def copied(result: RolloutResult) -> RolloutResult:
     return replace(result, **{name: value.copy() for name, value in _arrays(result).items()})
 
 
-def merged(results: Sequence[RolloutResult], *, join: int) -> RolloutResult:
+def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResult:
     """Results side by side (``join`` 0: they ran at the same time) or one after the other (1)."""
     if len(results) == 1:
         return results[0]

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from qd.run.presets import SchedulerCfg
-from qd.variation import varied
+from qd.variation import vary_elites
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
@@ -12,7 +12,7 @@ LINE = (PAIR[1] - PAIR[0]).numpy()
 
 def children(pool: torch.Tensor, count: int = 400, genes_per_part: int | None = 8, **steps: float) -> np.ndarray:
     cfg = SchedulerCfg(**{"iso_sigma": 0.0, "line_sigma": 0.0, "crossover_share": 0.0, **steps})
-    return varied(pool, count, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
+    return vary_elites(pool, count, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
 
 
 def test_of_a_share_of_the_children_half_of_the_bumps_are_another_elites():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from qd.groups import elites_of, rank
 from qd.run.directory import ROUNDS_FILE
-from qd.run.settings import own_policy
+from qd.run.settings import find_policy
 from qd.show.crossed import crossed_of
 from qd.show.recordings import Cross, Recordings, on_elite
 from qd.show.report import elites, evaluation, minimal, search
@@ -89,7 +89,7 @@ def _why_not_crossed(material: Material, device: str) -> str:
     """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
     try:
         if material.named_policy is None and material.search is not None:
-            own_policy(material.run, material.search, material.robot)
+            find_policy(material.run, material.search, material.robot)
         check_policy(material.policy, material.robot, device)
     except ValueError as error:
         if material.named_policy is not None:

@@ -6,7 +6,7 @@ import pytest
 
 from qd.fitness import FitnessCfg
 from qd.run.presets import SchedulerCfg
-from qd.run.settings import as_settings, differences, from_settings, is_searched, own_policy, preset
+from qd.run.settings import as_settings, differences, find_policy, from_settings, is_searched, preset
 from sim.files.records import robot_digest
 from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
@@ -91,15 +91,15 @@ def test_robot_and_controller_are_part_of_the_settings(tmp_path):
     assert changed.policy_sha256 == controller_hash(other) and code.policy_sha256 is None
     assert is_searched(cfg, str(shipped), body) and not is_searched(cfg, str(other), body)
     assert is_searched(code, "module:callable", body) and not is_searched(code, "module:other", body)
-    assert own_policy(tmp_path, cfg, body) == str(shipped)
+    assert find_policy(tmp_path, cfg, body) == str(shipped)
     shipped.write_bytes(b"c")
     with pytest.raises(ValueError, match="another one now"):
-        own_policy(tmp_path, cfg, body)
+        find_policy(tmp_path, cfg, body)
     shipped.unlink()
     with pytest.raises(ValueError, match="lost"):
-        own_policy(tmp_path, cfg, body)
+        find_policy(tmp_path, cfg, body)
     with pytest.raises(ValueError, match="code"):
-        own_policy(tmp_path, code, body)
+        find_policy(tmp_path, code, body)
 
 
 def test_scales_follow_the_penalties_that_count():

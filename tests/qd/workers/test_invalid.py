@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Invalidity
-from qd.workers.invalid import AllInvalidError, invalid_iterations, invalid_words, tell_invalid
+from qd.workers.invalid import AllInvalidError, invalid_iterations, invalid_words, report_invalid
 from tests.qd.stand_in import make_result
 
 FINE, ACTION, SPEED = Invalidity.NONE, Invalidity.ACTION, Invalidity.SPEED
@@ -38,9 +38,9 @@ def test_of_a_searchs_iterations_those_with_many_are_summed():
 def test_nothing_but_invalid_episodes_is_an_error_unless_it_may_be(capsys):
     nothing = result_of([[ACTION, ACTION, SPEED]])
     with pytest.raises(AllInvalidError):
-        tell_invalid(nothing, "flat")
-    tell_invalid(nothing, "flat", all_ok=True)
-    tell_invalid(result_of([[ACTION, ACTION, FINE]]), "steep")
+        report_invalid(nothing, "flat")
+    report_invalid(nothing, "flat", all_ok=True)
+    report_invalid(result_of([[ACTION, ACTION, FINE]]), "steep")
     assert [line[:5] for line in capsys.readouterr().err.splitlines()] == ["flat:", "steep"]
-    tell_invalid(result_of([[FINE] * 3]), "flat")
+    report_invalid(result_of([[FINE] * 3]), "flat")
     assert capsys.readouterr().err == ""
