@@ -60,9 +60,6 @@ class Cells:
         num_ratios: Number of ratio descriptors, at least 2.
         intervals: Intervals that [0, 1] is divided into; 1.0 belongs to the last.
         collision_bit: Whether "at least one episode has a base collision" is a descriptor too.
-
-    Raises:
-        ValueError: If there are fewer than 2 ratios, no interval, or too many cells.
     """
 
     def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
@@ -89,9 +86,8 @@ class Cells:
         """The reachable interval tuples in lexicographic order, shape (num_tuples, num_ratios)."""
         tuples = np.zeros((1, 0), dtype=np.int64)
         for _ in range(self.num_ratios):
-            tuples = np.vstack(
-                [np.column_stack([tuples, np.full(len(tuples), index)]) for index in range(self.intervals)]
-            )
+            longer = [np.column_stack([tuples, np.full(len(tuples), index)]) for index in range(self.intervals)]
+            tuples = np.vstack(longer)
             tuples = tuples[tuples.sum(axis=1) < self.intervals]
         tuples = tuples[tuples.sum(axis=1) + self.num_ratios > self.intervals]
         return tuples[np.lexsort(tuples.T[::-1])]
@@ -114,9 +110,6 @@ class Cells:
 
         Returns:
             Indices of reachable cells, shape (batch,).
-
-        Raises:
-            ValueError: If the shape is another one, a row does not sum to 1, or ``collided`` is missing.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
         self._check_ratios(ratios)
@@ -151,9 +144,8 @@ class Cells:
         total = tuples.sum(axis=1)
         rows = np.flatnonzero(total >= self.intervals)  # every ratio on its lower edge: .2, .2, .2, .2, .2
         tuples[rows, ratios[rows].argmax(axis=1)] -= 1
-        rows = np.flatnonzero(
-            total + self.num_ratios <= self.intervals
-        )  # every ratio rounded to just below its upper edge
+        # Every ratio rounded to just below its upper edge.
+        rows = np.flatnonzero(total + self.num_ratios <= self.intervals)
         gap = (tuples[rows] + 1) / self.intervals - ratios[rows]
         tuples[rows, gap.argmin(axis=1)] += 1
         return tuples

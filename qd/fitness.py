@@ -129,9 +129,6 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
 
     Returns:
         The evaluation. An invalid terrain has fitness -20, equal ratios and otherwise zeros, never NaN.
-
-    Raises:
-        ValueError: If the rollout lacks a penalty of ``cfg``, or scales are not positive, one a penalty.
     """
     penalties = _scaled_penalties(result, cfg)
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)

@@ -14,7 +14,7 @@ from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.judge import drawn_elites, fresh_values
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
-from qd.run.progress import ProgressBar, clock, plan
+from qd.run.progress import ProgressBar, clock, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
 from qd.show.figures import summary, write_figures
@@ -79,7 +79,7 @@ def search(
         scheduler, metrics = begin(cfg) if saved is None else (Scheduler.from_state(saved[0]), saved[1])
         scheduler.compute_on(compute.device)
         done = len(metrics)
-        print(plan(cfg, path, done, compute.device, evaluator.num_workers), flush=True)
+        print(describe_search(cfg, path, done, compute.device, evaluator.num_workers), flush=True)
         if note := robot.scaled_by_another(policy):
             print(note)
         if done < cfg.iterations:
@@ -117,7 +117,7 @@ def run_iterations(
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
         for group in range(num_under_way, num_groups):
             pipeline.put(scheduler.ask(group), _group_seeds(cfg, scheduler, iteration, group))
-        samples = samples_elites(cfg, iteration)
+        samples = bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
         goes_ahead = iteration < cfg.iterations and not samples  # a sample is crossed with nothing else under way
         results, evaluations, search_s = [], [], 0.0
         for group in range(num_groups):
@@ -151,11 +151,6 @@ def run_iterations(
 def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:
     """Seeds of a group's terrains, which are those of their places in the iteration."""
     return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
-
-
-def samples_elites(cfg: SearchCfg, iteration: int) -> bool:
-    """Whether some elites cross fresh episodes at the end of an iteration."""
-    return bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
 
 
 def metrics_row(
@@ -250,11 +245,11 @@ def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:
 
 
 def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
-    """Writes what a search leaves to look at, and says what it is.
+    """Writes archive, figures and numbers of a search, and prints what it found.
 
     Args:
         run: The run directory, claimed.
-        archive: What was found.
+        archive: Elites of the search.
         metrics: One row an iteration.
     """
     config = run.read_config()

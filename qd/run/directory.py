@@ -47,9 +47,6 @@ def find_run(
         named: Run directory or archive file.
         published: Whether the robot's published archive is taken where there is no run under runs/, before these, or
             never. Of the runs it is the one whose archive changed last.
-
-    Raises:
-        FileNotFoundError: If there is none.
     """
     if named is not None:
         return named

@@ -1,4 +1,4 @@
-"""What a search tells its user: what it will do, how long that should take, and how far it is."""
+"""What a search says: what it will do, how long that should take, and how far it is."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from qd.run.settings import SearchCfg
 from qd.workers.invalid import WARNED_SHARE, reason_words
-from sim.policy.spec import SHIPPED
 
 _FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
 
@@ -22,24 +21,14 @@ def clock(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def plan(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
-    """What a search is about to do, in words, after ``done`` iterations, by so many processes or GPUs."""
+def describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
+    """What a search is about to do after ``done`` iterations, by so many processes or GPUs."""
     left = cfg.iterations - done
-    where = f"{workers} process{'es' * (workers > 1)} on the CPU"
-    if device.startswith("cuda"):
-        where = device if workers == 1 else f"{workers} GPUs"
-    controller = "its shipped controller" if cfg.policy == SHIPPED else f"controller {cfg.policy}"
-    if not left:
-        return f"All {done} iterations of {path} are done."
-    iterations = f"{left:,} iterations" + (f" after {done:,} done" if done else "")
-    return "\n".join(
-        [
-            f"Searching for terrains that break {cfg.robot} with {controller}, each in its own way.",
-            f"  preset {cfg.preset}, seed {cfg.seed}, space {cfg.space}: {iterations} of "
-            f"{cfg.scheduler.num_terrains} terrains x {cfg.replicas} episodes of up to 20 s",
-            f"  {left * cfg.episodes_per_iteration:,} episodes on {where}; kernels are compiled first, once a machine",
-            f"  {cfg.cells.num_cells:,} reachable cells of {len(cfg.fitness.penalties)} penalties; results in {path}",
-        ]
+    return (
+        f"{path}: {left:,} of {cfg.iterations:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
+        f"{cfg.replicas} episodes of {cfg.robot} with the {cfg.policy} controller on {cfg.space}\n"
+        f"  {left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
+        f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
     )
 
 
@@ -81,12 +70,7 @@ class ProgressBar(tqdm):
         return lambda share: self._move_to(iteration - 1 + (part + share) / parts)
 
     def show(self, row: dict[str, Any], workers: object = None) -> None:
-        """Shows where the search stands after an iteration.
-
-        Args:
-            row: The iteration's metrics.
-            workers: How the workers fare, where there are any.
-        """
+        """Shows where the search stands after an iteration, and how its workers fare if there are any."""
         self._move_to(row["iteration"])
         if row["iteration"] == self._first + 1:
             left = (self._iterations - row["iteration"]) * row["wall_s"]

@@ -75,8 +75,7 @@ class WorkerProcess:
         """The next message: ``ready``, ``progress`` or ``result``, and its value.
 
         Raises:
-            ValueError: If the worker refused its work.
-            EvaluatorError: If it failed otherwise, or is dead.
+            ValueError: If the worker refused its work; EvaluatorError if it failed otherwise, or is dead.
         """
         try:
             message, value = self.connection.recv()
