@@ -9,13 +9,11 @@ import torch
 from qd import surrogate as module
 from qd.descriptors import Cells
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
-from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.run.presets import SchedulerCfg
-from qd.scheduler import Scheduler
 from qd.surrogate import Surrogate
 from sim.corridor import corridor_heights
 from sim.spaces.base import clipped
-from sim.spaces.registry import get_space, load_space
+from sim.spaces.registry import load_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.sim.spaces.spaces import write_ridges
@@ -230,34 +228,3 @@ def test_the_newest_are_kept(monkeypatch):
         told = crossed(genes, seed)
         search.learn(genes, told)
     assert len(search) == 70
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("space", [get_space("course+friction")], ids=lambda space: space.name)
-def test_a_saved_search_in_groups_goes_on_bit_for_bit(space, tmp_path):
-    cfg = SchedulerCfg(
-        emitters=5, batch_size=8, groups=2, method="surrogate+cma_mae", training_steps=3, candidates=2, generations=2,
-        crossover_share=0.3,
-    )  # fmt: skip
-
-    def advance_groups(search, first, last):
-        for iteration in range(first, last + 1):
-            for group in range(2):
-                genes = search.ask(group)
-                search.tell(crossed(genes, 2 * iteration + group, space), iteration, group)
-                search.ask(group)
-
-    straight, cut = (Scheduler(cfg, cells=CELLS, seed=1, space=space) for _ in range(2))
-    advance_groups(straight, 1, 4)
-    advance_groups(cut, 1, 3)
-    save_checkpoint(tmp_path / "saved", cut.state())
-    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
-    assert len(cut.surrogate) == 3 * 40
-    assert (
-        sum(emitter.batch_size for emitter in cut.emitters if getattr(emitter, "surrogate", 0) is cut.surrogate) == 24
-    )
-    advance_groups(cut, 4, 4)
-    for name, rows in straight.elites().items():
-        assert np.array_equal(rows, cut.elites()[name]), name
-    for group in range(2):
-        assert np.array_equal(straight.ask(group), cut.ask(group))
