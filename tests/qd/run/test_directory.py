@@ -6,12 +6,19 @@ import pytest
 
 from qd.archive import write_archive
 from qd.run import directory
-from qd.run.directory import RunDirectory, claimed, find_run, folder_for, read_archive_of, search_seed
+from qd.run.directory import RunDirectory, claimed, find_run, folder_for, free_path, read_archive_of, search_seed
 from sim.robots.find import get_robot
 from tests.builders import small_archive
 from tests.qd.searches import CFG
 
 ORIGIN = {"command": "faultline archive", "commit": "c", "device": "CPU", "seed": 3}
+
+
+def test_a_run_without_a_name_gets_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "a-2", "a-3"):
+        assert free_path("a") == Path("runs") / name
+        free_path("a").mkdir(parents=True)
 
 
 def test_a_claimed_directory_that_stays_empty_goes_away(tmp_path):
