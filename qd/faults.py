@@ -6,6 +6,7 @@ certificate is not known to be passable.
 """
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,6 @@ def fault_numbers(
         "failing": None if archive.fresh is None else int(failing.sum()),
         **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
         "families": None if families is None else len(np.unique(families)),
-        "robust": None,
         "certifiers": list(names),
     }
     if faults is None or not failing.any():
@@ -163,12 +163,12 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     ]
     if not sentences:
         return []
-    by = [name for name, certifies in zip(faults.certifiers, faults.certificates()[number], strict=True) if certifies]
+    crossers = [*compress(faults.certifiers, faults.certificates()[number].tolist())]
     if not archive.failing[number]:
         sentences.append("It does not fail by its fresh episodes.")
-    elif by:
+    elif crossers:
         kind = "a fault" if archive.confirmed[number] else "certified but not confirmed"
-        crosses = f"{' and '.join(by)} cross{'es' * (len(by) == 1)}"
+        crosses = f"{' and '.join(crossers)} cross{'es' * (len(crossers) == 1)}"
         sentences.append(f"It is {kind}: a terrain that {crosses} and this controller does not.")
     else:
         confirmed = "" if archive.confirmed[number] else "not "

@@ -143,12 +143,7 @@ _FROM_FRESH = ("cell", "fitness", "ratios", "penalty_mean", "penalty_std", "epis
 
 
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
-    """The elites of an archive, in its order.
-
-    Args:
-        archive: The archive.
-        judged: Leaves out elites whose fresh episodes are invalid.
-    """
+    """The elites of an archive, in its order; ``judged`` leaves out those whose fresh episodes are invalid."""
     values = {name: np.asarray(getattr(archive, name)) for name in _FROM_FRESH}
     is_fresh, reproduced = np.zeros(len(archive), bool), np.ones(len(archive), bool)
     rows = np.arange(len(archive))
@@ -347,7 +342,7 @@ class Ranking:
         return np.array([*leading, *np.setdiff1d(severity, [*leading], assume_unique=True)], dtype=np.int64)
 
     def mode_of(self, place: int) -> Mode | None:
-        """The mode of the elite in a row; None of one that does not fail."""
+        """The mode of the elite in a row; None if it does not fail."""
         number = int(self.modes.labels[place])
         return self.modes.modes[number - 1] if number else None
 
@@ -361,13 +356,7 @@ class Ranking:
 
 
 def rank(archive: Archive, space: TerrainSpace, *, judged: bool = False) -> Ranking:
-    """The ranking of an archive that has elites.
-
-    Args:
-        archive: The archive.
-        space: What its genes mean.
-        judged: Leaves out elites whose fresh episodes are invalid.
-    """
+    """The ranking of an archive that has elites; ``judged`` leaves out those whose fresh episodes are invalid."""
     elites = elites_of(archive, judged=judged)
     families = families_of(archive.genes[elites.numbers], space)
     by_worst = [*dict.fromkeys(families[elites.by_severity()].tolist())]

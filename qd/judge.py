@@ -216,14 +216,16 @@ def confirm(
         crossings: What crosses terrains.
         how: The episodes begin alike.
     """
+    faults, label = archive.faults or FaultCounts.none_of(len(archive)), "contact resolved"
     if how == "mujoco_c":
-        order = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows]
+        order, label = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows], "MuJoCo C"
         rows = np.sort(rows[np.argsort(order, kind="stable")][:_MOST_IN_MUJOCO_C])
-    label = "contact resolved" if how == "resolved" else "MuJoCo C"
     counts = _cross(archive, rows, search, crossings, search.policy, how, _CONFIRM_STREAM, label)
-    faults = archive.faults or FaultCounts.none_of(len(archive))
-    column = f"{how}_outcomes"
-    return replace(archive, faults=replace(faults, **{column: _put(getattr(faults, column), rows, counts)}))
+    if how == "resolved":
+        faults = replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts))
+    else:
+        faults = replace(faults, mujoco_c_outcomes=_put(faults.mujoco_c_outcomes, rows, counts))
+    return replace(archive, faults=faults)
 
 
 def certify(

@@ -22,9 +22,9 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
         fallen_rate=np.array([0.0, 0.0, 0.5, 0.0, 0.1]),
         fitness=np.array([9.0, 5.0, 4.0, 3.0, 2.0]),
     )
-    found = elites_of(archive)
-    assert found.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
-    assert found.by_severity().tolist() == [4, 3, 2, 1, 0]
+    elites = elites_of(archive)
+    assert elites.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
+    assert elites.by_severity().tolist() == [4, 3, 2, 1, 0]
 
 
 def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():

@@ -108,11 +108,10 @@ def test_drawn_elites_are_some_of_them_each_once():
 
 
 def test_outcomes_are_counted_by_hand():
-    collided, invalid, late = np.eye(4, dtype=bool)[:3, None]
-    result = make_result(np.ones((1, 4, 6)), base_collision=collided, invalid=invalid, late=late)
-    assert outcome_counts(result).tolist() == [[1, 1, 1, 1]]
-    result = make_result(np.ones((1, 4, 6)), base_collision=collided | late)
-    assert outcome_counts(result).tolist() == [[2, 2, 0, 0]]
+    collided, invalid, late = np.zeros((3, 1, 10), bool)
+    collided[0, :2], invalid[0, 2:5], late[0, 5:9] = True, True, True
+    result = make_result(np.ones((1, 10, 6)), base_collision=collided, invalid=invalid, late=late)
+    assert outcome_counts(result).tolist() == [[1, 2, 4, 3]]
 
 
 def crosses(policy, resolved, genes):

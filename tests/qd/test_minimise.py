@@ -70,6 +70,10 @@ def test_minimal_terrains_from_end_to_end(path, elites):
     assert (path / "minimal.png").read_bytes().startswith(b"\x89PNG")
     stored = read_minimal(path, read_archive(path))
     assert list(stored.genes) == elites and np.array_equal(stored.genes[elites[0]], genes)
+    assert stored.chosen("all", path) == elites and stored.chosen(f"{elites[1]}", path) == elites[1:]
+    with pytest.raises(ValueError, match="999"):
+        stored.chosen(f"{elites[0]} 999", path)
+    assert all(part in stored.words(elites[0]) for part in ("1 of 8 parts", "0% (0 to 9%)", "rise", "13.5 cm"))
 
 
 def test_stopped_it_goes_on_and_results_of_several_calls_add_up(path, elites):

@@ -24,18 +24,6 @@ def run(tmp_path_factory):
     return run
 
 
-def test_they_are_chosen_by_the_numbers_of_their_elites(run, tmp_path):
-    minima = find_archive("anymal", run).minima()
-    first, second = minima.genes
-    assert minima.chosen("all", run) == [first, second] and minima.chosen(f"{second}", run) == [second]
-    with pytest.raises(ValueError, match="19"):
-        minima.chosen(f"{first} 19", run)
-    words = minima.words(first)
-    assert all(part in words for part in ("1 of 2 parts", "0% (0 to 9%)", "rise", "12.0 cm"))
-    with pytest.raises(FileNotFoundError, match="minimal"):
-        find_archive("anymal", make_run(tmp_path)).minima()
-
-
 def test_one_is_replayed(run, monkeypatch):
     archive, asked = find_archive("anymal", run), []
     first = next(iter(archive.minima().genes))
@@ -52,7 +40,7 @@ def test_one_is_replayed(run, monkeypatch):
     assert archive.minima().words(first) in describe(done)
 
 
-def test_they_are_exported_beside_whole_elites(run, tmp_path):
+def test_they_are_exported_and_listed_in_the_viewer(run, tmp_path):
     genes = find_archive("anymal", run).minima().genes
     Export(run=run, minimal="all", out=tmp_path, formats=("npz",)).execute()
     assert {file.name for file in tmp_path.glob("*.npz")} == {f"minimal-{number}.npz" for number in genes}
@@ -61,10 +49,6 @@ def test_they_are_exported_beside_whole_elites(run, tmp_path):
         np.testing.assert_array_equal(content["genes"], genes[number])
     about = json.loads((tmp_path / f"minimal-{number}.json").read_text())
     assert about["elite"] == number and about["minimal"]["cause"]["kind"] == "rise"
-
-
-def test_the_viewer_lists_them(run):
-    numbers = list(find_archive("anymal", run).minima().genes)
-    show = find_show(run, minimal=str(numbers[1]), policies=("base=shipped",))
-    assert show.elite == numbers[1] and f"{MINIMAL} (2)" in show.axes.kinds()
-    assert set(show.axes.listed(Choice(ranges={}, kind=MINIMAL)).tolist()) == set(numbers)
+    show = find_show(run, minimal=str(number), policies=("base=shipped",))
+    assert show.elite == number and f"{MINIMAL} (2)" in show.axes.kinds()
+    assert set(show.axes.listed(Choice(ranges={}, kind=MINIMAL)).tolist()) == set(genes)
