@@ -38,7 +38,9 @@ def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():
     assert sorted(order.tolist()) == list(range(20))
     assert ranking.leaders() == [6, 1] and ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6
     assert kinds[order[:2]].tolist() == [1, 0]
-    assert ranking.families[[0, 6, 7]].tolist() == [1, 1, 1]  # of the worst
+    assert ranking.families[[0, 6, 7]].tolist() == [1, 1, 1]
+    by_worst = ranking.families[ranking.order("fault")].tolist()
+    assert [*dict.fromkeys(by_worst)] == [*range(1, 1 + len(set(by_worst)))]
     count = len(set(ranking.families[:15]))
     assert len(set(ranking.families[order[:count]])) == count  # other families come first
     assert set(order[15:].tolist()) == set(range(15, 20))
