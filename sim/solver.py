@@ -195,7 +195,6 @@ class TheirDynamics:
     """The same by mujoco_warp's own step, of any model."""
 
     def __init__(self, m: Any, d: Any) -> None:
-        """For any model."""
         self._model, self._data = m, d
 
     def find(self) -> None:

@@ -3,7 +3,7 @@
 A mesh is covered by balls that touch its convex hull from inside.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -65,12 +65,9 @@ class HullProbes:
 class _Hull:
     """A convex hull as the half spaces ``normal . x <= offset``."""
 
-    triangles: _Array
-    """Corners, shape (num_triangles, 3, 3) [m]."""
-    normal: _Array
-    """Outward unit normals, shape (num_planes, 3)."""
-    offset: _Array
-    """Distances from the origin [m], shape (num_planes,)."""
+    triangles: _Array  # corners, shape (num_triangles, 3, 3) [m]
+    normal: _Array  # outward, of length 1, shape (num_planes, 3)
+    offset: _Array  # shape (num_planes,) [m]
 
     def inradius(self) -> float:
         """Radius of the largest ball about the middle of the hull's volume [m]."""
@@ -106,10 +103,7 @@ def _surface_samples(triangles: _Array, spacing: float) -> _Array:
 
 
 def _ball_at(point: _Array, hull: _Hull, radii: _Array, most: float) -> tuple[_Array, float]:
-    """The largest inscribed ball of one of the falling ``radii`` that comes as near to a surface point as ``most``.
-
-    Its centre lies on the way inward from the point, as far in as a ball of that radius needs.
-    """
+    """The largest inscribed ball of one of the falling ``radii`` that comes as near to a surface point as ``most``."""
     clearance = hull.offset - hull.normal @ point
     touching = clearance < 0.25 * most
     inward = -hull.normal[touching].sum(axis=0)
@@ -148,10 +142,7 @@ def _cover(hull: _Hull, tolerance: float) -> tuple[_Array, _Array] | None:
 
 
 def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
-    """Balls in rows: of one radius, in order along the longest side, and left and right apart where that is wide.
-
-    Contacts are made of the ends and the deepest of a row, so rows bound their number.
-    """
+    """Balls in rows of one radius along the longest side: contacts are made of a row's ends and its deepest ball."""
     middle = corners.mean(axis=0)
     _, _, axes = np.linalg.svd(corners - middle, full_matrices=False)
     along, across = (centres - middle) @ axes[0], (centres - middle) @ axes[1]
@@ -202,7 +193,6 @@ MAX_EDGE_RADIUS = 0.02
 MAX_SIDE = 10.0
 """Longest side of a shape [m]; a longer one is in other units."""
 _MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
-_NUM_SIZES = {newton.GeoType.SPHERE: 1, newton.GeoType.CAPSULE: 2, newton.GeoType.CYLINDER: 2, newton.GeoType.BOX: 3}
 
 
 def max_spacing(radius: float, sag: float = MAX_SAG) -> float:
@@ -266,6 +256,15 @@ def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
     return strips
 
 
+_PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., list[Strip]]]] = {
+    newton.GeoType.SPHERE: (1, lambda radius: [Strip(centres=np.zeros((1, 3)), radius=radius)]),
+    newton.GeoType.CAPSULE: (2, capsule_strips),
+    newton.GeoType.CYLINDER: (2, cylinder_strips),
+    newton.GeoType.BOX: (3, lambda *half: box_strips(half)),
+}
+"""How many sizes a primitive has, and its strips."""
+
+
 def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
     """Strips of one collision shape, in the shape's frame.
 
@@ -275,7 +274,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
             factors along x, y and z.
         mesh: Newton's mesh, which collides as its convex hull.
     """
-    sizes = np.asarray(scale, dtype=np.float64)[: _NUM_SIZES.get(shape_type, 0)]
+    num_sizes, make_strips = _PRIMITIVES.get(shape_type, (0, None))
+    sizes = np.asarray(scale, dtype=np.float64)[:num_sizes]
     vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale if shape_type in _MESHES else np.zeros((1, 3))
     if not (np.isfinite(vertices).all() and (sizes > 0.0).all()):
         raise ValueError(f"its sizes must be positive numbers, got {', '.join(f'{size:g}' for size in sizes)} m")
@@ -285,14 +285,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
             f"it is {longest:g} m long, at most {MAX_SIDE:g} m are taken: lengths are in metres, and a mesh in "
             "millimetres has a scale"
         )
-    if shape_type == newton.GeoType.SPHERE:
-        return [Strip(centres=np.zeros((1, 3)), radius=float(scale[0]))]
-    if shape_type == newton.GeoType.CAPSULE:
-        return capsule_strips(float(scale[0]), float(scale[1]))
-    if shape_type == newton.GeoType.BOX:
-        return box_strips((float(scale[0]), float(scale[1]), float(scale[2])))
-    if shape_type == newton.GeoType.CYLINDER:
-        return cylinder_strips(float(scale[0]), float(scale[1]))
+    if make_strips is not None:
+        return make_strips(*map(float, sizes))
     if shape_type in _MESHES:
         return list(hull_probes(vertices).strips)
     raise ValueError(

@@ -125,7 +125,6 @@ class Skeleton:
     """A robot's bodies; the world is none of them."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        """Read the robot's file."""
         self._model = model = robot_model(robot_spec(robot), robot)
         self.num_coordinates = _FREE_COORDINATES + robot.num_joints
         """Columns of ``qpos``."""

@@ -104,11 +104,7 @@ def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
 
 
 def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArray[np.float64]]:
-    """Most contacts a robot on average, most rows of one, whether a buffer overflowed, and forces on the first robot.
-
-    The forces are the vertical ones on each geom with a role in the physics steps of the last half second [N], shape
-    (num_steps, num_geoms). One that changes from step to step would look steady in every fourth.
-    """
+    """Most contacts a robot, most rows, overflow, and the first robot's vertical forces in the last steps [N]."""
     start = sim.joint_q.numpy().copy()
 
     def launch() -> None:

@@ -51,16 +51,6 @@ def test_torque_is_the_pd_law_and_clamped(eight, robot):
     assert not torque[:, :6].any()  # nothing drives the base
 
 
-def test_free_fall(eight, robot):
-    # v = g t after one step, for the base's mass centre; the air holds no contact.
-    flatten(eight)
-    put(eight, standing(robot, 8, z=3.0))
-    step(eight)
-    np.testing.assert_allclose(velocities(eight)[:, :3], [[0, 0, -9.81 * 0.005]] * 8, atol=1e-4)
-    assert eight.contact_count.numpy()[0] == 0
-    assert not eight.geom_force.numpy().any()
-
-
 @ONLY_ANYMAL
 def test_forces_are_on_the_geoms_that_touch(eight, eight_stepper, anymal):
     # A robot lying on its right side on flat ground: what is clear of the ground has no force.

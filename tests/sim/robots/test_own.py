@@ -18,6 +18,7 @@ from sim.robots.model import build_robot, geom_names, joint_names
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
+from sim.robots.skeleton import Skeleton
 from sim.simulation import Simulation
 from tests.kernels import oracle
 from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
@@ -153,10 +154,11 @@ def test_effort_is_the_settings_or_the_urdfs(tmp_path):
         get_robot(str(file))
 
 
-def test_geoms_without_a_name_are_called_by_their_body(tmp_path):
+def test_geoms_without_a_name_are_called_by_their_body_and_shown_so(tmp_path):
     file = write_dog(tmp_path, model=re.sub(r'name="\w+_thigh" (?=type)', "", mjcf()))
     replace_once(file, '("thigh", "shank")', '("thigh_geom_0", "shank")')
-    assert "HR_thigh_geom_0" in geom_names(build_robot(get_robot(str(file))))
+    dog = get_robot(str(file))
+    assert "HR_thigh_geom_0" in geom_names(build_robot(dog)) and Skeleton(dog).geom("HR_thigh_geom_0")
 
 
 def test_the_digest_tells_models_apart(tmp_path):
@@ -164,7 +166,8 @@ def test_the_digest_tells_models_apart(tmp_path):
     drives, model, mesh = file.with_name("drives.xml"), file.with_name("dog.xml"), tmp_path / "dog/meshes/trunk.stl"
     body, _, actuators = model.read_text().partition("<actuator>")
     drives.write_text("<mujoco><actuator>" + actuators)
-    model.write_text(body + '<include file="drives.xml"/></mujoco>')
+    file.with_name("parts.xml").write_text('<mujoco><include file="drives.xml"/></mujoco>')
+    model.write_text(body + '<include file="parts.xml"/></mujoco>')
     first = robot_digest(get_robot(str(file)))
     shutil.copytree(tmp_path / "dog", tmp_path / "elsewhere" / "dog")
     digests = {first}
@@ -187,7 +190,8 @@ def test_the_digest_tells_models_apart(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_robot_travels_with_its_files(tmp_path, kind):
+def test_a_robot_travels_with_its_files(tmp_path, anymal, kind):
+    assert pack_robot(anymal) == "anymal"
     robot = get_robot(str(with_mesh(tmp_path / "here", kind)))
     assert len(read_model_files(robot.model_file).files) == 2
     packed, digest = pickle.loads(pickle.dumps(pack_robot(robot))), robot_digest(robot)
@@ -196,12 +200,12 @@ def test_a_robot_travels_with_its_files(tmp_path, kind):
     unpacked = packed.unpacked(tmp_path / "there")
     assert unpacked == dataclasses.replace(robot, model_file=unpacked.model_file)
     assert tmp_path / "there" in unpacked.model_file.parents
-    assert sum(build_robot(unpacked).body_mass) == pytest.approx(MASS)
-    assert robot_digest(unpacked) == digest
-
-
-def test_a_shipped_robot_travels_by_name(anymal):
-    assert pack_robot(anymal) == "anymal"
+    builder = build_robot(unpacked)
+    assert sum(builder.body_mass) == pytest.approx(MASS) and robot_digest(unpacked) == digest
+    trunk = geom_names(builder).index("trunk")
+    assert builder.shape_type[trunk] == newton.GeoType.MESH
+    positions, radii = probes_of(builder, trunk)
+    np.testing.assert_allclose((np.abs(positions) + radii[:, None]).max(axis=0), TRUNK, atol=0.01)
 
 
 def test_the_model_is_what_the_file_says(dog):
@@ -273,15 +277,6 @@ def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
     pose = builder.shape_transform[geom_names(builder).index("trunk")]
     np.testing.assert_allclose(pose[:3], [0, 0, 0.05], atol=1e-6)
     np.testing.assert_allclose(oracle.rotation_matrix(np.array(pose[3:]))[:, 0], [0, 1, 0], atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_mesh_of_a_file_is_read(tmp_path, kind):
-    builder = build_robot(get_robot(str(with_mesh(tmp_path, kind))))
-    trunk = geom_names(builder).index("trunk")
-    assert builder.shape_type[trunk] == newton.GeoType.MESH
-    positions, radii = probes_of(builder, trunk)
-    np.testing.assert_allclose((np.abs(positions) + radii[:, None]).max(axis=0), TRUNK, atol=0.01)
 
 
 @pytest.mark.parametrize(

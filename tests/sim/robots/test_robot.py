@@ -127,7 +127,6 @@ def test_what_is_asked_of_each_robot(anymal, cassie):
     assert anymal.penalties == ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
     assert cassie.penalties == anymal.penalties[:-1]
     assert (anymal.collision_bit, cassie.collision_bit) == (False, True)
-    assert (anymal.contact_force_limit, cassie.contact_force_limit) == (500.0, 300.0)
     # 12 + 3 * 12 + 17 * 11 = 235 observations, with 11 x 11 points 169; 4 * 0.005 s = 50 Hz.
     assert (anymal.observation_size, cassie.observation_size) == (235, 169)
     assert anymal.control_dt == cassie.control_dt == pytest.approx(0.02)

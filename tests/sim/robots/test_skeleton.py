@@ -1,7 +1,6 @@
 """What is shown of a robot stands where MuJoCo and the simulation have it, under the simulation's names."""
 
 import dataclasses
-import re
 
 import mujoco
 import newton
@@ -13,7 +12,7 @@ from sim.robots.find import get_robot
 from sim.robots.model import build_robot, geom_names
 from sim.robots.skeleton import Skeleton
 from tests.kernels import oracle
-from tests.sim.dogs import KINDS, mjcf, with_mesh, write_dog
+from tests.sim.dogs import KINDS, with_mesh, write_dog
 
 
 @pytest.fixture(scope="module")
@@ -62,20 +61,10 @@ def test_shapes_have_names_and_coordinates_a_shape(robot, skeleton):
         skeleton.body_poses(np.zeros((2, 7)))
 
 
-def dog_of(kind, folder):
-    if kind == "urdf with a mesh":
-        return get_robot(str(with_mesh(folder, "urdf")))
-    if kind != "unnamed":
-        return get_robot(str(write_dog(folder, **KINDS[kind])))
-    file = write_dog(folder, model=re.sub(r'name="\w+_thigh" (?=type)', "", mjcf()))
-    file.write_text(file.read_text().replace('("thigh", "shank")', '("thigh_geom_0", "shank")'))
-    return get_robot(str(file))
-
-
-@pytest.mark.parametrize("kind", [*KINDS, "unnamed", "urdf with a mesh"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
     """Limbs and feet, by their names in the simulation's own model, in poses of every joint."""
-    dog = dog_of(kind, tmp_path)
+    dog = get_robot(str(with_mesh(tmp_path, kind)))
     skeleton, rows, builder = Skeleton(dog), random_coordinates(dog, 3), build_robot(dog)
     positions, quaternions = skeleton.body_poses(rows)
     names = geom_names(builder)

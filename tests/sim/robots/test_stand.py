@@ -46,12 +46,6 @@ def test_what_has_to_be_mended_is_named(tmp_path, device, change, parts):
     assert not fine and all(part in mended for part in parts)
 
 
-def test_softer_contact_stops_feet_that_bounce(tmp_path, device):
-    dog = get_robot(str(write_dog(tmp_path, **KINDS["urdf"])))
-    bare = dataclasses.replace(dog, armature=(0.0,) * 8, contact_time_constant_s=0.03)
-    assert describe_standing(bare, stand(bare, device=device, drops=1))[1]
-
-
 def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     standing = stand(cassie, device=device, drops=1)
     assert not standing.stands and "pelvis" in standing.carried and describe_standing(cassie, standing)[1]
