@@ -31,14 +31,9 @@ class TerrainBank:
         ncol: int = NUM_COLS,
         with_ground: bool = False,
     ) -> None:
-        """Make flat terrains.
+        """Make flat terrains of ``nrow`` nodes along y and ``ncol`` along x.
 
-        Args:
-            num_terrains: Number of grids.
-            device: Warp device name.
-            nrow: Nodes along y.
-            ncol: Nodes along x.
-            with_ground: Whether they have maps of friction and softness, which contacts then pay for.
+        With ``with_ground`` they have maps of friction and softness, which contacts then pay for.
         """
         if num_terrains < 1 or nrow < 2 or ncol < 2:
             raise ValueError(f"a bank needs at least 1 terrain of 2 x 2 nodes, got {num_terrains} of {nrow} x {ncol}")

@@ -86,14 +86,10 @@ class Course(TerrainSpace):
         return genes
 
     def elements(self, genes: ArrayLike) -> NDArray[Any]:
-        """The elements as they lie, records of :class:`kernels.course.Element` of shape (num_terrains, 6).
-
-        Args:
-            genes: Shape (num_terrains, 36).
-        """
+        """The elements of genes as they lie, records of :class:`kernels.course.Element`, shape (num_terrains, 6)."""
         with wp.ScopedDevice(host_device()):
-            found: Any = course.lay_out(wp.array(self.validate(genes), dtype=float)).numpy()
-        return found.copy()
+            records: Any = course.lay_out(wp.array(self.validate(genes), dtype=float)).numpy()
+        return records.copy()
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each element in words, six of them."""
@@ -101,27 +97,27 @@ class Course(TerrainSpace):
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes with flat ground as long as some elements in their place; the others stay where they are."""
-        found = self.validate(genes).copy()
-        cells = self.elements(found)["cells"]
+        changed = self.validate(genes).copy()
+        cells = self.elements(changed)["cells"]
         (_, flat, *_) = PARAMETERS[Kind.FLAT]
-        rows = found.reshape(len(found), MAX_ELEMENTS, GENES_PER_ELEMENT)
+        rows = changed.reshape(len(changed), MAX_ELEMENTS, GENES_PER_ELEMENT)
         for part in parts:
             rows[:, part, _KIND] = _middle_of(Kind.FLAT, len(Kind))
             rows[:, part, _LENGTH] = _middle_of(cells[:, part] - flat.low, flat.high - flat.low + 1)
-        return clipped(found)
+        return clipped(changed)
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32]:
         """Genes with the size of every element times ``scale``, or the least that its kind has."""
-        found = clipped(self.validate(genes))
-        kinds = self.elements(found)["kind"]
-        rows = found.reshape(len(found), MAX_ELEMENTS, GENES_PER_ELEMENT)
+        changed = clipped(self.validate(genes))
+        kinds = self.elements(changed)["kind"]
+        rows = changed.reshape(len(changed), MAX_ELEMENTS, GENES_PER_ELEMENT)
         for kind, (size, *_) in PARAMETERS.items():
             of_kind = kinds == kind
             if size.high > size.low:
                 metres = size.low + (rows[of_kind, _SIZE] + 1.0) / 2.0 * (size.high - size.low)
                 share = (np.maximum(metres * scale, size.low) - size.low) / (size.high - size.low)
                 rows[of_kind, _SIZE] = 2.0 * share - 1.0
-        return found
+        return changed
 
     def describe(self, genes: ArrayLike) -> str:
         """The elements in words, in the order of the way, without flat ground."""
@@ -129,10 +125,10 @@ class Course(TerrainSpace):
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Each element but flat ground in words, with where it begins and ends [m]."""
-        (found,) = self.elements(np.asarray(genes)[None])
+        (elements,) = self.elements(np.asarray(genes)[None])
         return tuple(
             (_in_words(element), SPACING * element["first"], SPACING * (element["first"] + element["cells"]))
-            for element in found
+            for element in elements
             if element["kind"] != Kind.FLAT
         )
 

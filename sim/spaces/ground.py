@@ -109,21 +109,21 @@ class OnGround(TerrainSpace):
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes without some parts: a patch without friction or softness of its own is as ground always is."""
-        found = self.validate(genes).copy()
+        changed = self.validate(genes).copy()
         first = self.inner.num_genes
-        if len(found):
-            count = len(self.inner.parts(found[0, :first]))
-            found[:, :first] = self.inner.without(found[:, :first], [part for part in parts if part < count])
+        if len(changed):
+            count = len(self.inner.parts(changed[0, :first]))
+            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
             for part in parts:
                 if part >= count:
-                    found[:, first + part - count] = ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
-        return found
+                    changed[:, first + part - count] = ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
+        return changed
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
         """Genes with heights scaled by the space; the ground stays as it is."""
-        found, first = clipped(self.validate(genes)), self.inner.num_genes
-        heights = self.inner.scaled(found[:, :first], scale)
-        return None if heights is None else np.concatenate([heights, found[:, first:]], axis=1)
+        rows, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(rows[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
 
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
