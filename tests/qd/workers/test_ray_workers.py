@@ -52,6 +52,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
             assert_crossed(evaluate(GENES[:count], SEEDS[:count]), slice(count))
         with pytest.raises(KeyboardInterrupt):
             evaluate(GENES[:8], SEEDS[:8], interrupt)
+        evaluate.clear()
         for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
             evaluate.put(GENES[lot], SEEDS[lot])
         for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
