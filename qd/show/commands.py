@@ -41,14 +41,14 @@ class Replay(Who, OnDevice, Which):
 
     def execute(self) -> None:
         """Prints the numbers and writes the figure."""
-        from qd.show.elites import find_archive
+        from qd.show.elites import open_run
         from qd.show.replay import replay
         from qd.workers.evaluator import resolve_device
 
-        found = find_archive(self.robot, self.run, space=self.space)
+        opened_run = open_run(self.robot, self.run, space=self.space)
         replay(
-            found, found.terrain(self.elite, self.minimal), policy=self.policy, replicas=self.replicas, seed=self.seed,
-            device=resolve_device(self.device), out=self.out,
+            opened_run, opened_run.terrain(self.elite, self.minimal), policy=self.policy, replicas=self.replicas,
+            seed=self.seed, device=resolve_device(self.device), out=self.out,
         )  # fmt: skip
 
 
@@ -77,7 +77,7 @@ class Film(Who, OnDevice, Which, Mapped):
     def execute(self) -> None:
         """Makes the films."""
         from qd.show.cross import read_own_terrain
-        from qd.show.elites import find_archive
+        from qd.show.elites import open_run
         from qd.show.film import RECORDING, film_elites, film_map, film_recording
         from qd.workers.evaluator import resolve_device
         from sim.robots.find import get_robot
@@ -93,8 +93,8 @@ class Film(Who, OnDevice, Which, Mapped):
             terrain = read_own_terrain(self.terrain, self.size, self.scale, self.offset)
             film_map(terrain, get_robot(self.robot or "anymal"), self.look, **crossing)
             return
-        found = find_archive(self.robot, self.run, space=self.space)
-        film_elites(found, found.terrains(self.elite, self.minimal), self.look, **crossing)
+        opened_run = open_run(self.robot, self.run, space=self.space)
+        film_elites(opened_run, opened_run.terrains(self.elite, self.minimal), self.look, **crossing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +183,7 @@ class Export(Who, Which):
 
     def execute(self) -> None:
         """Writes the files."""
-        from qd.show.elites import find_archive
+        from qd.show.elites import open_run
         from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
         from sim.files.command import split_words
         from sim.robots.find import get_robot
@@ -201,8 +201,8 @@ class Export(Who, Which):
                 raise ValueError("a pack has its own terrains: leave --run, --space and --minimal out")
             source = source_of_pack(self.from_pack, self.elite, self.robot)
         else:
-            found = find_archive(self.robot, self.run, space=self.space)
-            source = source_of_archive(found, self.elite, self.minimal)
+            opened_run = open_run(self.robot, self.run, space=self.space)
+            source = source_of_archive(opened_run, self.elite, self.minimal)
         export_terrains(source, formats=split_words(self.formats), out=self.out, overwrite=self.overwrite)
 
     def _make_pack(self) -> None:

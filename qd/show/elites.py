@@ -38,10 +38,10 @@ class Terrain(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class OpenedRun:
     """An archive, its robot, and the search that made it."""
 
-    run: Path
+    path: Path
     """What was given: a run directory or an archive file."""
     archive: Archive
     robot: RobotCfg
@@ -49,7 +49,7 @@ class Found:
     @property
     def folder(self) -> Path:
         """The directory."""
-        return directory_of(self.run)
+        return directory_of(self.path)
 
     @property
     def space(self) -> TerrainSpace:
@@ -78,11 +78,11 @@ class Found:
         """The controller to cross with: the one given, or that of the search."""
         cfg = self.search()
         if given is None and cfg is not None:
-            return find_policy(self.run, cfg, self.robot)
+            return find_policy(self.path, cfg, self.robot)
         policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
         if given is None and searched not in (None, digest := controller_hash(policy)):
             raise ValueError(
-                f"{self.run} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
+                f"{self.path} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
                 f"{digest}): say with --policy which one to cross with"
             )
         return policy
@@ -100,13 +100,13 @@ class Found:
 
     def output(self, stem: str, policy: str | None = None) -> Path:
         """Where a file about a terrain goes, without its ending: into the run, or for a published one under runs/."""
-        return folder_for(self.run, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
+        return folder_for(self.path, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
 
     def minima(self) -> MinimalFound:
         """The minimal terrains of its elites."""
         minima = read_minimal(self.folder, self.archive)
         if minima is None:
-            raise FileNotFoundError(f"{self.run} has no minimal terrains: make them with `faultline minimise`")
+            raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
         return minima
 
     def terrains(self, elite: str = "0", minimal: str | None = None) -> list[Terrain]:
@@ -118,7 +118,7 @@ class Found:
         """
         archive, whole = self.archive, f"of {len(self.archive):,} of {self.archive.robot}"
         if minimal is None:
-            numbers = chosen_elites(elite, len(archive), self.run)
+            numbers = chosen_elites(elite, len(archive), self.path)
             return [Terrain(n, archive.genes[n], f"elite-{n}", f"elite {n} {whole}") for n in numbers]
         minima = self.minima()
         return [
@@ -126,7 +126,7 @@ class Found:
                 n, minima.genes[n], f"minimal-{n}", f"minimal terrain of elite {n} {whole}", minima.entry(n),
                 minima.words(n),
             )
-            for n in minima.chosen(minimal, self.run)
+            for n in minima.chosen(minimal, self.path)
         ]  # fmt: skip
 
     def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
@@ -137,7 +137,7 @@ class Found:
         return terrains[0]
 
 
-def find_archive(named: str | None, run: Path | None = None, *, space: str | None = None) -> Found:
+def open_run(named: str | None, run: Path | None = None, *, space: str | None = None) -> OpenedRun:
     """The archive of a run; without one the robot's newest under runs/, else its published one.
 
     Args:
@@ -155,4 +155,4 @@ def find_archive(named: str | None, run: Path | None = None, *, space: str | Non
             f"{run} was searched by penalties that robot {robot.name} does not have: {', '.join(unknown)}; expected "
             f"some of {', '.join(robot.penalties)}: give the settings that it was searched with, or another --run"
         )
-    return Found(run=run, archive=archive, robot=robot)
+    return OpenedRun(path=run, archive=archive, robot=robot)

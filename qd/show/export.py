@@ -13,7 +13,7 @@ from tqdm import tqdm
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.run.directory import RUNS, folder_for
-from qd.show.elites import Found
+from qd.show.elites import OpenedRun
 from sim.bank import terrains_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
@@ -54,13 +54,14 @@ class Source:
     """What the terrains have maps of beside heights."""
 
 
-def source_of_archive(found: Found, elite: str = "0", minimal: str | None = None) -> Source:
-    """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.Found.terrains`."""
-    archive, space = found.archive, found.space
-    terrains = found.terrains(elite, minimal)
+def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | None = None) -> Source:
+    """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
+    archive, space = opened_run.archive, opened_run.space
+    terrains = opened_run.terrains(elite, minimal)
     genes = np.stack([terrain.genes for terrain in terrains])
     return Source(
-        folder=folder_for(found.run, found.robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
+        folder=folder_for(opened_run.path, opened_run.robot.name)
+        / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
         stems=[terrain.stem for terrain in terrains],
         about=[
             about_elite(archive, terrain.number)
@@ -70,7 +71,7 @@ def source_of_archive(found: Found, elite: str = "0", minimal: str | None = None
         ],
         genes=genes,
         heights=lambda part: terrains_of(genes[part], space),
-        origin={"run": str(found.run), "space": archive.space, "space_sha256": archive.space_sha256},
+        origin={"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256},
         named=archive.named(),
         ground=space.ground,
     )

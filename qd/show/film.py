@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.show.cross import OWN_FOLDER, OwnTerrain
-from qd.show.elites import Found, Terrain
+from qd.show.elites import OpenedRun, Terrain
 from qd.show.film_cfg import FilmCfg
 from qd.show.replay import record_terrains
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures, typical_episode
@@ -30,7 +30,7 @@ _DISTANCE = 4.6  # of the camera, in standing heights of the robot
 
 
 def film_elites(
-    found: Found,
+    opened_run: OpenedRun,
     terrains: Sequence[Terrain],
     cfg: FilmCfg,
     *,
@@ -44,14 +44,14 @@ def film_elites(
 
     All recordings are written before the first film is made.
     """
-    controller = found.policy(policy)
-    outs = [Path(f"{found.output(terrain.stem, controller)}.mp4") for terrain in terrains]
+    controller = opened_run.policy(policy)
+    outs = [Path(f"{opened_run.output(terrain.stem, controller)}.mp4") for terrain in terrains]
     if out is not None:
         outs = [out / path.name for path in outs] if len(outs) > 1 or out.is_dir() else [out]
     _check(cfg, outs, replicas)
-    recordings = record_terrains(found, terrains, policy=controller, replicas=replicas, seed=seed, device=device)
-    scales = dict(zip(found.archive.penalties, found.archive.scales, strict=True))
-    return _store_and_film(recordings, found.robot, scales, cfg, outs)
+    recordings = record_terrains(opened_run, terrains, policy=controller, replicas=replicas, seed=seed, device=device)
+    scales = dict(zip(opened_run.archive.penalties, opened_run.archive.scales, strict=True))
+    return _store_and_film(recordings, opened_run.robot, scales, cfg, outs)
 
 
 def film_map(

@@ -10,7 +10,7 @@ from qd.archive import Archive
 from qd.faults import elite_words
 from qd.fitness import Evaluation, evaluation_of
 from qd.show.crossed import crossed_of, draw_paths
-from qd.show.elites import Found, Terrain
+from qd.show.elites import OpenedRun, Terrain
 from qd.show.figures import look_of, save_figure
 from qd.show.recordings import Recordings, on_elite
 from sim.files.atomic import prepare_output
@@ -20,24 +20,24 @@ from sim.recording.recorder import Recording
 
 
 def record_terrains(
-    found: Found, terrains: Sequence[Terrain], *, policy: str, replicas: int, seed: int, device: str
+    opened_run: OpenedRun, terrains: Sequence[Terrain], *, policy: str, replicas: int, seed: int, device: str
 ) -> list[Recording]:
     """Crossings of an archive's terrains, which are crossed where no recording of them is stored."""
     wanted = [
         on_elite(
-            found.archive, terrain.number, policy=policy, replicas=replicas, seed=seed, label=terrain.label,
+            opened_run.archive, terrain.number, policy=policy, replicas=replicas, seed=seed, label=terrain.label,
             minimal=terrain.genes if terrain.minimal else None,
         )
         for terrain in terrains
     ]  # fmt: skip
-    return Recordings(found.robot, device=device).all_of(wanted)
+    return Recordings(opened_run.robot, device=device).all_of(wanted)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
     """A terrain and what became of it this time."""
 
-    found: Found
+    opened_run: OpenedRun
     terrain: Terrain
     recording: Recording
     """Of the terrain."""
@@ -47,7 +47,7 @@ class Replay:
 
 
 def replay(
-    found: Found,
+    opened_run: OpenedRun,
     terrain: Terrain,
     *,
     policy: str | None = None,
@@ -57,21 +57,21 @@ def replay(
     out: Path | None = None,
 ) -> Replay:
     """Crosses a terrain again, prints its numbers, and draws it with the robots' paths."""
-    controller = found.policy(policy)
-    out = out or Path(f"{found.output(terrain.stem, controller)}.png")
+    controller = opened_run.policy(policy)
+    out = out or Path(f"{opened_run.output(terrain.stem, controller)}.png")
     if out.suffix != ".png":
         raise ValueError(f"out must be a file named *.png, got {out}")
     prepare_output(out)
     (recording,) = record_terrains(
-        found, [terrain], policy=controller, replicas=replicas, seed=seed, device=device
+        opened_run, [terrain], policy=controller, replicas=replicas, seed=seed, device=device
     )  # fmt: skip
-    _, fitness = found.as_searched()
+    _, fitness = opened_run.as_searched()
     replayed = Replay(
-        found=found,
+        opened_run=opened_run,
         terrain=terrain,
         recording=recording,
-        fresh=evaluation_of(recording.result(), found.archive.cells, fitness),
-        controller=controller if found.suffix(controller) else "",
+        fresh=evaluation_of(recording.result(), opened_run.archive.cells, fitness),
+        controller=controller if opened_run.suffix(controller) else "",
     )
     print(describe(replayed))
     save_figure(out, draw(replayed))
@@ -81,7 +81,7 @@ def replay(
 
 def describe(replay: Replay) -> str:
     """An elite's numbers as they were found, those that 40 fresh episodes corrected, if any did, and those of now."""
-    archive, n, fresh = replay.found.archive, replay.terrain.number, replay.fresh
+    archive, n, fresh = replay.opened_run.archive, replay.terrain.number, replay.fresh
     cells, minimal = archive.cells, replay.terrain.words
     columns: list[tuple[str, Archive | Evaluation, int]] = [("found", archive, n)]
     if archive.fresh is not None:
@@ -112,11 +112,11 @@ def describe(replay: Replay) -> str:
         known = f"Now it was crossed with {replay.controller}; all else is of the controller that was searched."
     return "\n".join(
         [
-            f"{replay.found.run}, {replay.terrain.label}, found in iteration {archive.iteration[n]}, with ratios in "
-            f"{cells.describe(int(archive.cell[n]))}",
+            f"{replay.opened_run.path}, {replay.terrain.label}, found in iteration {archive.iteration[n]}, "
+            f"with ratios in {cells.describe(int(archive.cell[n]))}",
             *(f"  {label:22}" + "".join(f"{value:>{width}}" for value in row) for label, row in rows.items()),
             "  Its terrain:",
-            *(f"    {line}" for line in replay.found.space.describe(replay.terrain.genes).splitlines()),
+            *(f"    {line}" for line in replay.opened_run.space.describe(replay.terrain.genes).splitlines()),
             "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
             *(f"  {line}" for line in [known, *elite_words(archive, n)]),
         ]
@@ -135,7 +135,7 @@ def _valid_episodes(values: Archive | Evaluation, number: int) -> int:
 
 def draw(replay: Replay) -> Figure:
     """The height map of a terrain with the robots' paths, and marks where they ended, by how."""
-    archive, n = replay.found.archive, replay.terrain.number
+    archive, n = replay.opened_run.archive, replay.terrain.number
     corrected = "" if archive.fresh is None else f"{archive.fresh.fitness[n]:.2f} corrected, "
     title = (
         f"{archive.robot}, elite {n} of {len(archive):,} after {archive.iterations:,} iterations: fitness "

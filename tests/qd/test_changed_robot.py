@@ -6,7 +6,7 @@ import json
 import pytest
 
 from qd.archive import write_archive
-from qd.show.elites import find_archive
+from qd.show.elites import open_run
 from sim.files.records import identity, robot_digest, robot_identity
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot, robot_of
@@ -32,7 +32,7 @@ def readers(file):
     record = {"robot": "dog"} | json.loads(robot.scales_file.read_text())
     return (
         robot.read_penalty_scales,
-        lambda: find_archive(str(file), folder / "archive.npz"),
+        lambda: open_run(str(file), folder / "archive.npz"),
         lambda: robot_of(record, str(file), folder),
     )
 

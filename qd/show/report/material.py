@@ -13,7 +13,7 @@ from qd.minimise import MinimalFound, read_minimal
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
-from qd.show.elites import Found, find_archive
+from qd.show.elites import OpenedRun, open_run
 from qd.show.figures import summary
 from qd.show.report.pictures import reliefs_of
 from sim.files.atomic import prepare_output
@@ -28,7 +28,7 @@ _ORIGIN = ("command", "commit", "device", "versions", "seed", "date")
 class Material:
     """Everything read; None where there is no such file."""
 
-    found: Found
+    opened_run: OpenedRun
     out: Path
     """The page."""
     named_policy: str | None
@@ -49,22 +49,22 @@ class Material:
     @property
     def run(self) -> Path:
         """Directory or archive file that was read."""
-        return self.found.run
+        return self.opened_run.path
 
     @property
     def robot(self) -> RobotCfg:
         """Whose archive it is."""
-        return self.found.robot
+        return self.opened_run.robot
 
     @property
     def archive(self) -> Archive:
         """The elites."""
-        return self.found.archive
+        return self.opened_run.archive
 
     @property
     def space(self) -> TerrainSpace:
         """What the archive's genes mean."""
-        return self.found.space
+        return self.opened_run.space
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -120,21 +120,23 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     """Reads what there is and makes sure that the page can be written."""
     if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
         raise ValueError(f"{run} must hold a search that has ended an iteration, got no {ARCHIVE_FILE}: let it go on")
-    found = find_archive(robot, run, space=space)
-    archive = found.archive
+    opened_run = open_run(robot, run, space=space)
+    archive = opened_run.archive
     if not len(archive):
-        raise ValueError(f"{found.run} must have elites to report on, got an archive of none: let its search go on")
-    folder = RunDirectory(found.folder)
-    search = found.search()
+        raise ValueError(
+            f"{opened_run.path} must have elites to report on, got an archive of none: let its search go on"
+        )
+    folder = RunDirectory(opened_run.folder)
+    search = opened_run.search()
     numbers = folder.read_summary()
     again = numbers.get("judged_by", {}).get("fresh")
     config = {} if search is None else folder.read_config()
-    tables_file = RESULTS / found.robot.name / "tables.json"
-    suffix = "" if policy is None else found.suffix(spec_of(policy, found.robot))
-    out = out or folder_for(found.run, found.robot.name) / f"report{suffix}.html"
+    tables_file = RESULTS / opened_run.robot.name / "tables.json"
+    suffix = "" if policy is None else opened_run.suffix(spec_of(policy, opened_run.robot))
+    out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)
     return Material(
-        found=found,
+        opened_run=opened_run,
         out=out,
         named_policy=policy,
         metrics=_metrics_of(folder, archive),
@@ -142,8 +144,8 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
         origin={key: config[key] for key in _ORIGIN if key in config},
         reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
-        minimal=read_minimal(found.folder, archive),
-        tables={**read_tables(tables_file, found.robot)} if tables_file.exists() else None,
+        minimal=read_minimal(opened_run.folder, archive),
+        tables={**read_tables(tables_file, opened_run.robot)} if tables_file.exists() else None,
         tables_file=tables_file,
     )
 

@@ -114,7 +114,7 @@ class App:
         """Serve until interrupted."""
         show = self._common.show
         for policy in list(show.controllers.values())[:1]:  # ready by the time that somebody has chosen an elite
-            self._recorder.warm(on_elite(show.found.archive, 0, policy=policy, replicas=show.replicas))
+            self._recorder.warm(on_elite(show.opened_run.archive, 0, policy=policy, replicas=show.replicas))
         last = time.perf_counter()
         while True:
             self.do_asked(wait_s=_FRAME_S if self._playing else _IDLE_S)

@@ -57,7 +57,7 @@ class Ghost:
         chosen = show.certifying(elite) if self.choice == CERTIFYING else self.choice
         self.name = chosen if chosen in show.controllers and chosen != beside else None
         if self.name is not None:
-            archive, policy = show.found.archive, show.controllers[self.name]
+            archive, policy = show.opened_run.archive, show.controllers[self.name]
             self._wanted = on_elite(archive, elite, policy=policy, replicas=show.replicas, minimal=minimal)
             self.recording = self._common.recordings.read(self._wanted)
         missing = self._wanted if self.recording is None else None
@@ -84,7 +84,7 @@ class Ghost:
 
     def show_episode(self, replica: int) -> str:
         """Take an episode, counted from 0; returns what to say of it, as HTML."""
-        archive = self._common.show.found.archive
+        archive = self._common.show.opened_run.archive
         self.crossing = None
         if self.recording is not None:
             skeleton = self._common.skeleton

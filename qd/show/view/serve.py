@@ -23,7 +23,7 @@ def serve(show: Show, *, host: str, port: int, cache: Path) -> None:
     check_port(host, port)
     app = App(show, Recordings(show.robot, folder=cache), host=host, port=port)
     try:
-        print(f"{show.found.run}: {len(show.found.archive):,} elites of {show.robot.name}.")
+        print(f"{show.opened_run.path}: {len(show.opened_run.archive):,} elites of {show.robot.name}.")
         print(f"Open http://{host}:{port} in a browser; Ctrl-C ends.", flush=True)
         app.run()
     except KeyboardInterrupt:

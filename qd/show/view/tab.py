@@ -55,7 +55,7 @@ class Tab:
         """
         self.client, self.common = client, common
         show = common.show
-        self._archive, self._others = show.found.archive, address.others
+        self._archive, self._others = show.opened_run.archive, address.others
         self._selection, self._clock = Selection(common.axes), Clock()
         self._controller = next(iter(show.controllers), None)
         self._minimal = False  # whether the elite's minimal terrain is wanted, where it has one
@@ -69,7 +69,7 @@ class Tab:
         self._query, self._told, self._addressed = "", 0.0, time.perf_counter()
         self.ghost = Ghost(common, client.client_id)
         self.scene = Scene(client, common.shapes, CrossingCfg())
-        title = f"{show.robot.name} · {show.found.folder} · {len(self._archive):,} elites"
+        title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
         self._list = ArchivePanel(client, common.axes, self._selection, title, self)
         self._panel = CrossingPanel(client, list(show.controllers), self)
         add_keys(client, self)
@@ -159,10 +159,10 @@ class Tab:
         show, name, number = self.common.show, self._controller, self._selection.picked
         which = {"elite": number} if self.genes is None else {"minimal": number}
         policy = None if name is None or name == SEARCHED else show.controllers[name]
-        space = show.found.space
+        space = show.opened_run.space
         text = command_line(
-            "replay", robot=show.robot.spec, run=show.found.run, space=space.name if space.sha256 else None, **which,
-            policy=policy, replicas=show.replicas,
+            "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None,
+            **which, policy=policy, replicas=show.replicas,
         )  # fmt: skip
         copy_text(self.client, text)
         self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
@@ -359,7 +359,7 @@ class Tab:
         show, elite, genes = self.common.show, self._selection.picked, self.genes
         self._panel.show_terrain(show.minima is not None and elite in show.minima.genes, genes is not None)
         shown = self._archive.genes[elite] if genes is None else genes
-        heights, ground = terrains_of(shown[None], show.found.space)
+        heights, ground = terrains_of(shown[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.archive import write_archive
-from qd.show.elites import find_archive
+from qd.show.elites import open_run
 from qd.show.export import export_terrains, source_of_archive
 from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
@@ -26,12 +26,12 @@ def run(tmp_path, monkeypatch):
 
 
 def export(elite, **options):
-    return export_terrains(source_of_archive(find_archive("anymal"), elite), **options)
+    return export_terrains(source_of_archive(open_run("anymal"), elite), **options)
 
 
 def test_elites_are_exported_as_the_simulation_has_them(run, monkeypatch):
     monkeypatch.setattr("qd.show.export._AT_ONCE", 2)
-    archive = find_archive("anymal", run).archive
+    archive = open_run("anymal", run).archive
     files, folder, elites = export("2 1 0"), run / "terrains", (2, 1, 0)
     endings = ("npz", "png", "xml", "stl", "json")
     expected = [*(f"elite-{k}.{ending}" for k in elites for ending in endings), "index.json"]

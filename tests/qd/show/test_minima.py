@@ -8,7 +8,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.show.commands import Export
-from qd.show.elites import find_archive
+from qd.show.elites import open_run
 from qd.show.replay import describe, replay
 from qd.show.view.plots import MINIMAL, Choice
 from qd.show.view.show import find_show
@@ -25,7 +25,7 @@ def run(tmp_path_factory):
 
 
 def test_one_is_replayed(run, monkeypatch):
-    archive, asked = find_archive("anymal", run), []
+    archive, asked = open_run("anymal", run), []
     first = next(iter(archive.minima().genes))
 
     def all_of(recordings, wanted):
@@ -41,7 +41,7 @@ def test_one_is_replayed(run, monkeypatch):
 
 
 def test_they_are_exported_and_listed_in_the_viewer(run, tmp_path):
-    genes = find_archive("anymal", run).minima().genes
+    genes = open_run("anymal", run).minima().genes
     Export(run=run, minimal="all", out=tmp_path, formats=("npz",)).execute()
     assert {file.name for file in tmp_path.glob("*.npz")} == {f"minimal-{number}.npz" for number in genes}
     number = next(iter(genes))

@@ -11,7 +11,7 @@ from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
 from qd.run.directory import RunDirectory
 from qd.run.settings import suffix_of
-from qd.show.elites import Found, find_archive
+from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import Replay, describe, draw, replay
 from sim.files.records import robot_identity
@@ -40,10 +40,10 @@ def done(tmp_path, anymal):
     sums = np.tile([2.0, 16.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
     recording = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
-    found = Found(run=tmp_path, archive=archive, robot=anymal)
+    opened_run = OpenedRun(path=tmp_path, archive=archive, robot=anymal)
     fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
     fresh = evaluation_of(recording.result(), Cells(2), fitness)
-    return Replay(found=found, terrain=found.terrain(), recording=recording, fresh=fresh)
+    return Replay(opened_run=opened_run, terrain=opened_run.terrain(), recording=recording, fresh=fresh)
 
 
 def lines_of(replayed):
@@ -66,10 +66,10 @@ def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
 
 
 def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
-    fresh = dataclasses.replace(fresh_values(done.found.archive), invalid_episodes=np.array([8]))
-    archive = dataclasses.replace(done.found.archive, fresh=fresh)
+    fresh = dataclasses.replace(fresh_values(done.opened_run.archive), invalid_episodes=np.array([8]))
+    archive = dataclasses.replace(done.opened_run.archive, fresh=fresh)
     invalid = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
-    case = dataclasses.replace(done, found=dataclasses.replace(done.found, archive=archive), fresh=invalid)
+    case = dataclasses.replace(done, opened_run=dataclasses.replace(done.opened_run, archive=archive), fresh=invalid)
     lines = lines_of(case)
     assert lines[2].split() == ["fitness", "3.25", "1.62", "10.50"]
     # 8 of the 40 are invalid, and now the terrain as a whole
@@ -90,21 +90,21 @@ def test_the_drawing_has_all_paths_and_how_they_ended(done):
 
 
 def test_a_terrain_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_run(done, monkeypatch):
-    asked, found = [], done.found
+    asked, opened_run = [], done.opened_run
 
     def all_of(recordings, wanted):
         asked.extend(wanted)
         return [done.recording]
 
     monkeypatch.setattr(Recordings, "all_of", all_of)
-    assert replay(found, found.terrain("0"), replicas=4, seed=2).controller == ""
-    assert (found.folder / "elite-0.png").is_file()
-    assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(found.robot.policy_file), 4, 2)
-    assert replay(found, found.terrain("0"), policy="os.path:join").controller == "os.path:join"
-    assert (found.folder / "elite-0-os.path-join.png").is_file()
-    np.testing.assert_array_equal(asked[1].terrain, found.archive.genes[0])
+    assert replay(opened_run, opened_run.terrain("0"), replicas=4, seed=2).controller == ""
+    assert (opened_run.folder / "elite-0.png").is_file()
+    assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(opened_run.robot.policy_file), 4, 2)
+    assert replay(opened_run, opened_run.terrain("0"), policy="os.path:join").controller == "os.path:join"
+    assert (opened_run.folder / "elite-0-os.path-join.png").is_file()
+    np.testing.assert_array_equal(asked[1].terrain, opened_run.archive.genes[0])
     with pytest.raises(ValueError, match="out"):
-        replay(found, found.terrain("0"), out=found.folder / "a.jpg")
+        replay(opened_run, opened_run.terrain("0"), out=opened_run.folder / "a.jpg")
 
 
 def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
@@ -120,26 +120,26 @@ def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
 def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     archive = tmp_path / "archive.npz"
     write_archive(archive, small_archive())
-    found = find_archive(None, archive)
-    assert [terrain.number for terrain in found.terrains("2 0")] == [2, 0]
-    assert [terrain.stem for terrain in found.terrains("all")] == ["elite-0", "elite-1", "elite-2"]
+    opened_run = open_run(None, archive)
+    assert [terrain.number for terrain in opened_run.terrains("2 0")] == [2, 0]
+    assert [terrain.stem for terrain in opened_run.terrains("all")] == ["elite-0", "elite-1", "elite-2"]
     for elite in ("3", "-1", "x"):
         with pytest.raises(ValueError, match="elite"):
-            found.terrains(elite)
+            opened_run.terrains(elite)
     with pytest.raises(ValueError, match="elite"):
-        found.terrain("all")
+        opened_run.terrain("all")
     with pytest.raises(FileNotFoundError, match="minimal"):
-        found.terrains("0", "all")
+        opened_run.terrains("0", "all")
     with pytest.raises(ValueError, match="cassie"):
-        find_archive("cassie", archive)
+        open_run("cassie", archive)
     with pytest.raises(FileNotFoundError):
-        find_archive(None, tmp_path / "elsewhere")
+        open_run(None, tmp_path / "elsewhere")
     RunDirectory(tmp_path).begin_session(CFG, {"command": "", "commit": "", "device": "cpu"}, 0)
     with pytest.raises(ValueError, match=r"config\.json"):  # which has six penalties
-        find_archive(None, tmp_path).as_searched()
+        open_run(None, tmp_path).as_searched()
     write_archive(archive, dataclasses.replace(small_archive(), penalties=("yaw_rate", "<b>")))
     with pytest.raises(ValueError, match="penalties"):
-        find_archive("anymal", archive)
+        open_run("anymal", archive)
     robot = {"robot": "cassie", **robot_identity(cassie)}
     write_archive(archive, dataclasses.replace(small_archive(), **robot))
-    assert find_archive(None, archive).robot.name == "cassie"
+    assert open_run(None, archive).robot.name == "cassie"

@@ -13,7 +13,7 @@ from pathlib import Path
 from PIL import Image
 
 from qd.groups import rank
-from qd.show.elites import find_archive
+from qd.show.elites import open_run
 from qd.show.recordings import Recordings, on_elite
 from qd.show.report.report import write_report
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
@@ -83,9 +83,9 @@ def report_picture(browser, file: Path) -> None:
 
 def film_picture(run: Path, elite: int) -> None:
     """A frame of the film of an elite that the viewer has recorded."""
-    found = find_archive(None, run)
-    archive, robot = found.archive, found.robot
-    wanted = on_elite(archive, elite, policy=found.policy(None), replicas=20)
+    opened_run = open_run(None, run)
+    archive, robot = opened_run.archive, opened_run.robot
+    wanted = on_elite(archive, elite, policy=opened_run.policy(None), replicas=20)
     (recording,) = Recordings(robot).all_of([wanted])
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
     shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
@@ -104,8 +104,8 @@ def main() -> None:
     flags.add_argument("--report", type=Path, default=Path("runs/anymal-published/report.html"))
     args = flags.parse_args()
     report = args.report if args.report.exists() else write_report(args.run, out=args.report, device="cpu")
-    found = find_archive(None, args.run)
-    elite = rank(found.archive, found.space).worst(1)[0] if args.elite is None else args.elite
+    opened_run = open_run(None, args.run)
+    elite = rank(opened_run.archive, opened_run.space).worst(1)[0] if args.elite is None else args.elite
     port = free_port()
     process, _ = serve(view_command("--run", str(args.run), "--port", str(port)))
     try:

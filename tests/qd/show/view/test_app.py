@@ -100,7 +100,7 @@ def worst_crossed(show):
     outcome, frames = np.full_like(recording.outcome, Outcome.TIME_OUT), recording.num_frames.copy()
     outcome[0, 16], frames[0, 16] = Outcome.BASE_COLLISION, round(5.3 / recording.dt)
     duration_s = np.where(outcome == Outcome.TIME_OUT, recording.duration_s, 5.3).astype(np.float32)
-    wanted = on_elite(show.found.archive, 0, policy=str(show.robot.policy_file), replicas=20)
+    wanted = on_elite(show.opened_run.archive, 0, policy=str(show.robot.policy_file), replicas=20)
     return wanted, dataclasses.replace(recording, outcome=outcome, num_frames=frames, duration_s=duration_s)
 
 
@@ -248,7 +248,7 @@ def test_playing_and_dragging_move_the_robot(shown):
 
 
 def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
-    genes = show.found.archive.genes[0].copy()
+    genes = show.opened_run.archive.genes[0].copy()
     genes[:8] = 0.0
     entry = {"elite": 0, "bumps": [1], "of": 8, "goal_rate": 0.1, "goal_interval": [0.03, 0.25], "cause": None,
              "margin_m": None}  # fmt: skip

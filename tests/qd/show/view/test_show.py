@@ -32,7 +32,7 @@ def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypa
     (tmp_path / "results").symlink_to(published)
     monkeypatch.chdir(tmp_path)
     show = find_show()
-    assert show.found.run == RESULTS / "anymal" / "archive"
+    assert show.opened_run.path == RESULTS / "anymal" / "archive"
     assert show.controllers["as searched"] == str(anymal.policy_file)
 
 
