@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import InSpace, OfRobot, Where, Who, peek
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -27,7 +27,7 @@ class ArchiveFitness:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive(Who, Where):
+class Archive(ControllerFlags, WorkerFlags):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
@@ -120,7 +120,7 @@ class Archive(Who, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge(Who, InSpace, Where):
+class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
     """Say which elites of a run are faults of its controller.
 
     fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
@@ -162,7 +162,7 @@ class Judge(Who, InSpace, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Minimise(Who, InSpace, Where):
+class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
     """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
     Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
@@ -209,7 +209,7 @@ class Minimise(Who, InSpace, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(Who, Where):
+class Calibrate(ControllerFlags, WorkerFlags):
     """Measure the penalty scales of a robot with a controller, on hard-random terrains.
 
     It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
@@ -247,7 +247,7 @@ class Calibrate(Who, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Who, Where):
+class Evaluate(ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
@@ -325,7 +325,7 @@ class Evaluate(Who, Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dose(OfRobot, Where):
+class Dose(RobotFlag, WorkerFlags):
     """Measure which real obstacle at which size stops a controller.
 
     One obstacle stands alone on flat ground, and one of its sizes grows: the rise of stairs, the width of a ditch; or

@@ -8,12 +8,12 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from sim.files.command import OfRobot, OnDevice
+from sim.files.command import DeviceFlag, RobotFlag
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stand(OfRobot, OnDevice):
+class Stand(RobotFlag, DeviceFlag):
     """Look at a robot before anything is searched or trained.
 
     It prints its joints and geoms as they were read, whether it stands in its default pose, and how many contacts and

@@ -7,7 +7,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from sim.files.command import Where, peek
+from sim.files.command import WorkerFlags, peek
 from sim.files.settings import from_builtins
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -90,7 +90,7 @@ class Finetune(_OfTraining, FinetuneCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Harden(HardenCfg, Where):
+class Harden(HardenCfg, WorkerFlags):
     """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
 
     Each search counts the faults: terrains that another controller crosses and this one does not. Each training is on

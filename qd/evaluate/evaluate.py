@@ -31,7 +31,7 @@ from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_eval
 from sim.files.command import publish
 from sim.files.figures import as_png
 from sim.files.records import identity, robot_identity
-from sim.policy.spec import controller_hash, name_of, spec_of, who_crossed
+from sim.policy.spec import controller_hash, crosser_name, name_of, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -248,7 +248,7 @@ def evaluate_rates(
     check_policy(policy, robot, compute.device)
     drawn_in = load_space(space or SUPER_GAUSSIAN.name)
     sets = {name: plain_set(name, count, seed, drawn_in) for name in ("hand_crafted", "hard_random", "flat")}
-    controller = who_crossed(robot, policy)
+    controller = crosser_name(robot, policy)
 
     def make() -> dict[str, Any]:
         results = cross_sets(

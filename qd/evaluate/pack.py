@@ -34,7 +34,7 @@ from sim.files.command import publish
 from sim.files.intervals import wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
-from sim.policy.spec import about_controllers, is_same, who_crossed
+from sim.policy.spec import about_controllers, crosser_name, is_same
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -112,7 +112,7 @@ def evaluate_pack(
     check_policy(policy, robot, compute.device)
     chosen = pack_set(pack.heights, min(count, len(pack)), seed)
     abouts = pack.terrains[: len(chosen)]
-    controller = who_crossed(robot, policy)
+    controller = crosser_name(robot, policy)
 
     def measure() -> dict[str, Any]:
         result = cross_sets(

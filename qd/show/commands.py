@@ -7,7 +7,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from qd.show.film_cfg import FilmCfg
-from sim.files.command import InSpace, OfRobot, OnDevice, Where, Which, Who
+from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -24,7 +24,7 @@ class Mapped:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay(Who, OnDevice, Which):
+class Replay(ControllerFlags, DeviceFlag, EliteFlags):
     """Print one elite of an archive, or its minimal terrain, and draw the terrain with the robots' paths.
 
     Elites are numbered by falling fitness; after fresh episodes their corrected fitness counts. That is not the order
@@ -53,7 +53,7 @@ class Replay(Who, OnDevice, Which):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film(Who, OnDevice, Which, Mapped):
+class Film(ControllerFlags, DeviceFlag, EliteFlags, Mapped):
     """Film a robot on elites of an archive, or on a terrain of your own.
 
     The episodes are those that `faultline replay` shows. Below the robot stand the map with all paths and what the
@@ -98,7 +98,7 @@ class Film(Who, OnDevice, Which, Mapped):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cross(Who, OnDevice, Mapped):
+class Cross(ControllerFlags, DeviceFlag, Mapped):
     """Cross a height map of your own: how often does the controller get over, and what does it cost?
 
     A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, floats
@@ -135,7 +135,7 @@ class Cross(Who, OnDevice, Mapped):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PackFlags(Where):
+class PackFlags(WorkerFlags):
     """How a pack is made."""
 
     size: PositiveInt = 100
@@ -150,7 +150,7 @@ class PackFlags(Where):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Who, Which):
+class Export(ControllerFlags, EliteFlags):
     """Write terrains as files that other programs read, a pack of terrains, or a controller as ONNX.
 
     For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
@@ -223,7 +223,7 @@ class Export(Who, Which):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(Who, OnDevice, InSpace):
+class Report(ControllerFlags, DeviceFlag, SpaceFlag):
     """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
 
     Robots cross the elites that it shows again, 20 times each. The crossings are stored, so the same command goes on
@@ -250,7 +250,7 @@ class Report(Who, OnDevice, InSpace):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(OfRobot, Which):
+class View(RobotFlag, EliteFlags):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
     On the left is the archive on parallel axes. A click on a line of the plot, or of the list under "Elites", shows

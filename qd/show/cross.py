@@ -19,7 +19,7 @@ from sim.files.intervals import rate_words, wilson_interval
 from sim.files.records import identity
 from sim.ground import GroundMaps
 from sim.maps.heightmap import as_terrain, fitted, read_heightmap
-from sim.policy.spec import who_crossed
+from sim.policy.spec import crosser_name
 from sim.recording.recorder import Recording
 from sim.robots.robot import RobotCfg
 
@@ -77,7 +77,7 @@ def cross_map(
 ) -> dict[str, Any]:
     """Crosses a map, prints rates and costs, writes numbers and figure."""
     policy = policy or str(robot.policy_file)
-    crosser = who_crossed(robot, policy)
+    crosser = crosser_name(robot, policy)
     out = out or OWN_FOLDER / f"{terrain.name}-{crosser}.json"
     figure = out.with_name(f"{out.stem}-paths.png")
     given = {terrain.file.resolve(), terrain.file.with_suffix(".json").resolve()}

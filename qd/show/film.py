@@ -17,7 +17,7 @@ from qd.show.film_cfg import FilmCfg
 from qd.show.replay import record_terrains
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures, typical_episode
 from sim.files.atomic import prepare_output, write_atomically
-from sim.policy.spec import who_crossed
+from sim.policy.spec import crosser_name
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Renderer, open_context
@@ -67,7 +67,7 @@ def film_map(
 ) -> list[Path]:
     """A film of a user's own terrain."""
     controller = policy or str(robot.policy_file)
-    outs = [out or OWN_FOLDER / f"{terrain.name}-{who_crossed(robot, controller)}.mp4"]
+    outs = [out or OWN_FOLDER / f"{terrain.name}-{crosser_name(robot, controller)}.mp4"]
     _check(cfg, outs, replicas)
     print(f"{terrain.file}: {terrain.fitted}", flush=True)
     recording = terrain.record(robot, controller, replicas=replicas, seed=seed, device=device)

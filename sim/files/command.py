@@ -24,7 +24,7 @@ from sim.files.settings import PositiveInt, check
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfRobot:
+class RobotFlag:
     """The option that says which robot."""
 
     robot: str | None = None
@@ -32,7 +32,7 @@ class OfRobot:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Who(OfRobot):
+class ControllerFlags(RobotFlag):
     """Options that say which robot, under which controller."""
 
     policy: str | None = None
@@ -41,7 +41,7 @@ class Who(OfRobot):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnDevice:
+class DeviceFlag:
     """The option that says on which device a command works."""
 
     device: str | None = None
@@ -49,7 +49,7 @@ class OnDevice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where(OnDevice):
+class WorkerFlags(DeviceFlag):
     """Options that say where a command works."""
 
     workers: str | None = None
@@ -61,7 +61,7 @@ class Where(OnDevice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class InSpace:
+class SpaceFlag:
     """The option that names the terrain space of a run."""
 
     space: str | None = None
@@ -70,7 +70,7 @@ class InSpace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Which(InSpace):
+class EliteFlags(SpaceFlag):
     """Options that say which elite of which run."""
 
     run: Path | None = None

@@ -237,7 +237,7 @@ def label_suffix(policy: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
-def who_crossed(robot: RobotSettings, policy: str) -> str:
+def crosser_name(robot: RobotSettings, policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
     return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
 
