@@ -63,12 +63,7 @@ class TerrainSpace(Protocol):
         ...
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
-        """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are.
-
-        Args:
-            genes: As of :meth:`rasterise`.
-            ground_out: Maps of these terrains.
-        """
+        """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
         return None
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
@@ -76,45 +71,26 @@ class TerrainSpace(Protocol):
         ...
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """The parts of a terrain that can be taken away, each in words.
-
-        Args:
-            genes: One row, shape (num_genes,).
-        """
+        """The parts of a terrain that can be taken away, each in words, of one row of genes (num_genes,)."""
         ...
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes of the same terrains without some of their parts, shape (num_terrains, num_genes).
-
-        Args:
-            genes: Shape (num_terrains, num_genes).
-            parts: Indices into :meth:`parts`.
-        """
+        """Genes (num_terrains, num_genes) of the same terrains without the parts of these indices in :meth:`parts`."""
         ...
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes of the same terrains with all their heights scaled down together; None where the space cannot.
+        """Genes (num_terrains, num_genes) of the same terrains with all heights times ``scale``, which is in (0, 1].
 
-        Args:
-            genes: Shape (num_terrains, num_genes).
-            scale: In (0, 1]; of 1 the terrains stay as they are.
+        None where the space cannot scale heights together.
         """
         return None
 
     def describe(self, genes: ArrayLike) -> str:
-        """A terrain in words, one part a line.
-
-        Args:
-            genes: One row, shape (num_genes,).
-        """
+        """A terrain in words, one part a line, of one row of genes (num_genes,)."""
         return "\n".join(self.parts(genes))
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
-        """What lies across the whole way, in words, with the x at which it begins and ends [m]; none of most spaces.
-
-        Args:
-            genes: One row, shape (num_genes,).
-        """
+        """What lies across the whole way, in words, with the x at which it begins and ends [m]; none of most spaces."""
         return ()
 
     def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -47,25 +47,12 @@ class Course(TerrainSpace):
     - stepping stones and rubble: chosen here.
     """
 
-    @property
-    def name(self) -> str:
-        """What files and command lines call the space."""
-        return "course"
-
-    @property
-    def num_genes(self) -> int:
-        """Six genes an element, in the order of :data:`kernels.course.GENES`, element after element."""
-        return MAX_ELEMENTS * GENES_PER_ELEMENT
-
-    @property
-    def sigma0(self) -> float:
-        """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
-        return 0.5
-
-    @property
-    def genes_per_part(self) -> int:
-        """A part is an element."""
-        return GENES_PER_ELEMENT
+    name: ClassVar[str] = "course"
+    num_genes: ClassVar[int] = MAX_ELEMENTS * GENES_PER_ELEMENT
+    """Six genes an element, in the order of :data:`kernels.course.GENES`, element after element."""
+    sigma0: ClassVar[float] = 0.5
+    """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
+    genes_per_part: ClassVar[int] = GENES_PER_ELEMENT
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""

@@ -49,14 +49,11 @@ class Quantity(NamedTuple):
         return f"{value:.{digits}f} {self.unit}".strip()
 
 
-def _cells(field: str, low: float, high: float, *, cells: int = 1) -> Quantity:
-    return Quantity(field, low, high, cells=cells)
-
-
 _HEIGHT = {"height": Quantity("size", 0.01, 1.0)}
 _DEPTH = {"depth": Quantity("size", 0.05, 2.0)}
 _SLOPE = {"slope": Quantity("size", 0.01, 2.0, "m/m")}
-_LENGTH = {"length": _cells("length", 0.20, 4.0)}
+_STONES = {"side": Quantity("detail", 0.10, 1.0, cells=1), "gap": Quantity("turn", 0.05, 1.0, cells=1)}
+_LENGTH = {"length": Quantity("length", 0.20, 4.0, cells=1)}
 
 QUANTITIES: dict[Kind, dict[str, Quantity]] = {
     Kind.STAIRS: {
@@ -65,15 +62,15 @@ QUANTITIES: dict[Kind, dict[str, Quantity]] = {
         "flight": Quantity("detail", 2, course.PARAMETERS[Kind.STAIRS][2].high, "steps"),
     },
     Kind.STEP: _HEIGHT,
-    Kind.SILL: _HEIGHT | {"width": _cells("length", 0.05, 0.50)},
+    Kind.SILL: _HEIGHT | {"width": Quantity("length", 0.05, 0.50, cells=1)},
     Kind.RAIL: _HEIGHT,
     Kind.PALLET: _HEIGHT | _LENGTH,
     Kind.RAMP: _SLOPE | _LENGTH,
-    Kind.CROSS_SLOPE: _SLOPE | {"length": _cells("length", 0.60, 4.0)},
-    Kind.DITCH: _DEPTH | {"width": _cells("length", 0.10, 4.0)},
-    Kind.BRIDGE: _DEPTH | _LENGTH | {"width": _cells("detail", 0.10, 4.0, cells=2)},
-    Kind.STONES: _DEPTH | _LENGTH | {"side": _cells("detail", 0.10, 1.0), "gap": _cells("turn", 0.05, 1.0)},
-    Kind.RUBBLE: _HEIGHT | _LENGTH | {"side": _cells("detail", 0.05, 1.0)},
+    Kind.CROSS_SLOPE: _SLOPE | {"length": Quantity("length", 0.60, 4.0, cells=1)},
+    Kind.DITCH: _DEPTH | {"width": Quantity("length", 0.10, 4.0, cells=1)},
+    Kind.BRIDGE: _DEPTH | _LENGTH | {"width": Quantity("detail", 0.10, 4.0, cells=2)},
+    Kind.STONES: _DEPTH | _LENGTH | _STONES,
+    Kind.RUBBLE: _HEIGHT | _LENGTH | {"side": Quantity("detail", 0.05, 1.0, cells=1)},
 }
 """Parameters of the kinds of obstacles, and how far terrains can follow them."""
 _GROUND = {
@@ -181,12 +178,7 @@ class Dose:
 
 
 def _heights_of(elements: Any) -> NDArray[np.float32]:
-    """Heights [m] of elements, each alone on flat ground, shape (num_terrains, NUM_ROWS, NUM_COLS).
-
-    Args:
-        elements: Records of :class:`kernels.course.Element`, as :func:`kernels.course.place` takes them, shape
-            (num_terrains,). All that :data:`QUANTITIES` allow fit before x = 12 m.
-    """
+    """Heights [m] of records of :class:`kernels.course.Element`, each alone on flat ground, before x = 12 m."""
     with wp.ScopedDevice(host_device()):
         laid: Any = wp.array(elements[:, None], dtype=Element)
         course.place(laid)

@@ -7,19 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.ground import (
-    COLS,
-    LEAST_FRICTION,
-    LEAST_TIME_CONSTANT_S,
-    MOST_TIME_CONSTANT_S,
-    NUM_PATCHES,
-    PATCH,
-    ROWS,
-    Ground,
-    decode_friction,
-    decode_softness,
-)
-from sim.ground import joined_name, patches_at
+from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
+from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, joined_name, patches_at
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
@@ -38,18 +27,18 @@ class OnGround(TerrainSpace):
 
     inner: TerrainSpace
     """Whose heights it has."""
-    kinds: tuple[str, ...]
-    """Some of :data:`sim.ground.GROUND_KINDS`, in their order."""
+    ground: tuple[str, ...] = ()
+    """What its terrains have maps of: some of :data:`sim.ground.GROUND_KINDS`, in their order."""
 
     @property
     def name(self) -> str:
         """What files and command lines call the space: ``course+friction+softness``."""
-        return joined_name(self.inner.name, self.kinds)
+        return joined_name(self.inner.name, self.ground)
 
     @property
     def num_genes(self) -> int:
         """Those of the space, and 32 a map."""
-        return self.inner.num_genes + NUM_PATCHES * len(self.kinds)
+        return self.inner.num_genes + NUM_PATCHES * len(self.ground)
 
     @property
     def sha256(self) -> str | None:
@@ -72,23 +61,16 @@ class OnGround(TerrainSpace):
         per_part = self.inner.genes_per_part
         return per_part if per_part and NUM_PATCHES % per_part == 0 else None
 
-    @property
-    def ground(self) -> tuple[str, ...]:
-        """What its terrains have maps of."""
-        return self.kinds
-
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device, by the space."""
         self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out)
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device (:mod:`kernels.ground`)."""
-        for kind in self.kinds:
-            decode, maps = {
-                "friction": (decode_friction, ground_out.friction),
-                "softness": (decode_softness, ground_out.time_constant),
-            }[kind]
-            decode(genes[:, self._columns(kind)].contiguous(), maps)
+        if "friction" in self.ground:
+            decode_friction(genes[:, self._columns("friction")].contiguous(), ground_out.friction)
+        if "softness" in self.ground:
+            decode_softness(genes[:, self._columns("softness")].contiguous(), ground_out.time_constant)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Hard-random terrains of the space; every patch as it always is, or as slippery or soft as can be."""
@@ -100,11 +82,8 @@ class OnGround(TerrainSpace):
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Those of the space, then each patch of each map in words."""
         row = clipped(genes)
-        words = [
-            _patch_words(kind, value, patch)
-            for kind in self.kinds
-            for patch, value in enumerate(self._values(row, kind))
-        ]
+        values = [(kind, patch) for kind in self.ground for patch in enumerate(self._values(row, kind))]
+        words = [_patch_words(kind, value, patch) for kind, (patch, value) in values]
         return (*self.inner.parts(row[: self.inner.num_genes]), *words)
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
@@ -116,7 +95,7 @@ class OnGround(TerrainSpace):
             changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
             for part in parts:
                 if part >= count:
-                    changed[:, first + part - count] = ABSENT[self.kinds[(part - count) // NUM_PATCHES]]
+                    changed[:, first + part - count] = ABSENT[self.ground[(part - count) // NUM_PATCHES]]
         return changed
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
@@ -134,7 +113,7 @@ class OnGround(TerrainSpace):
         heights = row[: self.inner.num_genes]
         across = [words + self._ground_words(row, begin, end) for words, begin, end in self.inner.spans(heights)]
         lines = [", ".join(across) or self.inner.describe(heights)]
-        for kind in self.kinds:
+        for kind in self.ground:
             right, left = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY]
             lines.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
         return "\n".join(lines)
@@ -143,7 +122,7 @@ class OnGround(TerrainSpace):
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
         first, last = patches_at((begin, end), PATCH * COLS, COLS)
         words = []
-        for kind in self.kinds:
+        for kind in self.ground:
             values = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]
             if kind == "friction" and values.min() < _MOST_FRICTION:
                 words.append(f"friction {values.min():.2f}")
@@ -152,7 +131,7 @@ class OnGround(TerrainSpace):
         return f" ({', '.join(words)})" if words else ""
 
     def _columns(self, kind: str) -> slice:
-        first = self.inner.num_genes + NUM_PATCHES * self.kinds.index(kind)
+        first = self.inner.num_genes + NUM_PATCHES * self.ground.index(kind)
         return slice(first, first + NUM_PATCHES)
 
     def _values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:

@@ -54,7 +54,7 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     space = SPACES.get(base) or _find_loaded(base, sha256)
     if kinds and space.ground:
         raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
-    return OnGround(inner=space, kinds=kinds) if kinds else space
+    return OnGround(inner=space, ground=kinds) if kinds else space
 
 
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:

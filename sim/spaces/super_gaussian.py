@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,9 @@ _HEIGHT = PARAMETERS.index("w")
 class SuperGaussian(TerrainSpace):
     """Eq. 1, with genes rescaled by Table I."""
 
+    name: ClassVar[str] = "super_gaussian"
+    any_spacing: ClassVar[bool] = True
+    genes_per_part: ClassVar[int] = GENES_PER_BUMP
     num_bumps: int = 8
 
     def __post_init__(self) -> None:
@@ -25,24 +28,9 @@ class SuperGaussian(TerrainSpace):
             raise ValueError(f"num_bumps must be at least 1, got {self.num_bumps}")
 
     @property
-    def name(self) -> str:
-        """What files and command lines call the space."""
-        return "super_gaussian"
-
-    @property
     def num_genes(self) -> int:
         """Eight genes a bump, in the order of :data:`kernels.super_gaussian.PARAMETERS`, bump after bump."""
         return self.num_bumps * GENES_PER_BUMP
-
-    @property
-    def any_spacing(self) -> bool:
-        """A bump has a height everywhere."""
-        return True
-
-    @property
-    def genes_per_part(self) -> int:
-        """A part is a bump."""
-        return GENES_PER_BUMP
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
