@@ -69,8 +69,8 @@ def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.Mod
     if structure:
         return builder, problems + structure
     joints = joint_names(builder)
-    problems += number_problems(builder, [leaf_name(label) for label in builder.body_label], joints)
-    problems += drive_problems(builder, files.root, joints)
+    problems += _number_problems(builder, joints)
+    problems += _drive_problems(builder, files.root, joints)
     if "joint_names" not in wrong:
         problems += _joint_name_problems(builder, robot) or _joint_value_problems(builder, robot, files, wrong)
     roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
@@ -94,7 +94,7 @@ def _add_model(builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles)
             str(robot.model_file), enable_self_collisions=False, parse_mujoco_options=False, parse_visuals=False
         )
     if newton.JointType.FIXED in builder.joint_type:
-        merge_fixed_bodies(builder)
+        _merge_fixed_bodies(builder)
 
 
 def _name_by_link(builder: newton.ModelBuilder) -> None:
@@ -105,7 +105,7 @@ def _name_by_link(builder: newton.ModelBuilder) -> None:
         builder.shape_label[k] = f"{name}_{bodies[:k].count(body)}" if bodies.count(body) > 1 else name
 
 
-def merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
+def _merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
     """Makes one body of those that are fixed to each other, with the mass, mass centre and inertia of all of them.
 
     Newton's own merging adds inertias about different points.
@@ -117,10 +117,10 @@ def merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
         if kind == newton.JointType.FIXED and parent >= 0:
             in_parent = model.joint_X_p[joint] * wp.transform_inverse(model.joint_X_c[joint])
             root[child], pose[child] = root[parent], pose[parent] * in_parent
-    masses = {}
-    for body in set(root):
-        parts = [k for k in range(model.body_count) if root[k] == body]
-        masses[model.body_label[body]] = _mass_of(model, parts, [pose[k] for k in parts])
+    masses = {
+        model.body_label[body]: _mass_of(model, [k for k in range(model.body_count) if root[k] == body], pose)
+        for body in set(root)
+    }
     model.collapse_fixed_joints()
     for body, label in enumerate(model.body_label):
         mass, centre, inertia = masses[label]
@@ -131,17 +131,14 @@ def merge_fixed_bodies(builder: newton.ModelBuilder) -> None:
 
 
 def _mass_of(builder: Any, bodies: list[int], poses: list[Any]) -> tuple[float, np.ndarray, np.ndarray]:
-    """Mass [kg], mass centre [m] and inertia about it [kg m^2] of bodies at the given poses."""
+    """Mass [kg], mass centre [m] and inertia about it [kg m^2] of some bodies; poses of all are given."""
     mass = [float(builder.body_mass[k]) for k in bodies]
-    centres = [
-        np.array(wp.transform_point(pose, _vec3(*builder.body_com[k])), dtype=np.float64)
-        for k, pose in zip(bodies, poses, strict=True)
-    ]
+    centres = [np.array(wp.transform_point(poses[k], _vec3(*builder.body_com[k])), dtype=np.float64) for k in bodies]
     total = sum(mass)
     centre = np.average(centres, axis=0, weights=mass) if total > 0.0 else centres[0]
     inertia = np.zeros((3, 3))
-    for k, pose, m, centre_of_body in zip(bodies, poses, mass, centres, strict=True):
-        turn = np.array(wp.quat_to_matrix(pose.q), dtype=np.float64).reshape(3, 3)
+    for k, m, centre_of_body in zip(bodies, mass, centres, strict=True):
+        turn = np.array(wp.quat_to_matrix(poses[k].q), dtype=np.float64).reshape(3, 3)
         off = centre_of_body - centre
         inertia += turn @ np.array(builder.body_inertia[k], dtype=np.float64).reshape(3, 3) @ turn.T
         inertia += m * (off @ off * np.eye(3) - np.outer(off, off))
@@ -155,10 +152,7 @@ def _structure_problems(builder: newton.ModelBuilder) -> list[str]:
     joints = joint_names(builder)
     crowded = [name for name, size in zip(joints, builder.joint_dof_dim[1:], strict=True) if sum(size) != 1]
     if crowded:
-        problems.append(
-            f"every joint must be a hinge or slide on a body of its own, unlike {', '.join(crowded)}: one robot, one "
-            "free body, one joint a body"
-        )
+        problems.append(f"every joint must be a hinge or slide on a body of its own, unlike {', '.join(crowded)}")
     fixed = [name for name, body in zip(geom_names(builder), builder.shape_body, strict=True) if body < 0]
     if fixed:
         problems.append(f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out")
@@ -186,10 +180,7 @@ def _joint_value_problems(
         problems += _range_problems(builder, robot)
     weak = joints_without_effort(files.root) if files.is_urdf and robot.effort_limit is None else []
     if weak:
-        problems.append(
-            f"joints without effort (<limit effort>): {', '.join(weak)}: give them one above 0 [N m], or effort_limit "
-            "in the settings"
-        )
+        problems.append(f"no <limit effort> above 0 for {', '.join(weak)}: give it, or effort_limit in the settings")
     if len(values) == len(_UNITS) and not short:
         problems += _set_drives(builder, robot)
     return problems
@@ -197,13 +188,8 @@ def _joint_value_problems(
 
 def _range_problems(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
     """Default angles that the joints cannot take."""
-    ranges = zip(
-        robot.joint_names,
-        robot.default_joint_pos,
-        builder.joint_limit_lower[6:],
-        builder.joint_limit_upper[6:],
-        strict=True,
-    )
+    limits = builder.joint_limit_lower[6:], builder.joint_limit_upper[6:]
+    ranges = zip(robot.joint_names, robot.default_joint_pos, *limits, strict=True)
     beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, low, high in ranges
               if not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
     degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in robot.default_joint_pos) else ""
@@ -231,17 +217,11 @@ def _set_drives(builder: newton.ModelBuilder, robot: RobotCfg) -> list[str]:
     """Takes gains, limits and armature from the settings where they are given; returns the problems of the gains."""
     joints = robot.joint_names
     driven = [name for name, gain in zip(joints, builder.joint_target_ke[6:], strict=True) if gain > 0.0]
-    if robot.stiffness is not None and driven:
-        return [
-            f"{robot.model_file} has position actuators for {', '.join(driven)}, and the settings have stiffness: take "
-            "one of them out"
-        ]
     limp = [name for name in joints if name not in driven]
+    if robot.stiffness is not None and driven:
+        return [f"stiffness and position actuators for {', '.join(driven)} in {robot.model_file}: take one of them out"]
     if robot.stiffness is None and limp:
-        return [
-            f"no gains for {', '.join(limp)}: give stiffness and damping in the settings, or <position> actuators in "
-            f"{robot.model_file}"
-        ]
+        return [f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"]
     for name, gains in (("joint_target_ke", robot.stiffness), ("joint_target_kd", robot.damping),
                         ("joint_effort_limit", robot.effort_limit), ("joint_armature", robot.armature)):  # fmt: skip
         if gains is not None:
@@ -267,33 +247,29 @@ def _set_contact(builder: newton.ModelBuilder, robot: RobotCfg, *, is_urdf: bool
 
 
 _JOINT_COLUMNS = {
-    "joint_limit_lower": "range",
-    "joint_limit_upper": "range",
-    "joint_target_ke": "kp",
-    "joint_target_kd": "kv",
-    "joint_armature": "armature",
-    "joint_effort_limit": "largest torque",
+    "joint_limit_lower": ("range", -np.inf),
+    "joint_limit_upper": ("range", -np.inf),
+    "joint_target_ke": ("kp", 0.0),
+    "joint_target_kd": ("kv", 0.0),
+    "joint_armature": ("armature", 0.0),
+    "joint_effort_limit": ("largest torque", 0.0),
 }
-_AT_LEAST_0 = ("joint_target_ke", "joint_target_kd", "joint_armature", "joint_effort_limit")
+"""What each column of a builder holds, and at least."""
 
 
-def number_problems(builder: newton.ModelBuilder, bodies: Sequence[str], joints: Sequence[str]) -> list[str]:
+def _number_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list[str]:
     """What is wrong with masses, frames and joints of a robot of single joints, one line each."""
+    bodies, problems = [leaf_name(label) for label in builder.body_label], []
     light = [name for name, mass in zip(bodies, builder.body_mass, strict=True) if not 0.0 < mass < np.inf]
-    problems = (
-        [f"every body must have a mass above 0, unlike {', '.join(light)}: give it an <inertial>"] if light else []
-    )
+    if light:
+        problems.append(f"every body must have a mass above 0, unlike {', '.join(light)}: give it an <inertial>")
     hollow = [name for name, inertia in zip(bodies, builder.body_inertia, strict=True)
               if name not in light and not _is_inertia(inertia)]  # fmt: skip
     if hollow:
-        problems.append(
-            f"every body must have an inertia above 0 about every axis, unlike {', '.join(hollow)}: an <inertial> has "
-            "one beside its mass"
-        )
+        problems.append(f"every body must have an inertia above 0 about every axis, unlike {', '.join(hollow)}")
     lost = [name for name, com in zip(bodies, builder.body_com, strict=True) if not np.isfinite(np.array(com)).all()]
-    lost += [
-        name for name, pose in zip(joints, builder.joint_X_p[1:], strict=True) if not np.isfinite(np.array(pose)).all()
-    ]
+    poses = zip(joints, builder.joint_X_p[1:], strict=True)
+    lost += [name for name, pose in poses if not np.isfinite(np.array(pose)).all()]
     if lost:
         problems.append(f"position and rotation must be numbers, unlike those of {', '.join(lost)}")
     return problems + _joint_problems(builder, joints)
@@ -306,8 +282,7 @@ def _is_inertia(inertia: Any) -> bool:
 
 def _joint_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list[str]:
     problems = []
-    for column, what in _JOINT_COLUMNS.items():
-        least = 0.0 if column in _AT_LEAST_0 else -np.inf
+    for column, (what, least) in _JOINT_COLUMNS.items():
         values = zip(joints, getattr(builder, column)[6:], strict=True)
         wrong = [f"{name} ({value:g})" for name, value in values if not value >= least]
         if wrong:
@@ -328,7 +303,7 @@ def effort_limits(builder: newton.ModelBuilder) -> list[float]:
     return efforts
 
 
-def drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Sequence[str]) -> list[str]:
+def _drive_problems(builder: newton.ModelBuilder, root: ET.Element, joints: Sequence[str]) -> list[str]:
     """Drives and joints that MuJoCo would move otherwise than the simulation, one line each; ``root`` is the file's."""
     attributes: dict[str, Any] = {name: builder.custom_attributes[f"mujoco:{name}"].values for name in _ATTRIBUTES}
     sources, biases, gears, targets = (list(attributes[name] or ()) for name in _ATTRIBUTES[:4])

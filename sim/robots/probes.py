@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from kernels.contact import Probes
 from sim.crossing import CrossingCfg
 from sim.device import host_device
-from sim.robots.model import geom_names
+from sim.robots.model import geom_names, leaf_name
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
@@ -295,15 +295,10 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     )
 
 
-def placed(pose: Any, point: np.ndarray) -> Any:
-    """A point [m] of a frame that stands at ``pose``, as a vec3 in the frame that the pose is in."""
-    local: Any = wp.vec3(*point)
-    return wp.transform_point(pose, local)
-
-
 def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
     centres, radius, spread, body, shape, problems = [], [], [], [], [], []
+    vec3: Any = wp.vec3
     for k in range(builder.shape_count):
         if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
             continue
@@ -313,11 +308,10 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
                 newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k]), builder.shape_source[k]
             )
         except ValueError as error:
-            name = builder.shape_label[k].rsplit("/", 1)[-1]
-            problems.append(f"geom {name}: {error}")
+            problems.append(f"geom {leaf_name(builder.shape_label[k])}: {error}")
             continue
         for strip in strips:
-            centres.append([placed(pose, centre) for centre in strip.centres])
+            centres.append([wp.transform_point(pose, vec3(*centre)) for centre in strip.centres])
             radius.append(strip.radius)
             spread.append(strip.spread)
             body.append(builder.shape_body[k])

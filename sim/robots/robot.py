@@ -153,11 +153,7 @@ class RobotCfg:
         return command_line("train", robot=self.spec, export=self.policy_file)
 
     def read_penalty_scales(self, policy: str | None = None) -> tuple[float, ...]:
-        """Scales of the penalties, in the order of ``penalties``.
-
-        Args:
-            policy: Controller that the command line names, for the command that measures them.
-        """
+        """Scales of the penalties, in their order; an error says how to measure those of the command line's policy."""
         given = policy if self.settings_file is not None else None  # a shipped robot's are of its own controller
         remedy = f"run `{command_line('calibrate', robot=self.spec, policy=given)}`"
         if given is None and not self.policy_file.exists():
@@ -174,12 +170,9 @@ class RobotCfg:
         return tuple(float(scales[name]) for name in self.penalties)
 
     def scaled_by_another(self, policy: str) -> str | None:
-        """What to tell of a search whose controller is not the one that the scales were measured with; None if it is.
+        """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
 
         Scales of the robot's own controller make searches against others comparable: this is no mistake.
-
-        Args:
-            policy: The search's controller.
         """
         measured = read_json(self.scales_file) if self.scales_file.exists() else {}
         if measured.get("policy_sha256") in (None, controller_hash(policy)):

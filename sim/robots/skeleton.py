@@ -172,15 +172,10 @@ class Skeleton:
         )
 
     def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where the bodies are.
+        """Where the bodies are: origins in the world [m] and body-to-world quaternions w x y z.
 
-        Args:
-            qpos: MuJoCo's joint coordinates, as :meth:`sim.recording.recorder.Recording.qpos` gives them, shape
-                (num_frames, num_coordinates).
-
-        Returns:
-            Origins in the world [m], shape (num_frames, num_bodies, 3), and body-to-world quaternions w x y z, shape
-            (num_frames, num_bodies, 4).
+        Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
+        (num_frames, num_coordinates), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
         """
         if qpos.ndim != 2 or qpos.shape[1] != self.num_coordinates:
             raise ValueError(f"qpos must have shape (num_frames, {self.num_coordinates}), got {qpos.shape}")
