@@ -26,12 +26,8 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
 
     A space that is made for 0.05 m gives the means of 3 x 3 nodes, so that nothing narrow falls between two nodes.
 
-    Args:
-        genes: Float32 in [-1, 1], shape (num_terrains, num_genes), on the device that does the work.
-        space: What the genes mean.
-
-    Returns:
-        Float32 tensor on that device, shape (num_terrains, 41, 121).
+    Genes are float32 in [-1, 1], shape (num_terrains, num_genes), on the device that does the work; heights come on it,
+    float32, shape (num_terrains, 41, 121).
     """
     heights = genes.new_empty(len(genes), *SHAPE)
     with wp.ScopedDevice(wp.device_from_torch(genes.device)):
@@ -42,15 +38,10 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
 
 
 def corridor_ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    """What :attr:`TerrainSpace.ground` names, around the way, on the nodes of :func:`corridor_heights`.
+    """What :attr:`TerrainSpace.ground` names, on the nodes of :func:`corridor_heights`, which has the same arguments.
 
-    Args:
-        genes: As of :func:`corridor_heights`.
-        space: What the genes mean.
-
-    Returns:
-        Float32 tensor on their device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the
-        friction that is missing, and the time constant over that of the softest ground.
+    Float32 tensor on their device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the friction
+    that is missing, and the time constant over that of the softest ground.
     """
     if not space.ground:
         return genes.new_empty(len(genes), 0, *SHAPE)

@@ -91,10 +91,10 @@ def _check_map(name: str, values: NDArray[np.floating], allowed: NDArray[np.bool
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     """The name of a space without its ground, and what that has maps of: ``course+friction`` is of ``course``."""
-    found = _SUFFIX.search(name)
-    if found is None or found.start() == 0:
+    suffix = _SUFFIX.search(name)
+    if suffix is None or suffix.start() == 0:
         return name, ()
-    return name[: found.start()], tuple(kind for kind in GROUND_KINDS if f"+{kind}" in found.group(1))
+    return name[: suffix.start()], tuple(kind for kind in GROUND_KINDS if f"+{kind}" in suffix[1])
 
 
 def joined_name(name: str, kinds: Sequence[str]) -> str:

@@ -3,8 +3,7 @@
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -176,8 +175,17 @@ class Rollout:
         self.space, self._with_ground = space, with_ground or bool(space.ground)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
-        with _saying_what_does_not_fit(self.num_envs, num_terrains, device):
+        try:
             self._build(loaded, solver, device)
+        except (MemoryError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and not re.search(
+                "out of memory|failed to allocate", str(error).lower()
+            ):
+                raise
+            raise ValueError(
+                f"{self.num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has "
+                "free: give fewer robots (--num-envs), or fewer terrains"
+            ) from error
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
         bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground)
@@ -308,13 +316,7 @@ class Rollout:
         self._queue.episode_of_env.fill_(-1)
 
     def put(self, terrains: np.ndarray, seeds: np.ndarray, ground: GroundMaps | None = None) -> None:
-        """Let every replica on some terrains be crossed, behind what is under way; waits for nothing.
-
-        Args:
-            terrains: As of :meth:`evaluate`, seeds and ground too; at most :attr:`num_free` of them.
-            seeds: One a terrain.
-            ground: Of heights.
-        """
+        """Queue crossings of at most :attr:`num_free` terrains, arguments as of :meth:`evaluate`; waits for nothing."""
         count, idle = len(terrains), not self._lots
         if seeds.shape != (count,):
             raise ValueError(f"seeds must have shape ({count},), one a terrain, got {seeds.shape}")
@@ -339,22 +341,18 @@ class Rollout:
     def _write_terrains(self, terrains: Any, seeds: Any, slots: Sequence[slice], ground: GroundMaps | None) -> None:
         done = 0
         with wp.ScopedDevice(self.sim.device):
-            for own in slots:
-                part = slice(done, done + own.stop - own.start)
+            for run in slots:
+                part = slice(done, done + run.stop - run.start)
                 if terrains.ndim == 3:
-                    self.sim.bank.set_heights(terrains[part], own, ground=None if ground is None else ground[part])
+                    self.sim.bank.set_heights(terrains[part], run, ground=None if ground is None else ground[part])
                 else:
-                    self.sim.bank.set_genes(terrains[part], self.space, own)
-                self._queue.seed[own].assign(seeds[part].astype(np.uint32))
-                self._queue.num_ended[own].zero_()
+                    self.sim.bank.set_genes(terrains[part], self.space, run)
+                self._queue.seed[run].assign(seeds[part].astype(np.uint32))
+                self._queue.num_ended[run].zero_()
                 done = part.stop
 
     def _release(self, *, begin: bool) -> None:
-        """Let robots take what was put in; one episode each if they have to begin together.
-
-        Args:
-            begin: Whether all of them wait and are to begin now; else each takes one when its own has ended.
-        """
+        """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
         count = self._num_unreleased
         if self._policy.memory is Memory.WHOLE:
             count = min(count, self.num_envs)
@@ -384,17 +382,10 @@ class Rollout:
             self.control_step(watcher)
 
     def take(self, progress: Callable[[float], None] | None = None, *, watcher: Watcher | None = None) -> RolloutResult:
-        """Wait for the terrains that were put in first.
+        """Wait for the terrains that were put in first, and return what came of their episodes.
 
-        Args:
-            progress: Called at every look with the share of them that is done; may put in more.
-            watcher: Looks on.
-
-        Returns:
-            What came of their episodes. On a GPU what else is under way goes on without waiting.
-
-        Raises:
-            RuntimeError: If nothing is under way.
+        On a GPU what else is under way goes on without waiting. ``progress`` is called at every look with the share of
+        them that is done, and may put in more.
         """
         if not self._lots:
             raise RuntimeError("take() must follow put(), got nothing under way")
@@ -418,14 +409,14 @@ class Rollout:
         return result
 
     def _num_ended(self, lot: _Lot) -> int:
-        return sum(int(self._queue.num_ended[own].numpy().sum()) for own in lot.slots)
+        return sum(int(self._queue.num_ended[slots].numpy().sum()) for slots in lot.slots)
 
     def _collect(self, lot: _Lot) -> RolloutResult:
         queue, robot = self._queue, self.robot
-        rows = [slice(own.start * self.num_replicas, own.stop * self.num_replicas) for own in lot.slots]
+        rows = [slice(slots.start * self.num_replicas, slots.stop * self.num_replicas) for slots in lot.slots]
 
         def of(array: Any) -> np.ndarray:
-            values = np.concatenate([array[own].numpy() for own in rows])  # a copy: on the CPU numpy() is a view
+            values = np.concatenate([array[part].numpy() for part in rows])  # a copy: on the CPU numpy() is a view
             return values.reshape(-1, self.num_replicas, *values.shape[1:])
 
         outcome, steps, pose = of(queue.outcome).astype(np.uint8), of(queue.steps), of(queue.final_pose)
@@ -456,17 +447,3 @@ class Rollout:
             wall_s=wall_s,
             reward=reward,
         )
-
-
-@contextmanager
-def _saying_what_does_not_fit(num_envs: int, num_terrains: int, device: str) -> Iterator[None]:
-    """Says of an allocation that failed what it was for, by a ValueError."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not re.search("out of memory|failed to allocate", str(error).lower()):
-            raise
-        raise ValueError(
-            f"{num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has free: "
-            "give fewer robots (--num-envs), or fewer terrains"
-        ) from error

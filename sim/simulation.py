@@ -30,7 +30,7 @@ use_own_solver()
 
 @dataclass(frozen=True, kw_only=True)
 class SolverCfg:
-    """Options of the physics solver, chosen by measurement (``faultline solver-options``).
+    """Options of the physics solver, chosen by measurement.
 
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that the integrator
     ``implicitfast`` takes with steps of 0.005 s. At MuJoCo's default of 0.02 s feet that land hard sink in by more than
@@ -230,7 +230,11 @@ class Simulation:
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
         self.geom_names = self.robot.geom_names
-        self.solver_contacts = view_solver_contacts(data)
+        self.solver_contacts = SolverContacts()
+        self.solver_contacts.count, self.solver_contacts.capacity = data.nacon, data.naconmax
+        self.solver_contacts.world, self.solver_contacts.geom = data.contact.worldid, data.contact.geom
+        self.solver_contacts.frame, self.solver_contacts.efc_address = data.contact.frame, data.contact.efc_address
+        self.solver_contacts.efc_force = data.efc.force
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -330,16 +334,3 @@ class Simulation:
         """Run a captured graph once."""
         with wp.ScopedDevice(self.device):
             wp.capture_launch(graph)
-
-
-def view_solver_contacts(data: Any) -> SolverContacts:
-    """The contact arrays of a mujoco_warp ``Data`` as a kernel argument."""
-    contacts = SolverContacts()
-    contacts.count = data.nacon
-    contacts.capacity = data.naconmax
-    contacts.world = data.contact.worldid
-    contacts.geom = data.contact.geom
-    contacts.frame = data.contact.frame
-    contacts.efc_address = data.contact.efc_address
-    contacts.efc_force = data.efc.force
-    return contacts

@@ -21,10 +21,7 @@ def array_names(path: Path) -> list[str]:
 def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("inf")) -> dict[str, NDArray[Any]]:
     """Some arrays of an npz file by name; any Exception if it is damaged, another file, or lacks one.
 
-    Args:
-        path: The file.
-        names: Which.
-        max_bytes: Largest size of one of them; a packed file of zeros is small at any size.
+    None may have more than ``max_bytes``: a packed file of zeros is small at any size.
     """
     with zipfile.ZipFile(path) as members:
         missing = set(names) - {name.removesuffix(_ENDING) for name in members.namelist()}

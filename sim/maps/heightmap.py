@@ -78,10 +78,6 @@ def read_heightmap(
         size_m: Along x and along y.
         scale_m: Metres a gray level; heights of an npz are multiplied by it too, if it is given.
         offset_m: Height of gray level 0; added to the heights of an npz, if it is given.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If the file is damaged or of another kind, a size or scale is missing, or a number is out of range.
     """
     path = Path(path)
     if not os.path.isfile(path):  # False too for a name that no file can have

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -48,12 +48,8 @@ from sim.spaces.base import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
 _WARNINGS = [
-    _mj.mjtWarning.mjWARN_CONTACTFULL,
-    _mj.mjtWarning.mjWARN_CNSTRFULL,
-    _mj.mjtWarning.mjWARN_BADQPOS,
-    _mj.mjtWarning.mjWARN_BADQVEL,
-    _mj.mjtWarning.mjWARN_BADQACC,
-    _mj.mjtWarning.mjWARN_BADCTRL,
+    getattr(_mj.mjtWarning, f"mjWARN_{name}")
+    for name in ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
 ]
 
 
@@ -77,12 +73,7 @@ def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
 
 
 def draw_starts(
-    robot: RobotCfg,
-    heights: NDArray[np.float32],
-    seed: int,
-    count: int,
-    device: str,
-    cfg: CrossingCfg | None = None,
+    robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str, cfg: CrossingCfg | None = None
 ) -> Starts:
     """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
@@ -294,12 +285,8 @@ def cross_terrains(
 def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that have the controller loaded; an OSError if one of them dies."""
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        processes,
-        multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(robot, policy, os.getpid()),
-    )
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, spawn, _start_worker, (robot, policy, os.getpid()))
     try:
         yield pool
     except BrokenProcessPool as error:
@@ -314,5 +301,5 @@ def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[Proc
 
 def _join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
     """Crossings of one terrain that were run in parts."""
-    names = [field.name for field in fields(PlainCrossings)]
+    names = vars(parts[0])
     return PlainCrossings(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -83,9 +83,6 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
             and the robot, and returns a policy.
         robot: The robot it is to walk: fixes observation and action size.
         device: Warp device name.
-
-    Raises:
-        ValueError: If the controller cannot be loaded, or its actions have the wrong shape or are not finite.
     """
     where = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
     if where != "cpu" and not torch.cuda.is_available():

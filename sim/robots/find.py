@@ -15,7 +15,6 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     Args:
         spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; None is
             ANYmal; settings are returned as they are.
-
     """
     if isinstance(spec, RobotCfg):
         return spec

@@ -49,7 +49,10 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     files = [model_file]
     if root.tag == "robot":
         problems += _urdf_problems(root)
-        files += [_take_urdf_mesh(mesh, model_file) for mesh in root.iter("mesh") if mesh.get("filename")]
+        for mesh in root.iter("mesh"):
+            if mesh.get("filename"):
+                files.append(_mesh_path(mesh, model_file))
+                mesh.set("filename", str(files[-1]))
     else:
         files += _mjcf_files(root, (Path(os.path.abspath(model_file)),), model_file.parent)
     missing = sorted({str(file) for file in files if not file.is_file()})
@@ -148,13 +151,6 @@ def _can_be_shown(visual: ET.Element, model_file: Path) -> bool:
     except ValueError:
         return False
     return all(path.suffix.lower() in _SUFFIXES and path.is_file() for path in meshes)
-
-
-def _take_urdf_mesh(mesh: ET.Element, model_file: Path) -> Path:
-    """Makes the file name of a URDF's mesh absolute, and returns it."""
-    path = _mesh_path(mesh, model_file)
-    mesh.set("filename", str(path))
-    return path
 
 
 def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:

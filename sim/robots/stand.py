@@ -94,7 +94,26 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     ]
     sim.joint_q.assign(q)
     contacts, rows, overflowed, forces = _let_fall(sim, seconds)
-    return _judged(sim, robot, bottoms, start_height(robot, builder), contacts, rows, overflowed, forces)
+    first = sim.joint_q.numpy()[0].astype(np.float64)
+    weight = float(sim.model.body_mass.numpy()[: sim.layout.bodies_per_env].sum()) * _GRAVITY
+    up = 1.0 - 2.0 * (first[3] ** 2 + first[4] ** 2)
+    on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
+    carried = zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True)
+    return Standing(
+        gap=min(bottoms[name] for name in robot.foot_geoms),
+        lowest=min(bottoms, key=lambda name: bottoms[name]),
+        right_height=start_height(robot, builder),
+        height=(robot.default_base_height, float(first[2])),
+        tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
+        joint_error=float(np.abs(first[7:] - robot.default_joint_pos).max(initial=0.0)),
+        carried={name: float(share) for name, share in carried if share > 1e-3},
+        bounce=(float(on_feet.sum(axis=1).min()), float(on_feet.sum(axis=1).max())),
+        restless=float(np.abs(np.diff(on_feet, axis=0)).sum(axis=1).mean()),
+        contacts=contacts,
+        rows=rows,
+        overflowed=overflowed,
+        finite=bool(np.isfinite(sim.joint_q.numpy()).all() and np.isfinite(sim.joint_qd.numpy()).all()),
+    )
 
 
 def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
@@ -126,32 +145,6 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArra
             rows = max(rows, int(sim.solver.mjw_data.nefc.numpy().max()))
             overflowed |= bool((sim.overflow.numpy() & CAPACITY_OVERFLOWS).any())
     return contacts, rows, overflowed or contacts > sim.robot.nconmax, np.array(forces, dtype=np.float64)
-
-
-def _judged(
-    sim: Simulation, robot: RobotCfg, bottoms: dict[str, float], right_height: float, contacts: float, rows: int,
-    overflowed: bool, forces: NDArray[np.float64],
-) -> Standing:  # fmt: skip
-    q = sim.joint_q.numpy()[0].astype(np.float64)
-    weight = float(sim.model.body_mass.numpy()[: sim.layout.bodies_per_env].sum()) * _GRAVITY
-    up = 1.0 - 2.0 * (q[3] ** 2 + q[4] ** 2)
-    mean = dict(zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True))
-    on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
-    return Standing(
-        gap=min(bottoms[name] for name in robot.foot_geoms),
-        lowest=min(bottoms, key=lambda name: bottoms[name]),
-        right_height=right_height,
-        height=(robot.default_base_height, float(q[2])),
-        tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
-        joint_error=float(np.abs(q[7:] - robot.default_joint_pos).max(initial=0.0)),
-        carried={name: float(share) for name, share in mean.items() if share > 1e-3},
-        bounce=(float(on_feet.sum(axis=1).min()), float(on_feet.sum(axis=1).max())),
-        restless=float(np.abs(np.diff(on_feet, axis=0)).sum(axis=1).mean()),
-        contacts=contacts,
-        rows=rows,
-        overflowed=overflowed,
-        finite=bool(np.isfinite(sim.joint_q.numpy()).all() and np.isfinite(sim.joint_qd.numpy()).all()),
-    )
 
 
 def describe_model(robot: RobotCfg) -> str:

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
+from sim.terrain import Seed
 
-Seed = int | np.random.Generator
-"""What random terrains are drawn from. A Generator gives other terrains on each call, an int the same ones."""
 DEFAULT_SIGMA0 = 2.0
 """So wide a start asks for terrains at the genes' limits, which are the hard ones of most spaces."""
 

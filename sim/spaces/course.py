@@ -64,12 +64,12 @@ class Course(TerrainSpace):
         rows = genes.reshape(-1, GENES_PER_ELEMENT)
         kinds = np.minimum((rows[:, _KIND] + 1.0) / 2.0 * len(Kind), len(Kind) - 1).astype(int)
         for kind, ranges in PARAMETERS.items():
-            for column, own in enumerate(ranges, _FIRST_PARAMETER):
+            for column, limits in enumerate(ranges, _FIRST_PARAMETER):
                 of_kind = kinds == kind
-                if own.hard == "either":
+                if limits.hard == "either":
                     rows[of_kind, column] = np.where(rows[of_kind, column] < 0.0, -1.0, 1.0)
-                elif own.hard:
-                    rows[of_kind, column] = {"low": -1.0, "high": 1.0}[own.hard]
+                elif limits.hard:
+                    rows[of_kind, column] = {"low": -1.0, "high": 1.0}[limits.hard]
         return genes
 
     def elements(self, genes: ArrayLike) -> NDArray[Any]:

@@ -236,14 +236,20 @@ DOSES: dict[str, Dose] = {
 """Every dose by its name."""
 
 
-def chosen_doses(elements: Mapping[str, Sequence[float] | None], others: Mapping[str, float]) -> dict[str, Dose]:
-    """Some of the doses, in the order of :data:`DOSES`.
+def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
+    """Some of :data:`DOSES`, in their order, as a command line names them; all of them without ``words``.
 
     Args:
-        elements: Some of :data:`DOSES`, each with other values or None; all if empty.
-        others: Other parameters of those that have them.
+        words: ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces.
+        at: Other parameters of those that have them, ``tread=0.25``.
     """
+    elements: dict[str, Sequence[float] | None] = {}
+    for word in " ".join(words).split():
+        name, equals, values = word.partition("=")
+        elements[name] = [_number(value, word) for value in values.split(",")] if equals else None
     elements = elements or dict.fromkeys(DOSES)
+    pairs = (word.partition("=") for word in " ".join(at).split())
+    others = {name: _number(value, f"{name}={value}") for name, _, value in pairs}
     if unknown := elements.keys() - DOSES.keys():
         raise ValueError(f"elements must be some of {', '.join(DOSES)}, got {', '.join(sorted(unknown))}")
     doses = {name: dose for name, dose in DOSES.items() if name in elements}
@@ -254,16 +260,6 @@ def chosen_doses(elements: Mapping[str, Sequence[float] | None], others: Mapping
             f"got {', '.join(sorted(wrong))}"
         )
     return {name: dose.changed(elements[name], others) for name, dose in doses.items()}
-
-
-def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
-    """Doses that a command line names: ``stairs_up``, ``ditch=0.2,0.4``, with other parameters, ``tread=0.25``."""
-    elements: dict[str, Sequence[float] | None] = {}
-    for word in " ".join(words).split():
-        name, equals, values = word.partition("=")
-        elements[name] = [_number(value, word) for value in values.split(",")] if equals else None
-    pairs = (word.partition("=") for word in " ".join(at).split())
-    return chosen_doses(elements, {name: _number(value, f"{name}={value}") for name, _, value in pairs})
 
 
 def _number(text: str, word: str) -> float:

@@ -22,7 +22,7 @@ class OwnSpace(TerrainSpace):
 
     Args:
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
-        own: The user's object (docs/own-space.md): ``num_genes`` and ``rasterise(genes, x, y)``; optionally
+        code: The user's object (docs/own-space.md): ``num_genes`` and ``rasterise(genes, x, y)``; optionally
             ``hard_random(count, rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``,
             ``scaled(genes, scale)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``,
             ``sigma0``.
@@ -35,20 +35,20 @@ class OwnSpace(TerrainSpace):
     genes_per_part: int | None = None
     ground: tuple[str, ...] = ()
 
-    def __init__(self, spec: str, own: Any) -> None:
-        self.name, self._own, self.sha256 = spec, own, controller_hash(spec)
+    def __init__(self, spec: str, code: Any) -> None:
+        self.name, self._code, self.sha256 = spec, code, controller_hash(spec)
         self.num_genes = self._setting("num_genes", 0, lambda value: isinstance(value, int) and value > 0)
         self.sigma0 = float(self._setting("sigma0", DEFAULT_SIGMA0, lambda value: 0.0 < value < np.inf))
         self.genes_per_part = self._setting(
             "genes_per_part", None, lambda value: value is None or (value > 0 and self.num_genes % value == 0)
         )
-        self.ground = tuple(kind for kind in GROUND_KINDS if hasattr(own, kind))
-        for name in ("rasterise", *(["without"] if hasattr(own, "parts") else [])):
-            if not callable(getattr(own, name, None)):
+        self.ground = tuple(kind for kind in GROUND_KINDS if hasattr(code, kind))
+        for name in ("rasterise", *(["without"] if hasattr(code, "parts") else [])):
+            if not callable(getattr(code, name, None)):
                 raise self._wrong(name, "must be a method, got none")
 
     def _setting(self, name: str, default: Any, allowed: Callable[[Any], bool]) -> Any:
-        value = getattr(self._own, name, default)
+        value = getattr(self._code, name, default)
         try:
             if allowed(value):
                 return value
@@ -97,7 +97,7 @@ class OwnSpace(TerrainSpace):
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """What the user's method draws, clipped; uniform genes if it has none."""
-        if count < 1 or not hasattr(self._own, "hard_random"):
+        if count < 1 or not hasattr(self._code, "hard_random"):
             return self.uniform_random(count, seed)
         genes = self._call_for_genes("hard_random", count, np.random.default_rng(seed))
         if len(genes) != count:
@@ -107,26 +107,26 @@ class OwnSpace(TerrainSpace):
     def describe(self, genes: ArrayLike) -> str:
         """What the user's method says of a terrain; its parts, or its genes as numbers, if it has none."""
         row = clipped(genes)
-        if hasattr(self._own, "describe"):
+        if hasattr(self._code, "describe"):
             return str(self._call("describe", row))
         return super().describe(row) or f"genes {', '.join(f'{gene:.2f}' for gene in row)}"
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """The parts that the user's method names; none if it has none."""
-        return tuple(map(str, self._call("parts", clipped(genes)))) if hasattr(self._own, "parts") else ()
+        return tuple(map(str, self._call("parts", clipped(genes)))) if hasattr(self._code, "parts") else ()
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes of the same terrains without some of their parts."""
         rows = self.validate(genes)
         if not len(parts):
             return rows
-        if not hasattr(self._own, "parts"):
+        if not hasattr(self._code, "parts"):
             raise self._wrong("parts", "is missing: terrains of this space have no parts to take away")
         return self._call_for_genes("without", clipped(rows), list(parts))
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
         """What the user's method makes of genes; None if there is none."""
-        if not hasattr(self._own, "scaled"):
+        if not hasattr(self._code, "scaled"):
             return None
         return self._call_for_genes("scaled", clipped(self.validate(genes)), scale)
 
@@ -139,7 +139,7 @@ class OwnSpace(TerrainSpace):
 
     def _call(self, method: str, *arguments: Any) -> Any:
         try:
-            return getattr(self._own, method)(*arguments)
+            return getattr(self._code, method)(*arguments)
         except Exception as error:  # a user's code can fail with anything
             raise self._wrong(method, f"fails: {in_one_line(error)}") from error
 
@@ -148,18 +148,14 @@ class OwnSpace(TerrainSpace):
 
 
 def load_own(spec: str) -> OwnSpace:
-    """Runs the code of a space and tries all of it on three terrains.
-
-    Args:
-        spec: ``file.py:Space`` or ``module:Space``; a class is called without arguments.
-    """
+    """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains."""
     place = ControllerSpec.parse(spec)
     try:
-        own: Any = find_named(str(place.place), str(place.name))
-        own = own() if inspect.isclass(own) else own
+        code: Any = find_named(str(place.place), str(place.name))
+        code = code() if inspect.isclass(code) else code
     except Exception as error:  # a user's code can fail with anything
         raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}") from error
-    space, device = OwnSpace(spec, own), host_device()
+    space, device = OwnSpace(spec, code), host_device()
     hard = space.hard_random(2, 0)
     genes = np.concatenate([np.zeros((1, space.num_genes), np.float32), hard])
     with wp.ScopedDevice(device):

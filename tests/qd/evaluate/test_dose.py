@@ -11,7 +11,7 @@ from qd.evaluate import dose as dose_module
 from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
-from sim.spaces.dose import chosen_doses, parse_doses
+from sim.spaces.dose import parse_doses
 from tests.qd.evaluate.made import Crosser
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
@@ -51,7 +51,7 @@ def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
 
 
 def test_seeds_and_places_are_the_same_for_all_values_and_doses():
-    doses = chosen_doses({"ditch": [0.2, 0.4], "sill": None}, {})
+    doses = parse_doses(["ditch=0.2,0.4 sill"], [])
     ditch, sill = (dose_set(name, doses[name], 3, 7) for name in ("ditch", "sill"))
     np.testing.assert_array_equal(ditch.seeds.reshape(3, 2), ditch.seeds[::2, None].repeat(2, axis=1))
     np.testing.assert_array_equal(ditch.seeds[::2], sill.seeds[:: len(doses["sill"].values)])
@@ -59,7 +59,7 @@ def test_seeds_and_places_are_the_same_for_all_values_and_doses():
 
 
 def test_rows_are_by_value():
-    dose = chosen_doses({"ditch": [0.2, 0.4]}, {})["ditch"]
+    dose = parse_doses(["ditch=0.2,0.4"], [])["ditch"]
     # Two places of two values each, two episodes: the first value at both places comes first.
     result = result_of([[GOAL, GOAL], [HIT, LATE], [GOAL, BAD], [BAD, BAD]], fallen=[[0, 0], [1, 0], [0, 0], [0, 0]])
     first, second = rows_of("ditch", dose, "base", result)
@@ -82,7 +82,7 @@ def test_rows_are_by_value():
     ],
 )
 def test_where_under_half_begin_to_reach_the_goal(name, rates, limits, value, interval):
-    dose = chosen_doses({name: [0.2, 0.4]}, {})[name]
+    dose = parse_doses([f"{name}=0.2,0.4"], [])[name]
     about = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "controller": "a"}
     rows = [
         {**about, "value": size, "goal_rate": rate, "interval": list(ends)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bank import terrains_of
-from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, chosen_doses, parse_doses
+from sim.spaces.dose import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, parse_doses
 from sim.spaces.registry import get_space
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
@@ -26,7 +26,8 @@ IN_RANGE = {
 
 
 def dose_of(name, *values, **others):
-    return chosen_doses({name: values}, others)[name]
+    at = [f"{parameter}={value}" for parameter, value in others.items()]
+    return parse_doses([f"{name}={','.join(map(str, values))}"], at)[name]
 
 
 @pytest.mark.parametrize("name", IN_RANGE)
