@@ -55,12 +55,9 @@ class TerrainBank:
         return self.terrain.heights
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
-        """Replace terrains by height grids [m].
+        """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol).
 
-        Args:
-            heights: Shape (number of slots, nrow, ncol).
-            slots: Which are replaced; all if left out.
-            ground: Their friction and softness; ground that changes nothing if left out.
+        Without ``ground`` their friction and softness change nothing.
         """
         replaced = self.heights[slots]
         expected = tuple(replaced.shape)
@@ -89,13 +86,7 @@ class TerrainBank:
         return maps
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
-        """Replace terrains by those of genes of a space.
-
-        Args:
-            genes: Shape (number of slots, num_genes).
-            space: What the genes mean.
-            slots: Which are replaced; all if left out.
-        """
+        """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
         valid, replaced = space.validate(genes), self.heights[slots]
         if len(valid) != len(replaced):
             raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")

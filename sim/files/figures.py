@@ -41,12 +41,7 @@ def _png_of(figure: Figure) -> bytes:
 
 
 def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) -> NDArray[np.float64]:
-    """How far error bars go below and above values, shape (2, count); NaN, which draws none, without interval.
-
-    Args:
-        values: Shape (count,).
-        intervals: Lower and upper limit of each.
-    """
+    """How far error bars of values (count,) go below and above, shape (2, count); NaN, which draws none, without."""
     limits = np.array([interval or (np.nan, np.nan) for interval in intervals], np.float64).reshape(-1, 2)
     means = np.asarray(values, np.float64)
     return np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)  # equal limits may be off by rounding

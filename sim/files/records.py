@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, fields
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -112,18 +112,16 @@ def robot_digest(robot: RobotSettings) -> str:
 
     A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
     """
-    values = {field.name: (getattr(robot, field.name), _default(field)) for field in fields(robot)}
-    settings = {
-        name: value for name, (value, default) in values.items() if name not in _NOT_IN_DIGEST and value != default
-    }
+    settings = {}
+    for field in fields(robot):
+        value = getattr(robot, field.name)
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if field.name not in _NOT_IN_DIGEST and value != default:
+            settings[field.name] = value
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for file in read_model_files(robot.model_file).files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
-
-
-def _default(setting: Field[Any]) -> Any:
-    return setting.default if setting.default_factory is MISSING else setting.default_factory()
 
 
 def robot_identity(robot: RobotSettings) -> dict[str, str]:

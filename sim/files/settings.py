@@ -80,7 +80,8 @@ def _unknown(given: Any, known: Any) -> Iterator[str]:
 
 def _mismatch(annotation: Any, value: Any) -> str | None:
     """What a value should have been; None if it fits or its annotation is beyond msgspec."""
-    parts = [float(part) if isinstance(part, float) else part for part in _parts(value)]  # a NumPy float as Python's
+    parts = value if isinstance(value, tuple) else (value,)
+    parts = [float(part) if isinstance(part, float) else part for part in parts]  # a NumPy float as Python's
     if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
         return "a finite number"
     plain = tuple(parts) if isinstance(value, tuple) else parts[0]
@@ -104,10 +105,6 @@ def _choices(annotation: Any) -> tuple[Any, ...]:
     """Values of the literals in an annotation."""
     parts = get_args(annotation)
     return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
-
-
-def _parts(value: Any) -> tuple[Any, ...]:
-    return value if isinstance(value, tuple) else (value,)
 
 
 def _brief(value: Any) -> str:
