@@ -16,9 +16,7 @@ from sim.simulation import Simulation
 def soft_joint_limits(sim: Simulation, share: float) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper soft limits of the joints [rad], float32, shape (num_joints,) each.
 
-    Args:
-        sim: The robots.
-        share: Part of each joint's range that they span, about its middle; where there is none, they are far away.
+    They span a share of each joint's range about its middle; where there is none, they are far away.
     """
     joints = slice(6, 6 + sim.robot.num_joints)
     lower, upper = (

@@ -48,11 +48,7 @@ def bootstrap_interval(
     """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
-
-    Args:
-        values: Of each terrain.
-        seed: Of the resamples.
-        families: Terrains of one number are not independent: they are drawn together, shape (num_terrains,).
+    Terrains of one family, by their numbers (num_terrains,), are not independent: they are drawn together.
     """
     family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
     count = int(family.max(initial=-1)) + 1
