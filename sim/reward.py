@@ -37,12 +37,6 @@ def make_motion(sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any)
         action: Clipped action of the step, shape (num_envs, num_joints).
     """
     robot = sim.robot
-    unknown = [name for name in cfg.steady_joints if name not in robot.joint_names]
-    if unknown:
-        raise ValueError(
-            f"steady_joints: robot '{robot.name}' has no joint named {', '.join(unknown)}: expected some of "
-            f"{', '.join(robot.joint_names)}"
-        )
     motion = Motion()
     for name in ("joint_q", "joint_qd", "joint_torque", "geom_force", "geom_role"):
         setattr(motion, name, getattr(sim, name))

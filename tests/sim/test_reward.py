@@ -147,10 +147,3 @@ def test_a_robots_own_settings_reach_the_kernels(eight, robot):
     np.testing.assert_array_equal(motion.joint_lower.numpy(), lower)
     np.testing.assert_array_equal(motion.joint_upper.numpy(), upper)
     np.testing.assert_allclose(motion.default_joint_pos.numpy(), robot.default_joint_pos, rtol=1e-6)
-
-
-@ONLY_CASSIE
-def test_a_joint_that_is_not_there_is_named(eight, robot):
-    cfg = replace(robot.training, steady_joints=("hip_rotation_left", "knee"))
-    with pytest.raises(ValueError, match="knee"):
-        make_motion(eight, cfg, command=None, action=None)

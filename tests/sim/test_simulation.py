@@ -11,7 +11,7 @@ from sim.device import resolve_device
 from sim.mujoco_c.model import to_mujoco
 from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.sim.scenes import GAINS, ONLY_ANYMAL, Stepper, lying, positions, put, velocities
+from tests.sim.scenes import GAINS, Stepper, lying, positions, put, velocities
 
 
 def standing(robot, num, z=0.6, x=8.0):
@@ -49,20 +49,6 @@ def test_torque_is_the_pd_law_and_clamped(eight, robot):
     np.testing.assert_allclose(torque[2, 6:], 0.5 * kp - 3.0 * kd, rtol=1e-3)
     np.testing.assert_allclose(torque[3, 6:], 0, atol=1e-3)
     assert not torque[:, :6].any()  # nothing drives the base
-
-
-@ONLY_ANYMAL
-def test_forces_are_on_the_geoms_that_touch(eight, eight_stepper, anymal):
-    # A robot lying on its right side on flat ground: what is clear of the ground has no force.
-    flatten(eight)
-    q = standing(anymal, 8, z=0.35)
-    q[:, 3:7] = np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)
-    put(eight, q)
-    eight_stepper.run(2.0)
-    assert eight.geom_names == anymal.geom_names
-    forces = dict(zip(eight.geom_names, eight.geom_force.numpy()[0, :, 2], strict=True))
-    assert max(force for name, force in forces.items() if name.startswith("R")) > 1
-    assert min(forces.values()) >= 0 and forces["LF_FOOT"] == forces["LH_THIGH"] == 0
 
 
 def test_state_rows_are_what_they_say(eight, robot):
@@ -115,16 +101,6 @@ def test_a_reset_forgets_everything(eight, rough_start, robot, device):
         runs.append((positions(eight), velocities(eight), np.array(eight.geom_force.numpy())))
     for first, again in zip(runs[0], runs[2], strict=True):
         np.testing.assert_array_equal(first, again)
-
-
-def test_only_masked_worlds_are_cleared(eight, rough_start):
-    put(eight, rough_start)
-    step(eight, 40)
-    before = np.array(eight.solver.mjw_data.qacc_warmstart.numpy())
-    eight.clear_solver(wp.array([0, 1] * 4, dtype=int, device=eight.device))
-    after = eight.solver.mjw_data.qacc_warmstart.numpy()
-    np.testing.assert_array_equal(after[::2], before[::2])
-    assert before[1::2].any() and not after[1::2].any()
 
 
 def test_friction_and_mass_of_each_robot(anymal, device):

@@ -152,34 +152,6 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
 
 
-VELOCITIES = ("yaw_rate", "vel_x", "vel_y")
-
-
-@pytest.mark.parametrize(
-    # On the heightfield neighbouring facets bear a foot, which the plane bears once.
-    ("robot", "plane", "names", "rtol"),
-    [
-        ("anymal", False, VELOCITIES, 0.1),
-        ("anymal", True, (*VELOCITIES, "contact_force"), 0.08),
-        ("cassie", True, (*VELOCITIES, "contact_force"), 0.08),
-    ],
-    indirect=["robot"],
-)
-def test_walking_costs_the_same_in_both(robot, monkeypatch, plane, names, rtol):
-    # 4 s: long enough for steps to fall otherwise, so that only what they cost can be held against each other.
-    if plane:
-        monkeypatch.setattr("sim.mujoco_c.crossing.crossing_model", lambda robot, heights, **_: on_plane(robot))
-    cfg = CrossingCfg(max_duration_s=4.0)
-    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu", cfg=cfg)
-    ours = rollout.evaluate(FLAT[None], np.array([1000], np.uint32))
-    policy = load_policy(robot.policy_file, robot, "cpu")
-    plain = cross(robot, policy, FLAT, draw_starts(robot, FLAT, 1000, EPISODES, "cpu"), cfg)
-    assert (ours.outcome == Outcome.TIME_OUT).all() and (plain.outcome == Outcome.TIME_OUT).all()
-    np.testing.assert_array_equal(plain.duration_s, 4.0)
-    columns = [PENALTIES.index(name) for name in names]
-    np.testing.assert_allclose(ours.penalties[0][:, columns].mean(0), plain.penalties[:, columns].mean(0), rtol=rtol)
-
-
 @SETTINGS
 def test_sliding_on_its_back_it_is_braked_alike_in_both(anymal, changes, time_constant_s):
     robot, rollout, plain = side_by_side(anymal, anymal.policy_file, changes, time_constant_s)

@@ -11,7 +11,6 @@ from kernels.penalties import BASE, FOOT, LIMB
 from sim.files.records import robot_identity
 from sim.robots.find import get_robot
 from sim.robots.model import build_robot, leaf_name
-from tests.kernels import oracle
 from tests.sim import plain_mujoco
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying
 
@@ -33,15 +32,6 @@ def test_published_mass(robot, c_model, builder):
     assert c_model.body_mass.sum() == pytest.approx(mass, abs=tolerance)
     assert sum(builder.body_mass) == pytest.approx(mass, abs=tolerance)
     assert builder.body_count == 13
-
-
-def test_inertias_are_the_same_in_newton_and_mujoco(c_model, builder):
-    for k, label in enumerate(builder.body_label):
-        body = c_model.body(leaf_name(label))
-        axes = oracle.rotation_matrix(np.roll(body.iquat, -1))
-        np.testing.assert_allclose(np.array(builder.body_com[k]), body.ipos, atol=1e-6)
-        inertia = np.array(builder.body_inertia[k]).reshape(3, 3)
-        np.testing.assert_allclose(inertia, axes @ np.diag(body.inertia) @ axes.T, atol=1e-6)
 
 
 def test_joints_are_in_policy_order(robot, c_model, builder):

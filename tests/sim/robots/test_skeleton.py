@@ -1,7 +1,5 @@
 """What is shown of a robot stands where MuJoCo and the simulation have it, under the simulation's names."""
 
-import dataclasses
-
 import mujoco
 import newton
 import numpy as np
@@ -80,14 +78,6 @@ def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
             expected = np.array((pose * builder.shape_transform[shape]).p)
             shown = position[geom.body] + matrix_of(quaternion[geom.body]) @ geom.position
             np.testing.assert_allclose(shown, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("text", ["no xml", "<mujoco><worldbody><body><geom size='.1'/></body></worldbody></mujoco>"])
-def test_a_file_that_cannot_be_shown_is_named(robot, tmp_path, text):
-    file = tmp_path / "bad.xml"
-    file.write_text(text)
-    with pytest.raises(ValueError, match=r"bad\.xml"):
-        Skeleton(dataclasses.replace(robot, model_file=file))
 
 
 def test_bodies_with_visual_shapes_show_those_alone(tmp_path):
