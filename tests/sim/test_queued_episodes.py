@@ -135,7 +135,6 @@ def test_a_world_that_broke_and_a_failure_leave_a_rollout_that_works(anymal, alo
     check_same(alone, rollout.evaluate(GRIDS[:3], SEEDS[:3]), slice(0, 3))
 
 
-@ONLY_ANYMAL
 def test_an_episode_that_begins_in_contact_forgets_what_its_world_did_before(anymal):
     """Feet begin in the ground, so that the solver's first step has contacts, for which it would start warm."""
     low, cfg = dataclasses.replace(anymal, default_base_height=0.5), dataclasses.replace(SHORT, max_duration_s=0.1)
