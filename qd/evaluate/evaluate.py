@@ -70,9 +70,6 @@ def sizes_for(
     compute: Compute, terrains: int | None, episodes: int | None, *, full: tuple[int, int], small: tuple[int, int]
 ) -> tuple[int, int]:
     """Terrains and episodes a terrain: those asked for, else ``full`` on a GPU; ``small`` without one, in a line."""
-    for name, count in (("terrains", terrains), ("episodes", episodes)):
-        if count is not None and count < 1:
-            raise ValueError(f"{name} must be at least 1, got {count}")
     on_gpu = compute.device.startswith("cuda")
     if not on_gpu and terrains is None and episodes is None:
         print(f"No GPU: {small[0]} terrains x {small[1]} episodes each instead of {full[0]} x {full[1]}.")

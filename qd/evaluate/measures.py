@@ -85,8 +85,6 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
     """
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
-    if len(scales) != len(result.penalty_names):
-        raise ValueError(f"scales must be one a penalty {result.penalty_names}, got {len(scales)}")
     counted = counted_episodes(result.invalid)
     names = zip(result.penalty_names, scales, strict=True)
     return Measured(

@@ -288,15 +288,12 @@ def _about_minimal(entry: dict[str, Any]) -> dict[str, Any]:
     return {
         "name": f"elite-{entry['elite']}-minimal",
         "kind": "minimal",
-        "elite": entry["elite"],
-        "cell": entry["cell"],
-        "iteration": entry["iteration"],
+        **{key: entry[key] for key in ("elite", "cell", "iteration")},
         "parts": entry["bumps"],
         "verdict": "fault" if entry["verdict"] == "fault" else "near-fault",
         "cause": None if entry["cause"] is None else entry["cause"]["kind"],
         "searched": {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")},
-        "resolved": entry["resolved"],
-        "certificates": entry["certificates"],
+        **{key: entry[key] for key in ("resolved", "certificates")},
     }
 
 
@@ -398,15 +395,9 @@ def round_heights(heights: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def write_terrains(folder: Path, heights: NDArray[np.float32], genes: NDArray[np.float32]) -> str:
-    """Writes ``pack.npz``, atomically; equal content gives equal bytes.
+    """Writes ``pack.npz``, atomically; equal content gives equal bytes. Returns its SHA-256.
 
-    Args:
-        folder: Of the pack.
-        heights: [m], rounded, shape (N, nrow, ncol).
-        genes: Shape (N, num_genes).
-
-    Returns:
-        SHA-256 of the file.
+    Heights [m], rounded, have shape (N, nrow, ncol), genes (N, num_genes).
     """
     whole = np.rint(heights.astype(np.float64) / HEIGHT_UNIT_M).astype(np.int32)
     # Of smooth ground the rise along x hardly changes along y, so that this packs into a third of the bytes.
@@ -418,11 +409,7 @@ def write_terrains(folder: Path, heights: NDArray[np.float32], genes: NDArray[np
 
 
 def pack_folder(named: str) -> Path:
-    """The folder of a pack: the one named, or the published one of a robot that is.
-
-    Raises:
-        FileNotFoundError: If there is none.
-    """
+    """The folder of a pack: the one named, or the published one of a robot that is."""
     published = RESULTS / named / PACK_FOLDER
     for folder in (Path(named), published):
         if (folder / PACK_FILE).is_file():

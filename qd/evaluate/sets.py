@@ -252,9 +252,7 @@ def space_of(archive: Archive) -> TerrainSpace:
 def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
     """The third of a set that is farthest from training terrains, in the set's order and with the same episodes.
 
-    Args:
-        whole: The set.
-        distance: Of each terrain to its nearest training terrain, shape (T,).
+    ``distance`` of each terrain to its nearest training terrain has shape (T,).
     """
     places = np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)])
     families, certificates = whole.families, whole.certificates
@@ -272,15 +270,9 @@ def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
 def nearest_distance(
     genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
 ) -> NDArray[np.float64]:
-    """Root mean square distance of height maps to the nearest of others.
+    """Root mean square distance over all nodes [m] of T height maps to the nearest of others, shape (T,).
 
-    Args:
-        genes: Terrains, shape (T, num_genes).
-        training_genes: Terrains to be far from, shape (N, num_genes).
-        space: What the genes of both mean.
-
-    Returns:
-        Distance to the nearest over all nodes [m], shape (T,). Computed on the CPU, so that it is the same everywhere.
+    Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
     """
     maps, others = (
         heights_of(some, space).reshape(len(some), -1).astype(np.float64) for some in (genes, training_genes)

@@ -141,12 +141,7 @@ Crossed = Mapping[str, Mapping[str, Measured]]
 
 
 def read_tables(file: Path, robot: RobotCfg) -> Tables:
-    """The tables of a robot to report.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is damaged, another file, of validation terrains, or of another robot.
-    """
+    """The tables of a robot to report; refuses those of validation terrains."""
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: `faultline evaluate` writes them")
     try:
@@ -314,11 +309,7 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
 
 
 def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[str, dict[str, dict[str, OverSeeds]]]:
-    """Mean over the controllers of each kind that has several.
-
-    Returns:
-        Measure -> set -> kind; empty where no kind has several.
-    """
+    """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, OverSeeds]]] = {}
     for measure in measures:
         for name, row in tables[measure].items():

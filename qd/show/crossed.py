@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.show.figures import look_of
+from qd.show.figures import label_of, look_of
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
 from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
@@ -148,25 +148,15 @@ _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
 def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> Figure:
-    """One terrain: its height map with the paths, its profile, and the penalties by place and by kind."""
-    figure = new_figure(12.0, 7.2)
+    """One terrain: its height map with the paths, its profile, and the penalties by place."""
+    figure = new_figure(9.5, 7.6)
     figure.suptitle(title)
-    grid = figure.add_gridspec(3, 2, width_ratios=(2.6, 1.0), height_ratios=(3.2, 0.9, 1.1))
-    top = figure.add_subplot(grid[0, 0])
-    profile, places = (figure.add_subplot(grid[row, 0], sharex=top) for row in (1, 2))
-    image = draw_map(top, crossed)
-    figure.colorbar(image, ax=top, label="height [m]", shrink=0.85, pad=0.01)
+    top, profile, places = figure.subplots(3, 1, sharex=True, height_ratios=(3.2, 0.9, 1.1))
+    figure.colorbar(draw_map(top, crossed), ax=top, label="height [m]", shrink=0.85, pad=0.01)
     _draw_profile(profile, crossed)
     _draw_places(places, crossed, penalties)
-    _draw_penalties(figure.add_subplot(grid[1:, 1]), crossed, penalties)
-    legend = figure.add_subplot(grid[0, 1])
-    legend.set_axis_off()
-    handles = _legend(crossed)
-    legend.legend(
-        handles=handles, loc="center left", frameon=False, title="crossings", alignment="left", handlelength=3
-    )
-    for axes in (top, profile):
-        axes.tick_params(labelbottom=False)
+    handles = [*_legend(crossed), *(Patch(label=label_of(name), **look_of(name).bar) for name in penalties)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
     top.set_xlim(*_x_limits(crossed))
     return figure
 
@@ -241,19 +231,4 @@ def _draw_places(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) -> No
     axes.set_xlabel("x [m]")
     axes.set_ylabel(f"penalties per\n{_PLACE} m (scaled)", fontsize=9)
     axes.grid(alpha=0.3)
-    axes.set_axisbelow(True)
-
-
-def _draw_penalties(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) -> None:
-    """Mean of each scaled penalty with its standard deviation over the episodes."""
-    places = np.arange(len(penalties))
-    means, stds = crossed.scaled.mean(axis=0), crossed.scaled.std(axis=0)
-    for place, penalty in zip(places, penalties, strict=True):
-        axes.barh(place, means[place], **look_of(penalty).bar)
-    axes.errorbar(means, places, xerr=stds, linestyle="", color="0.3", capsize=3)
-    axes.set_yticks(places, [look_of(name).label for name in penalties], fontsize=9)
-    axes.invert_yaxis()
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("penalty an episode (scaled),\nmean and standard deviation", fontsize=9)
-    axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)

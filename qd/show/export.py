@@ -152,8 +152,7 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
 
 
 def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
-    files = [file for file in (folder / INDEX_FILE, *folder.glob("*-*")) if file.exists()]
-    replaced = sorted({file.name for file in files if file.name == INDEX_FILE or file.stem in stems})
+    replaced = sorted(file.name for file in folder.glob("*") if file.name == INDEX_FILE or file.stem in stems)
     if replaced:
         names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")

@@ -142,41 +142,22 @@ def draw_archive(archive: Archive) -> Figure:
         fitness, ratios = fresh.fitness[fresh.valid], fresh.ratios[fresh.valid]
         title += f",\ncorrected by {FRESH_EPISODES} fresh episodes each: {fresh.reproduced.sum():,} reproduced"
     axes.set_title(title)
-    lines = draw_elites(axes, archive.penalties, ratios, fitness, _range(fitness))
-    figure.colorbar(lines, ax=axes, label="fitness", pad=0.02, extend="both")
-    return figure
-
-
-def draw_elites(
-    axes: Axes, penalties: Sequence[str], ratios: np.ndarray, values: np.ndarray, limits: tuple[float, float]
-) -> LineCollection:
-    """Draws elites as lines over one vertical axis a ratio.
-
-    Args:
-        axes: Where.
-        penalties: Names of the P penalties.
-        ratios: Share of each, shape (N, P).
-        values: By which lines are coloured, the largest on top, shape (N,).
-        limits: Of the colours.
-
-    Returns:
-        The lines, which a colour bar takes.
-    """
-    positions, order = np.arange(len(penalties)), np.argsort(values)
-    points = np.stack([np.broadcast_to(positions, ratios.shape), ratios], axis=2)[order]
-    lines = LineCollection([*points], cmap="viridis", norm=Normalize(*limits), linewidths=0.8, alpha=0.6)
-    lines.set_array(values[order])
+    places, order = np.arange(count), np.argsort(fitness)  # the fittest on top
+    points = np.stack([np.broadcast_to(places, ratios.shape), ratios], axis=2)[order]
+    lines = LineCollection([*points], cmap="viridis", norm=Normalize(*_range(fitness)), linewidths=0.8, alpha=0.6)
+    lines.set_array(fitness[order])
     axes.add_collection(lines)
-    for position in positions:
-        axes.axvline(float(position), color="0.25", linewidth=1.0)
-    axes.set_xticks(positions, [look_of(name).label for name in penalties])
+    for place in places:
+        axes.axvline(float(place), color="0.25", linewidth=1.0)
+    axes.set_xticks(places, [look_of(name).label for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
-    axes.set_xlim(-0.15, len(penalties) - 0.85)
+    axes.set_xlim(-0.15, count - 0.85)
     axes.set_ylim(-0.02, 1.02)
     axes.set_ylabel("share of the penalties")
     axes.grid(axis="y", alpha=0.25)
     axes.spines[:].set_visible(False)
-    return lines
+    figure.colorbar(lines, ax=axes, label="fitness", pad=0.02, extend="both")
+    return figure
 
 
 def _range(fitness: np.ndarray) -> tuple[float, float]:

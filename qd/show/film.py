@@ -87,14 +87,9 @@ def _store_and_film(
 def film_recording(
     file: Path, cfg: FilmCfg, *, robot: str | None = None, policy: str | None = None, out: Path | None = None
 ) -> list[Path]:
-    """Films of what was recorded, beside the recording or in ``out``; nothing is crossed.
+    """Films of what was recorded of one terrain or several, beside the recording or in ``out``; nothing is crossed.
 
-    Args:
-        file: The recording, of one terrain or several.
-        cfg: How the films look.
-        robot: Name or settings file of the robot; the recording's if None.
-        policy: Controller by whose scales penalties are drawn.
-        out: The film, or the folder of several.
+    Penalties are drawn by the scales of ``policy``.
     """
     recording = read_recording(file)
     recorded = robot_of({**recording.origin, "robot": recording.robot}, robot, file)

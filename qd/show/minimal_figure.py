@@ -20,25 +20,17 @@ _COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f
 
 
 def draw_minimal(
-    robot: str,
-    numbers: dict[str, Any],
-    genes: Mapping[int, NDArray[np.float32]],
-    space: TerrainSpace,
-    most: int = _SHOWN,
+    robot: str, numbers: dict[str, Any], genes: Mapping[int, NDArray[np.float32]], space: TerrainSpace
 ) -> Figure:
     """How many parts failures take, by the kind of the cause, and some minimal terrains from above.
 
     Of every kind of cause the gallery has one terrain before it has a second of another.
 
-    Args:
-        robot: Its name.
-        numbers: At least one terrain, as ``minimal.json`` has them.
-        genes: Of the minimal terrains by number of the elite, each of shape (num_genes,).
-        space: What they mean.
-        most: Terrains of the gallery.
+    ``numbers`` has at least one terrain, as ``minimal.json`` has them; ``genes`` of each, shape (num_genes,), by the
+    number of the elite.
     """
     entries = numbers["elites"]
-    shown = _gallery(entries)[:most]
+    shown = _gallery(entries)[:_SHOWN]
     rows = -(-len(shown) // _COLUMNS)
     figure = new_figure(13.0, 3.2 + 2.3 * rows)
     figure.suptitle(f"{robot}: {len(entries):,} minimal terrains")

@@ -72,16 +72,9 @@ def on_elite(
     label: str | None = None,
     minimal: NDArray[np.float32] | None = None,
 ) -> Wanted:
-    """The crossings of an elite, or of its minimal terrain, that ``faultline replay`` shows.
+    """The crossings of an elite that ``faultline replay`` shows.
 
-    Args:
-        archive: The elite's archive.
-        number: Its number.
-        policy: The controller.
-        replicas: Episodes.
-        seed: Other episodes for another seed.
-        label: What the terrain is, in words.
-        minimal: Genes of its minimal terrain, which is crossed from the same starts.
+    With ``minimal``, the genes of its minimal terrain, they are of that, from the same starts.
     """
     return Wanted(
         label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
@@ -149,14 +142,7 @@ class Simulation:
 
 
 class Recordings:
-    """The recordings of a robot that are stored, and the simulation that makes those that are not.
-
-    Args:
-        robot: The robot.
-        device: Where missing ones are crossed.
-        folder: Where they are stored.
-        cross: Crosses what is missing; by default a :class:`Simulation`.
-    """
+    """The recordings of a robot that are stored; what is missing ``cross`` makes, by default a :class:`Simulation`."""
 
     def __init__(
         self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER, cross: Cross | None = None

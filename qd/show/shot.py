@@ -28,7 +28,6 @@ _HOLD_S = 1.0  # of the last frame
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 _DPI = 100
-_NUMBERS = 52  # width of the running numbers behind the legend [pixels]
 _FUTURE = 0.25  # how much is left to see of what has not happened yet
 
 Image = NDArray[np.uint8]
@@ -89,12 +88,7 @@ def caption(shot: Shot) -> tuple[str, str]:
 
 
 def follow(shot: Shot, distance: float) -> list[Camera]:
-    """A camera a frame: it follows the base smoothly, from as low as the ground nowhere hides the robot.
-
-    Args:
-        shot: What the film shows.
-        distance: Of the camera from the base [m].
-    """
+    """A camera a frame, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it."""
     recording = shot.recording
     base = recording.base_position[0, shot.episode, : shot.num_frames].astype(np.float64)
     width = max(1, round(_SMOOTH_S / recording.dt)) | 1
@@ -114,16 +108,9 @@ def follow(shot: Shot, distance: float) -> list[Camera]:
 
 
 def frames_of(shot: Shot, renderer: Renderer, cameras: Sequence[Camera], fps: int) -> Iterator[Image]:
-    """The pictures of a film, the last one held for a second.
+    """The pictures of a film, RGB of shape (720, 1280, 3), the last one held for a second.
 
-    Args:
-        shot: What it shows.
-        renderer: Of the robot on the terrain, with images of 1280 x 480 pixels.
-        cameras: One a frame of the recording.
-        fps: Pictures a second.
-
-    Yields:
-        RGB, shape (720, 1280, 3).
+    There is a camera for each frame of the recording; the renderer's images have 1280 x 480 pixels.
     """
     panel, lines = Panel(shot, WIDTH, PANEL_HEIGHT), caption(shot)
     recording = shot.recording
@@ -171,30 +158,18 @@ class Panel:
 
     def __init__(self, shot: Shot, width: int, height: int) -> None:
         figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
-        figure.set_layout_engine("constrained", rect=(0.0, 0.0, 1.0 - _NUMBERS / width, 1.0))
+        figure.set_layout_engine("constrained")
         canvas = FigureCanvasAgg(figure)
         self._map, self._curves = figure.subplots(1, 2, width_ratios=(1.0, 1.6))
         _draw_map(self._map, shot)
-        self._penalties, self._dt = shot.penalties, shot.recording.dt
-        rows = _draw_curves(self._curves, shot)
+        _draw_curves(self._curves, shot)
         canvas.draw()
         self._image = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        boxes = [row.get_window_extent() for row in rows]
-        right = round(max((box.x1 for box in boxes), default=0.0)) + _NUMBERS
-        self._places = [(right, height - round(0.5 * (box.y0 + box.y1))) for box in boxes]
         self._faded = np.rint(255 - _FUTURE * (255.0 - self._image)).astype(np.uint8)
         self._inside = self._curves.get_window_extent()
 
     def at(self, time_s: float, position: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """The panel at a moment.
-
-        Args:
-            time_s: Since the start.
-            position: Of the base [m], shape (3,).
-
-        Returns:
-            RGB, shape (height, width, 3).
-        """
+        """The panel at a moment, RGB of shape (height, width, 3); ``position`` of the base [m] has shape (3,)."""
         image, height = self._image.copy(), len(self._image)
         now = round(self._curves.transData.transform((time_s, 0.0))[0])
         rows = slice(height - round(self._inside.y1), height - round(self._inside.y0))
@@ -206,18 +181,7 @@ class Panel:
         apart = np.hypot(row - (height - y), column - x)
         image[apart < 7.0] = 255
         image[apart < 5.0] = (213, 94, 0)
-        return self._with_sums(image, time_s)
-
-    def _with_sums(self, image: Image, time_s: float) -> Image:
-        """What each penalty has come to by now, behind its name in the legend."""
-        picture = Images.fromarray(image)
-        draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
-        for place, values in zip(self._places, self._penalties.values(), strict=True):
-            frame = min(round(time_s / self._dt), len(values) - 1)
-            draw.text(
-                place, f"{values[frame]:.{2 if values[frame] < 10.0 else 1}f}", fill="black", font=font, anchor="rm"
-            )
-        return np.asarray(picture)
+        return image
 
 
 def _draw_map(axes: Any, shot: Shot) -> None:
@@ -237,8 +201,7 @@ def _draw_map(axes: Any, shot: Shot) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _draw_curves(axes: Any, shot: Shot) -> list[Any]:
-    """The curves; returns the names of the penalties in the legend."""
+def _draw_curves(axes: Any, shot: Shot) -> None:
     times = shot.recording.times_s[: shot.num_frames]
     for name, values in shot.penalties.items():
         axes.plot(times, values, color=look_of(name).color, linewidth=1.8, label=label_of(name))
@@ -248,5 +211,4 @@ def _draw_curves(axes: Any, shot: Shot) -> list[Any]:
     measured = set(shot.scales.values()) != {1.0}
     axes.set_ylabel(f"penalty so far,\n{'multiples of its scale' if measured else 'raw'}")
     axes.grid(alpha=0.3)
-    style: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.01, 0.5), "frameon": False, "fontsize": 9}
-    return axes.legend(**style).get_texts()
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=9)

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qd.faults import elite_words
-from qd.groups import MAX_MODES, TOLERANCE, VERDICTS, Elites, Mode, Modes
+from qd.groups import MAX_MODES, TOLERANCE, VERDICTS, Elites, Modes
 from qd.show.crossed import ARRIVED, FAILED, Crossed, Rate, draw_crossing
 from qd.show.figures import label_of, look_of, mode_words
 from qd.show.report.material import Shown
@@ -19,6 +18,11 @@ from sim.files.intervals import wilson_interval
 from sim.files.records import without_machine
 
 _MIN_PICTURED = 3  # terrains that the page begins with
+_METHOD = (
+    "Ward's clustering on the shares and on the rates of goal, base collision and fall, all fractions and unweighted; "
+    f"of 2 to {MAX_MODES} groups the most whose mean silhouette (1: apart, 0: touching) is {TOLERANCE} or less below "
+    "the best"
+)
 
 
 def anchor_of(number: int) -> str:
@@ -94,40 +98,15 @@ def modes_section(shown: Shown) -> list[Block]:
     failing = int(elites.failing.sum())
     if not modes.modes:
         return [paragraph("No elite fails, so there is no failure mode.")]
-    largest = max(modes.modes, key=lambda mode: len(mode.members))
+    count, silhouettes = len(modes.modes), modes.silhouettes
+    parting = f"; {count} have {silhouettes[count]:.2f}" if silhouettes else "; these are too few or too equal"
     text = (
         f"The {counted(failing, 'failing elite')} of {len(elites):,} fall into "
-        f"{counted(len(modes.modes), 'failure mode')} by how the robot struggles and how its crossings end. The "
-        f"largest, mode {largest.number}, has {len(largest.members):,} ({percent(len(largest.members) / failing)}): "
-        f"{_described(largest)}. {_how(shown)}"
+        f"{counted(count, 'failure mode')} by how the robot struggles and how its crossings end: "
+        f"{_METHOD}{parting}."
     )
-    shows = "Mean shares of the penalties and of the ends of crossings by group; silhouette by number of groups"
+    shows = "Mean shares of the penalties and of the ends of crossings by group"
     return [paragraph(text), picture("modes", draw_modes(elites, modes), shows), _modes_table(shown)]
-
-
-def _described(mode: Mode) -> str:
-    return (
-        f"the robot {mode.deed} (goal {percent(mode.goal_rate)}, base collision "
-        f"{percent(mode.collision_rate)}, neither {percent(mode.other_rate)}), and the share that stands out is that "
-        f"of {label_of(mode.marked_by)}"
-    )
-
-
-def _how(shown: Shown) -> str:
-    """How the groups were made."""
-    how = (
-        "Ward's clustering on the shares and on the rates of goal, base collision and fall, all fractions and "
-        f"unweighted; of 2 to {MAX_MODES} groups the most whose mean silhouette is within {TOLERANCE} of the best"
-    )
-    silhouettes = shown.modes.silhouettes
-    if not silhouettes:
-        return f"{how}. These elites are too few or too equal to be divided."
-    best = max(silhouettes, key=lambda count: silhouettes[count])
-    count = len(shown.modes.modes)
-    return (
-        f"{how}: {count} have {silhouettes[count]:.2f}, the best, {best}, {silhouettes[best]:.2f} "
-        "(1: apart, 0: touching; under one half the borders between them are soft)."
-    )
 
 
 def _modes_table(shown: Shown) -> str:
@@ -206,25 +185,17 @@ def _elite(shown: Shown, number: int, *, opened: bool) -> Folded:
 
 
 def _what_happened(shown: Shown, crossed: Crossed, place: int) -> str:
-    """What became of the robots, in a sentence or two."""
-    elites = shown.elites
-    arrived = crossed.rates[ARRIVED]
-    failures = {label: crossed.rates[label].hits for label in FAILED}
-    others = "; ".join(f"{label} {hits}" for label, hits in failures.items() if hits)
-    text = f"{arrived.hits} of {arrived.count} robots reached the goal"
-    if others:
-        text += f" ({others}), and the middle one of those that did not ended at x = {crossed.failed_at:.1f} m"
-    means = crossed.scaled.mean(axis=0)
-    main = int(means.argmax())
-    count = int(elites.counted[place])
-    episodes = f"fresh episode{'s' * (count != 1)}"
-    if not elites.fresh[place]:
-        episodes = f"episode{'s' * (count != 1)} of the search"
+    """Where the robots ended, and what the elite costs."""
+    elites, fresh = shown.elites, bool(shown.elites.fresh[place])
+    episodes = counted(int(elites.counted[place]), "fresh episode" if fresh else "episode") + " of the search" * (
+        not fresh
+    )
+    ended = "All reached the goal."
+    if crossed.failed_at is not None:
+        ended = f"The middle one of those that did not reach the goal ended at x = {crossed.failed_at:.1f} m."
     return (
-        f"{text}. The largest penalty is {label_of(elites.penalties[main])}, "
-        f"{percent(float(means[main] / max(means.sum(), 1e-12)))} of all. Its fitness is {elites.fitness[place]:.1f} "
-        f"by {count:,} {episodes}, whose penalties have a standard deviation of "
-        f"{percent(float(elites.variation[place]))} of their mean."
+        f"{ended} Its fitness is {elites.fitness[place]:.1f} by {episodes}, whose penalties have a standard "
+        f"deviation of {percent(float(elites.variation[place]))} of their mean."
     )
 
 
@@ -292,9 +263,9 @@ _ENDS = (("goal_rate", "goal", "#009e73", "o"), ("collision_rate", "base collisi
 
 
 def draw_modes(elites: Elites, modes: Modes) -> Figure:
-    """The failure modes: their mean shares, how their crossings end, and how well divisions separate."""
-    figure = new_figure(12.0, max(3.4, 0.5 * len(modes.modes) + 2.2))
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1.5, 1.2, 0.9))
+    """The failure modes: their mean shares, and how their crossings end."""
+    figure = new_figure(10.0, max(3.4, 0.5 * len(modes.modes) + 2.2))
+    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.2))
     places = np.arange(len(modes.modes))
     start = np.zeros(len(places))
     for column, penalty in enumerate(elites.penalties):
@@ -303,13 +274,13 @@ def draw_modes(elites: Elites, modes: Modes) -> Figure:
         start += shares
     for shift, (name, label, colour, marker) in zip((-0.22, 0.0, 0.22), _ENDS, strict=True):
         rates = [100.0 * getattr(mode, name) for mode in modes.modes]
-        middle.plot(
+        right.plot(
             rates, places + shift, linestyle="", marker=marker, markersize=8, color=colour, label=label, alpha=0.9
         )
     names = [f"mode {mode.number}: {mode.ending}\n{len(mode.members):,} elites" for mode in modes.modes]
     left.set_yticks(places, names)
-    middle.set_yticks(places, [])
-    for axes, label in ((left, "mean share of the penalties [%]"), (middle, "mean share of the crossings [%]")):
+    right.set_yticks(places, [])
+    for axes, label in ((left, "mean share of the penalties [%]"), (right, "mean share of the crossings [%]")):
         axes.set_ylim(len(places) - 0.5, -0.5)
         axes.set_xlabel(label)
         axes.grid(axis="x", alpha=0.3)
@@ -319,27 +290,5 @@ def draw_modes(elites: Elites, modes: Modes) -> Figure:
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2 if axes is left else 1, frameon=False,
                     fontsize=9)  # fmt: skip
     left.set_xlim(0, 100)
-    middle.set_xlim(-3, 103)
-    _draw_silhouettes(right, modes)
+    right.set_xlim(-3, 103)
     return figure
-
-
-def _draw_silhouettes(axes: Axes, modes: Modes) -> None:
-    axes.set_xlabel("number of modes")
-    axes.set_ylabel("mean silhouette")
-    if not modes.silhouettes:
-        axes.text(
-            0.5, 0.5, "too few or too equal\nelites to divide", ha="center", va="center", transform=axes.transAxes
-        )
-        axes.set(xticks=[], yticks=[])
-        return
-    counts, values = list(modes.silhouettes), list(modes.silhouettes.values())
-    axes.plot(counts, values, color="#0072b2", marker="o", label="of each number")
-    chosen = len(modes.modes)
-    style = {"markersize": 15, "markerfacecolor": "none", "color": "#d55e00", "markeredgewidth": 2}
-    axes.plot(chosen, modes.silhouettes[chosen], "o", label="taken", **style)
-    axes.axhline(max(values) - TOLERANCE, color="0.4", linestyle="--", label=f"best less {TOLERANCE}")
-    axes.set_xticks(counts)
-    axes.set_ylim(bottom=min(0.0, *values))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False, fontsize=9)

@@ -16,13 +16,6 @@ MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward"
 _GENERATED = labels.HELD_OUT[0]  # elites that were held out of training
 CERTIFIED = {name: labels.MEASURES[measure] for name, measure in labels.CERTIFIED.items()}
 """Measures on certified terrains alone, in words."""
-_TRAINED_ON = {
-    "C-HC": "hand-crafted terrains alone",
-    "C-HR": "hand-crafted and hard-random ones",
-    "C-G": "hand-crafted ones and elites",
-    "C-F": "hand-crafted ones and elites, drawn by how often it fails them",
-}
-"""What controllers are trained further on that are named as the paper and docs/results-anymal.md name them."""
 
 
 def tables_section(shown: Shown) -> list[Block]:
@@ -58,18 +51,6 @@ def _drawn(figure: Path) -> list[Block]:
     return [Picture("tables.png", figure.read_bytes(), shows)] if figure.exists() else []
 
 
-def most_mended(tables: dict[str, Any]) -> tuple[str, str] | None:
-    """How many of the held-out elites that the first controller fails the best one mends, and what that counts."""
-    first = next(iter(tables["controllers"]))
-    changes = {pair.partition(" -> "): change for pair, change in (tables["differences"].get(_GENERATED) or {}).items()}
-    of_first = {after: change for (before, _, after), change in changes.items() if before == first}
-    if not of_first:
-        return None
-    best = max(of_first, key=lambda name: of_first[name]["mended"]["count"])
-    mended, failing = (of_first[best][kind]["count"] for kind in ("mended", "still_failing"))
-    return f"elites held out of training that {first} fails and {best} mends", f"{mended} of {mended + failing}"
-
-
 def _command(shown: Shown) -> str:
     """What makes the tables."""
     material = shown.material
@@ -86,7 +67,6 @@ def _command(shown: Shown) -> str:
 
 def _compared(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     """Who was compared on what, in a sentence or two."""
-    first = next(iter(kinds["controllers"]))
     sets = ", ".join(f"{_label(name)}: {count}" for name, count in tables["terrains"].items())
     text = (
         f"{counted(len(tables['controllers']), 'controller')} on {counted(len(tables['terrains']), 'set')} of "
@@ -94,12 +74,10 @@ def _compared(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
     )
     several = len(kinds["controllers"]) < len(tables["controllers"])
     text += ", of several trainings that differ in their seed over these." if several else "."
-    trained = [f"{label} on {what}" for label, what in _TRAINED_ON.items() if label in tables["controllers"]]
-    text += (
-        " No base collision is what the paper calls success. A robot that stands still or walks off has none either: "
-        "it may have 100 % there and never reach the goal. Read the goal rate first."
+    return (
+        f"{text} No base collision is what the paper calls success. A robot that stands still or walks off has none "
+        "either: it may have 100 % there and never reach the goal. Read the goal rate first."
     )
-    return text + (f" By their names these are {first} trained further: {'; '.join(trained)}." if trained else "")
 
 
 def _label(name: str) -> str:
@@ -172,12 +150,8 @@ def changes_tables(tables: dict[str, Any]) -> list[Block]:
 def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
     """The tables with one column a kind of controller, where a kind was trained from several seeds.
 
-    Args:
-        tables: As :func:`qd.evaluate.tables.read_tables` gives them.
-
-    Returns:
-        The same, but for ``controllers``, measures and ``intervals``: of a kind of several those are the mean over them
-        and the interval of that, under the kind's name with the number of its seeds. ``members`` says who is of it.
+    Of several, measures are the mean over them and ``intervals`` that of the mean, under the kind's name with the
+    number of its seeds. ``members`` has the controllers of each kind.
     """
     members: dict[str, list[str]] = {}
     for controller in tables["controllers"]:

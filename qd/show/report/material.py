@@ -38,8 +38,6 @@ class Material:
     search: SearchCfg | None
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
-    reproduced_by: dict[str, Any]
-    """Where the fresh episodes come from, likewise; empty if there are none or that is not on record."""
     gpus: int | None
     minimal: MinimalFound | None
     tables: dict[str, Any] | None
@@ -129,7 +127,6 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
     folder = RunDirectory(opened_run.folder)
     search = opened_run.search()
     numbers = folder.read_summary()
-    again = numbers.get("judged_by", {}).get("fresh")
     config = {} if search is None else folder.read_config()
     tables_file = RESULTS / opened_run.robot.name / "tables.json"
     suffix = "" if policy is None else opened_run.suffix(spec_of(policy, opened_run.robot))
@@ -142,7 +139,6 @@ def gather(robot: str | None, run: Path | None, *, policy: str | None, space: st
         metrics=_metrics_of(folder, archive),
         search=search,
         origin={key: config[key] for key in _ORIGIN if key in config},
-        reproduced_by=again if archive.fresh is not None and isinstance(again, dict) else {},
         gpus=numbers["gpus"] if type(numbers.get("gpus")) is int else None,
         minimal=read_minimal(opened_run.folder, archive),
         tables={**read_tables(tables_file, opened_run.robot)} if tables_file.exists() else None,

@@ -12,7 +12,6 @@ from sim.files.command import command_line
 from sim.files.records import without_machine
 
 _ROWS = 5  # of a table that is not folded
-_PICTURED = 6  # terrains
 
 
 def minimal_section(shown: Shown) -> list[Block]:
@@ -26,7 +25,7 @@ def minimal_section(shown: Shown) -> list[Block]:
         return [absent(text, without_machine(command_line(word, robot=material.robot.spec, run=material.run)))]
     entries = minima.numbers["elites"]
     caption = "How many parts failures take, by the kind of the cause, and minimal terrains from above"
-    figure = draw_minimal(material.archive.robot, minima.numbers, minima.genes, material.space, most=_PICTURED)
+    figure = draw_minimal(material.archive.robot, minima.numbers, minima.genes, material.space)
     return [paragraph(_summary(entries)), picture("minimal", figure, caption), _table(entries)]
 
 

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
-from qd.run.progress import clock
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png
 
@@ -152,11 +151,6 @@ def percent(share: float) -> str:
     if (text == "0.0" and share > 0.0) or (text == "100.0" and share < 1.0):
         text = "less than 0.1" if share < 0.5 else "over 99.9"
     return f"{text} %"
-
-
-def hours(seconds: float) -> str:
-    """A long duration."""
-    return f"{seconds / 3600:,.0f} hours" if seconds > 36_000 else clock(seconds)
 
 
 def counted(number: int, noun: str, many: str = "") -> str:

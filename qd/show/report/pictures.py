@@ -43,13 +43,7 @@ def reliefs_of(genes: NDArray[np.float32], space: TerrainSpace) -> list[bytes]:
 
 
 def relief(heights: NDArray[np.floating], width: int = _WIDTHS[0], ground: GroundMaps | None = None) -> bytes:
-    """A picture of a terrain, with the start yellow and the goal green.
-
-    Args:
-        heights: [m], shape (nrow, ncol).
-        width: Of the picture [pixels].
-        ground: Its friction and softness, which tint it.
-    """
+    """A picture of a terrain of heights [m], shape (nrow, ncol), with the start yellow and the goal green."""
     rise_y, rise_x = np.gradient(heights, SPACING)
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
     colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
@@ -77,14 +71,9 @@ _BEFORE = 0.9  # how far before the end the camera looks at [m]
 
 
 def rendered(crossed: Crossed, robot: RobotCfg, scales: dict[str, float]) -> bytes:
-    """A picture of a terrain where robots end on it, as JPEG.
+    """A picture of a terrain where robots end on it, as JPEG; at least one crossing is valid.
 
     The robot stands where the middle one of the episodes ended that end as most do, with ghosts of it on its way there.
-
-    Args:
-        crossed: At least one valid crossing of the terrain.
-        robot: Who crossed it.
-        scales: What each penalty is divided by.
     """
     recording = crossed.recording
     episode = typical_episode(recording, scales)

@@ -41,11 +41,12 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     content = _read(run, robot)
     out = out or run / "report.html"
     check_page(out)
+    nothing_trained = absent("Nothing is trained yet: there are no two controllers to compare.")
     sections = [
         Section("Faults by round", "faults", _faults(content)),
         Section("Rates by round", "rates", _rates(content)),
         *_choices(content),
-        Section("What became of terrains", "changes", _changes(content)),
+        Section("What became of terrains", "changes", changes_tables(content["tables"]) or [nothing_trained]),
         Section("Where this comes from", "origin", _origin(content, run)),
     ]
     lead = f"Made from {without_machine(str(run))}: a search for what breaks a controller, a training on it, and again."
@@ -175,12 +176,6 @@ def _choices(content: dict[str, Any]) -> list[Section]:
     rows = [[name, "kept" if choice["kept"] else "not kept", choice["why"]] for name, choice in choices.items()]
     blocks = [paragraph(text), table(["training", "", "why"], rows, words=True)]
     return [Section("Which trainings were kept", "choices", blocks)]
-
-
-def _changes(content: dict[str, Any]) -> list[Block]:
-    """What is mended, newly broken and still failing."""
-    blocks = changes_tables(content["tables"])
-    return blocks or [absent("Nothing is trained yet: there are no two controllers to compare.")]
 
 
 def _origin(content: dict[str, Any], run: Path) -> list[Block]:

@@ -1,16 +1,12 @@
 """The page's chapters about the search: what was done, what came out, its curves and its archive."""
 
-from typing import Any
-
 import numpy as np
 
-from qd.archive import Archive
-from qd.faults import FRESH_EPISODES, any_of, count_faults, fault_words
+from qd.faults import any_of, count_faults, fault_words
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.progress import clock
-from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of, spread
+from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of
 from qd.show.report.elites import failures
-from qd.show.report.evaluation import most_mended
 from qd.show.report.material import Shown
 from qd.show.report.page import (
     Block,
@@ -18,7 +14,6 @@ from qd.show.report.page import (
     absent,
     at_a_glance,
     counted,
-    hours,
     origin_table,
     paragraph,
     percent,
@@ -30,7 +25,6 @@ from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
 
-_AGAIN = ("command", "commit", "device", "date")  # what is told of the fresh episodes
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
@@ -62,51 +56,29 @@ def outcome_section(shown: Shown) -> list[Block]:
         if elites.fresh.any()
         else "by the episodes that found them, which flatter themselves"
     )
-    tables = _tables_of_these(shown)
-    mended = most_mended(tables) if tables else None
-    facts = at_a_glance(
-        [
-            *_faults_at_a_glance(archive),
-            ("elites that under half of the robots cross", f"{failing:,} of {len(elites):,}"),
-            ("failure modes: kinds of these", f"{len(shown.modes.modes)}"),
-            ("cells that these fall into: different shares of what goes wrong", f"{ways:,}"),
-            ("robots that reach the goal, mean over the elites", percent(float(elites.goal_rate.mean()))),
-            ("robots that end in a base collision, likewise", percent(float(elites.collision_rate.mean()))),
-            *([mended] if mended else []),
-        ]
-    )
+    faults, count = archive.faults, count_faults(archive)
+    facts = []
+    if faults is not None and faults.certifiers and count is not None:
+        what = f"faults: elites that {any_of(faults.certifiers)} crosses and this controller does not"
+        facts.append((what, f"{count:,}"))
+    facts += [
+        ("elites that under half of the robots cross", f"{failing:,} of {len(elites):,}"),
+        ("failure modes: kinds of these", f"{len(shown.modes.modes)}"),
+        ("cells that these fall into: different shares of what goes wrong", f"{ways:,}"),
+        ("robots that reach the goal, mean over the elites", _rate(elites.goal_rate)),
+        ("robots that end in a base collision, mean over the elites", _rate(elites.collision_rate)),
+        ("robots that end fallen, mean over the elites", _rate(elites.fallen_rate)),
+    ]
     text = (
         f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under "
         f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
-        f"Over all elites {_rate(elites.goal_rate)} of the robots reach the goal, the base of "
-        f"{_rate(elites.collision_rate)} collides, {_rate(elites.fallen_rate)} end fallen: means over terrains"
-        f"{', with 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
+        f"Means over the elites{' have 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
     )
-    known = fault_words(archive)
-    about = [paragraph(" ".join([*known, text]))] if known else [_no_faults(shown), paragraph(text)]
-    return [facts, *failures(shown), *about, _searched(shown)]
-
-
-def _no_faults(shown: Shown) -> Block:
-    """That nobody knows yet which of what fails are faults, and the command that says it."""
-    material = shown.material
-    text = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
-    return absent(text, without_machine(command_line("judge", robot=material.robot.spec, run=material.run)))
-
-
-def _faults_at_a_glance(archive: Archive) -> list[tuple[str, str]]:
-    """The number of faults, where other controllers crossed what fails."""
-    faults, count = archive.faults, count_faults(archive)
-    if faults is None or not faults.certifiers or count is None:
-        return []
-    return [(f"faults: elites that {any_of(faults.certifiers)} crosses and this controller does not", f"{count:,}")]
-
-
-def _tables_of_these(shown: Shown) -> dict[str, Any] | None:
-    """The evaluation's tables, if their elites are those of this archive."""
-    tables, archive = shown.material.tables, shown.material.archive
-    about = (tables or {}).get("archive") or {}
-    return tables if (about.get("elites"), about.get("iterations")) == (len(archive), archive.iterations) else None
+    known, material = fault_words(archive), shown.material
+    judge = without_machine(command_line("judge", robot=material.robot.spec, run=material.run))
+    unknown = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
+    about = [paragraph(" ".join([*known, text]))] if known else [absent(unknown, judge), paragraph(text)]
+    return [at_a_glance(facts), *failures(shown), *about, _searched(shown)]
 
 
 def _rate(rates: np.ndarray) -> str:
@@ -132,9 +104,6 @@ def _searched(shown: Shown) -> Block:
     if numbers is None or material.metrics is None:
         return paragraph(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
     text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
-    walked = [row["episodes"] * row["mean_duration_s"] for row in material.metrics if "mean_duration_s" in row]
-    if len(walked) == len(material.metrics):
-        text += f" ({hours(sum(walked))} of walking, simulated)"
     where = f" on {'up to ' if material.gpus > 1 else ''}{counted(material.gpus, 'GPU')}" if material.gpus else ""
     invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
     return paragraph(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
@@ -154,17 +123,6 @@ def curves_section(shown: Shown) -> list[Block]:
         f"above -20, rose from {first['qd_score']:,.0f} to {last['qd_score']:,.0f}, the mean fitness went from "
         f"{first['mean_fitness']:.1f} to {last['mean_fitness']:.1f}."
     )
-    if len(rows) > 1:
-        tail = rows[-max(1, len(rows) // 5) - 1 :]
-        gained = tail[-1]["elites"] - tail[0]["elites"]
-        span = "iteration" if len(tail) == 2 else f"{len(tail) - 1:,} iterations"
-        text += f" The last {span} added {counted(gained, 'elite')}."
-    if any(row.get("mean_std") is not None for row in rows):
-        text += (
-            " On the right the mean STD: the standard deviations of the scaled penalties over "
-            f"{FRESH_EPISODES} fresh episodes, summed, and averaged over elites looked at during the search, with its "
-            "95 % interval."
-        )
     shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
     return [paragraph(text), picture("curves", draw_curves(archive, rows), shows)]
 
@@ -172,31 +130,16 @@ def curves_section(shown: Shown) -> list[Block]:
 def archive_section(shown: Shown) -> list[Block]:
     """The archive on parallel axes, and its spread over each share."""
     elites, archive = shown.elites, shown.material.archive
-    largest = elites.ratios.max(axis=0)
-    ranges = ", ".join(
-        f"{label_of(name)} {percent(top)}" for name, top in zip(elites.penalties, largest.tolist(), strict=True)
-    )
     lines = (
         f"Each line is one of {counted(len(elites), 'elite')}; each axis a penalty, the height its share of all that "
-        f"went wrong. The largest shares reached are: {ranges}."
-    )
-    counts = spread(archive).sum(axis=2)
-    filled = (counts > 0).sum(axis=1).tolist()
-    widest = int(np.argmax(filled))
-    spread_text = (
-        f"Of the {archive.intervals} intervals of each share the search filled {min(filled)} to {max(filled)}, most of "
-        f"{label_of(archive.penalties[widest])}; {int(archive.collided.sum()):,} of "
-        f"{counted(len(archive), 'elite')} had a base collision in the episodes that found them."
+        "went wrong."
     )
     return [
         paragraph(lines),
         picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
         Folded(
             "Show the elites by interval of each share",
-            [
-                paragraph(spread_text),
-                picture("spread", draw_spread(archive), "Number of elites in each interval of each share"),
-            ],
+            [picture("spread", draw_spread(archive), "Number of elites in each interval of each share")],
         ),
     ]
 
@@ -207,8 +150,5 @@ def origin_section(shown: Shown) -> list[Block]:
     if not origin:
         lost = "The search is not on record: there is no config.json beside the archive. A search writes one:"
         return [absent(lost, without_machine(command_line("archive", robot=shown.material.robot.spec)))]
-    rows = origin_table(origin)
-    again = shown.material.reproduced_by
-    rows += [[f"fresh episodes: {name}", str(again[name])] for name in _AGAIN if name in again]
     text = f"The archive read is {without_machine(str(shown.material.run))}. Its search began with:"
-    return [paragraph(text), table(["", ""], rows, words=True)]
+    return [paragraph(text), table(["", ""], origin_table(origin), words=True)]

@@ -29,8 +29,7 @@ def export(elite, **options):
     return export_terrains(source_of_archive(open_run("anymal"), elite), **options)
 
 
-def test_elites_are_exported_as_the_simulation_has_them(run, monkeypatch):
-    monkeypatch.setattr("qd.show.export._AT_ONCE", 2)
+def test_elites_are_exported_as_the_simulation_has_them(run):
     archive = open_run("anymal", run).archive
     files, folder, elites = export("2 1 0"), run / "terrains", (2, 1, 0)
     endings = ("npz", "png", "xml", "stl", "json")

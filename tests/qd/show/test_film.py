@@ -76,7 +76,7 @@ def test_frames_are_shown_in_real_time_from_the_first_to_the_last(recording):
     assert shown_frames(shot_of(replace(recording, num_frames=np.ones((1, 5), np.int32))), 25) == [0]
 
 
-def test_the_panel_has_a_dot_at_the_place_and_sums_that_grow(recording):
+def test_the_panel_has_a_dot_at_the_place(recording):
     panel = Panel(shot_of(recording), WIDTH, PANEL_HEIGHT)
     early, late = panel.at(0.25, np.array([3.0, 4.0, 0.5])), panel.at(0.75, np.array([5.0, 6.0, 0.5]))
     assert early.shape == (PANEL_HEIGHT, WIDTH, 3) and early.dtype == np.uint8
@@ -88,7 +88,6 @@ def test_the_panel_has_a_dot_at_the_place_and_sums_that_grow(recording):
 
     moved = dot(late, early) - dot(early, late)
     assert moved[0] == pytest.approx(-moved[1], abs=2) and moved[0] > 30  # 2 m along x, 2 m up along y
-    assert (early[:, -60:] != late[:, -60:]).any()  # the sums behind the legend
 
 
 def test_the_camera_follows_and_rises_where_the_ground_would_hide_the_robot(recording):

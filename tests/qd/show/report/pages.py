@@ -13,8 +13,8 @@ from sim.files.atomic import to_json
 from sim.robots.find import get_robot
 from tests.builders import fresh_values
 from tests.qd.recordings import stand_in_cross
-from tests.qd.show.report.test_numbers import grouped_archive
 from tests.qd.show.test_figures import rows
+from tests.qd.test_groups import grouped_archive
 
 DOT = bytes.fromhex("89504e470d0a1a0a")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -54,8 +54,7 @@ def make_run(root):
     folder = root / "run"
     folder.mkdir()
     write_archive(folder / "archive.npz", archive)
-    metrics = [{**row, "mean_duration_s": 15.0} for row in rows(4)]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in metrics))
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows(4)))
     small = preset("small", get_robot("anymal"))
     fitness = dataclasses.replace(small.fitness, penalties=archive.penalties, scales=archive.scales)
     settings = as_settings(dataclasses.replace(small, fitness=fitness))
