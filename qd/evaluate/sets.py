@@ -275,7 +275,7 @@ def nearest_distance(
     Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
     """
     maps, others = (
-        heights_of(some, space).reshape(len(some), -1).astype(np.float64) for some in (genes, training_genes)
+        heights_of(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
     )
     nearest = np.full(len(maps), np.inf)
     for first in range(0, len(others), _BANK):

@@ -12,21 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.box import SIMPLE
-from rich.console import Console
-from rich.table import Table
 
+from qd.evaluate.show import show_table
 from sim.device import resolve_device
+from sim.files.intervals import value_words
 from sim.files.records import provenance
 from sim.policy.loaders import prepare_torch
 from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
 from tests.bench.ceiling import Ceiling, measure_ceiling
-from tests.bench.timing import Timing, Variant, fit_launches, repeat_torch, repeat_warp, time_in_turns
+from tests.bench.timing import Timing, fit_launches, repeat_torch, repeat_warp, time_in_turns
 
 
-def torch_variants(case: Case, device: str, timing: Timing, *, compiled: bool) -> dict[str, Variant]:
-    """The counterpart as it is, and through ``torch.compile`` where that works."""
+def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *, compiled: bool) -> dict[str, Any]:
+    """One row of the results; what was not measured, since ``torch.compile`` failed, is None."""
     functions = {"torch": case.counterpart}
     if compiled:
         functions["torch_compile"] = torch.compile(case.counterpart, dynamic=False, fullgraph=True)
@@ -34,18 +33,12 @@ def torch_variants(case: Case, device: str, timing: Timing, *, compiled: bool) -
     for name, function in functions.items():
         call = partial(function, *case.arguments)
         try:
-            variants[name] = fit_launches(partial(repeat_torch, call, device=device), device, timing)
+            variants[name] = variant = fit_launches(partial(repeat_torch, call, device=device), device, timing)
         except Exception as error:  # the compiler may fail with anything: it may lack a C++ compiler
             if name == "torch":
                 raise
             print(f"no torch.compile of {case.name}: {type(error).__name__}: {error}"[:300], file=sys.stderr)
-    return variants
-
-
-def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *, compiled: bool) -> dict[str, Any]:
-    """One row of the results; what was not measured is None."""
-    variants = torch_variants(case, device, timing, compiled=compiled)
-    for variant in variants.values():
+            continue
         variant.replay()
         case.compare(variant.outputs[0])
     variants["ours"] = fit_launches(partial(repeat_warp, case.launch, device=device), device, timing)
@@ -64,21 +57,18 @@ def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *,
 
 def print_table(report: dict[str, Any]) -> None:
     """Prints the rows."""
-    table = Table(
-        title=f"{report['device']}: {report['num_envs']} robots on {report['num_terrains']} terrains",
-        box=SIMPLE,
-        pad_edge=False,
-        padding=(0, 1),
-    )
-    for heading in ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"):
-        table.add_column(heading, no_wrap=True, justify="left" if heading in ("kernel", "bound by") else "right")
-    for row in report["rows"]:
-        ms = [row[name] for name in ("ours_ms", "torch_ms", "torch_compile_ms")]
-        table.add_row(
-            row["kernel"], *("-" if value is None else f"{value:.4g}" for value in ms), f"{row['speedup']:.1f}x",
-            f"{row['ceiling_share']:.1%}", row["bound_by"],
-        )  # fmt: skip
-    Console(width=None if sys.stdout.isatty() else 100).print(table)
+    rows = [
+        (
+            row["kernel"],
+            *(value_words(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")),
+            f"{row['speedup']:.1f}x",
+            f"{row['ceiling_share']:.1%}",
+            row["bound_by"],
+        )
+        for row in report["rows"]
+    ]
+    title = f"{report['device']}: {report['num_envs']} robots on {report['num_terrains']} terrains"
+    show_table(title, ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"), rows)
 
 
 def file_name(device_name: str) -> str:
@@ -109,11 +99,10 @@ def main(argv: list[str]) -> None:
         robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=1.0 if args.small else 8.0, seed=0
     )
     ceiling = measure_ceiling(device, timing)
-    rows = [
-        measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in make_cases(scene).values()
-    ]
-    report = {**provenance(device, 0), "robot": robot.name, "num_envs": num_envs, "num_terrains": num_terrains}
-    report["rows"] = rows
+    cases = make_cases(scene).values()
+    rows = [measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in cases]
+    sizes = {"num_envs": num_envs, "num_terrains": num_terrains}
+    report = {**provenance(device, 0), "robot": robot.name, **sizes, "rows": rows}
     print_table(report)
     out = args.out or Path("results/bench") / file_name(report["device"])
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -72,8 +72,8 @@ def _compared(tables: dict[str, Any], kinds: dict[str, Any]) -> str:
         f"{counted(len(tables['controllers']), 'controller')} on {counted(len(tables['terrains']), 'set')} of "
         f"terrains ({sets}), {tables['episodes']} episodes on each terrain; intervals are 95 %, over terrains"
     )
-    several = len(kinds["controllers"]) < len(tables["controllers"])
-    text += ", of several trainings that differ in their seed over these." if several else "."
+    over_seeds = len(kinds["controllers"]) < len(tables["controllers"])
+    text += ", of several trainings that differ in their seed over these." if over_seeds else "."
     return (
         f"{text} No base collision is what the paper calls success. A robot that stands still or walks off has none "
         "either: it may have 100 % there and never reach the goal. Read the goal rate first."
@@ -110,7 +110,8 @@ def certified_table(kinds: dict[str, Any]) -> list[Block]:
         return []
     rows = [
         [f"{_label(name)} ({about['terrains']} certified): {words}",
-         *(_value(kinds, key, name, controller) + _role(about, all_) for controller, all_ in kinds["members"].items())]
+         *(_value(kinds, key, name, controller) + _role(about, names)
+           for controller, names in kinds["members"].items())]
         for name, about in known.items() for key, words in CERTIFIED.items()
     ]  # fmt: skip
     text = (
@@ -156,14 +157,14 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
     members: dict[str, list[str]] = {}
     for controller in tables["controllers"]:
         members.setdefault(kind_of(controller), []).append(controller)
-    kinds = {f"{kind} ({len(all_)} seeds)" if len(all_) > 1 else all_[0]: all_ for kind, all_ in members.items()}
-    joined = {**tables, "controllers": {label: tables["controllers"][all_[0]] for label, all_ in kinds.items()}}
+    kinds = {f"{kind} ({len(names)} seeds)" if len(names) > 1 else names[0]: names for kind, names in members.items()}
+    joined = {**tables, "controllers": {label: tables["controllers"][names[0]] for label, names in kinds.items()}}
     joined |= {"members": kinds, "intervals": dict(tables["intervals"])}
     for measure in (*MEASURES, *(CERTIFIED if tables.get("certified") else ())):
         values, limits = {}, {}
         for name in tables[measure]:
-            several = tables["over_seeds"].get(measure, {}).get(name, {})
-            pairs = {label: _of_kind(tables, measure, name, all_, several) for label, all_ in kinds.items()}
+            means = tables["over_seeds"].get(measure, {}).get(name, {})
+            pairs = {label: _of_kind(tables, measure, name, names, means) for label, names in kinds.items()}
             values[name] = {label: value for label, (value, _) in pairs.items()}
             limits[name] = {label: interval for label, (_, interval) in pairs.items()}
         joined[measure], joined["intervals"][measure] = values, limits
@@ -171,10 +172,10 @@ def by_kind(tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_kind(
-    tables: dict[str, Any], measure: str, name: str, members: list[str], several: dict[str, Any]
+    tables: dict[str, Any], measure: str, name: str, members: list[str], means: dict[str, Any]
 ) -> tuple[float | None, list[float] | None]:
     """Value and interval of a kind of controller on a set."""
     if len(members) == 1:
         return tables[measure][name][members[0]], tables["intervals"][measure][name][members[0]]
-    about = several.get(kind_of(members[0]), {"mean": None, "interval": None})
+    about = means.get(kind_of(members[0]), {"mean": None, "interval": None})
     return about["mean"], about["interval"]

@@ -93,10 +93,10 @@ def _searched(shown: Shown) -> Block:
     material, numbers = shown.material, shown.material.summary
     archive, search = material.archive, material.search
     policy = SHIPPED if search is None else search.policy
-    who = "its shipped controller" if policy == SHIPPED else f"controller {ControllerSpec.parse(policy).label}"
+    controller = "its shipped controller" if policy == SHIPPED else f"controller {ControllerSpec.parse(policy).label}"
     if search is None:
-        who = "a controller that is not on record (the archive lies without its config.json)"
-    text = f"{archive.robot} with {who}, after {counted(archive.iterations, 'iteration')}"
+        controller = "a controller that is not on record (the archive lies without its config.json)"
+    text = f"{archive.robot} with {controller}, after {counted(archive.iterations, 'iteration')}"
     if search is not None:
         text += f" of {search.scheduler.method.replace('+', ' and ')} (seed {search.seed})"
     text += f": {counted(len(archive), 'elite')} in {percent(archive.reachable_coverage)} of the "

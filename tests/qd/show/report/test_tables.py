@@ -70,13 +70,6 @@ def test_tables_without_the_controller_of_the_search_say_so(reported, tables, ru
     assert ["faultline evaluate" in text for text in texts] == [False, True]
 
 
-def test_damaged_tables_are_refused(reported, run, tables):
-    changed(tables, goal=3)
-    with pytest.raises(ValueError, match="goal"):
-        reported()
-    assert not (run / "report.html").exists()
-
-
 def test_of_several_trainings_the_mean_over_their_seeds_is_shown():
     values, limits = {"base": 0.5, "C-G": 0.6, "C-G@1": 0.8, "C-R@1": None}, {"base": [0.4, 0.6], "C-G": [0.5, 0.7],
                       "C-G@1": [0.7, 0.9], "C-R@1": None}  # fmt: skip
