@@ -155,7 +155,10 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> F
     figure.colorbar(draw_map(top, crossed), ax=top, label="height [m]", shrink=0.85, pad=0.01)
     _draw_profile(profile, crossed)
     _draw_places(places, crossed, penalties)
-    handles = [*_legend(crossed), *(Patch(label=label_of(name), **look_of(name).bar) for name in penalties)]
+    handles = _legend(crossed)
+    for name in penalties:
+        look = look_of(name)
+        handles.append(Patch(facecolor=look.color, hatch=look.hatch, edgecolor="white", label=label_of(name)))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
     top.set_xlim(*_x_limits(crossed))
     return figure
