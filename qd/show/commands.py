@@ -286,7 +286,7 @@ class View(RobotFlag, EliteFlags):
 
     def execute(self) -> None:
         """Serves the page until Ctrl-C."""
-        from qd.show.view.serve import serve
+        from qd.show.view.app import serve
         from qd.show.view.show import find_show
 
         show = find_show(

@@ -3,8 +3,10 @@
 import json
 import math
 import uuid
-from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 import viser
@@ -14,7 +16,6 @@ _ANSWER_S = 5.0
 """How long a browser has to say what its address is."""
 _POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"
 """Viser's own: its page starts with that camera."""
-
 _MINIMAL = "minimal"
 
 Point = tuple[float, float, float]
@@ -22,7 +23,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Address:
-    """What a tab shows; None and False of what its address does not say."""
+    """What a tab shows; None or False where its address does not say it."""
 
     elite: int | None = None
     controller: str | None = None
@@ -37,61 +38,53 @@ class Address:
     camera: tuple[Point, Point] | None = None
     """Where the camera stands and what it looks at [m]."""
     others: tuple[tuple[str, str], ...] = ()
-    """What else the address says, as it says it; viser has parameters of its own."""
+    """Further parameters with their values, such as viser's."""
 
     def query(self) -> str:
         """The address behind its question mark."""
-        said: list[tuple[str, str]] = list(self.others)
-        named = (("elite", self.elite), ("controller", self.controller), ("ghost", self.ghost),
-                 ("episode", self.episode))  # fmt: skip
-        said += [(name, str(value)) for name, value in named if value is not None]
-        if self.minimal:
-            said.insert(len(self.others) + 1, ("terrain", _MINIMAL))
-        if self.time_s is not None:
-            said.append(("t", f"{self.time_s:.2f}".rstrip("0").rstrip(".")))
-        if self.follow:
-            said.append(("follow", "1"))
-        if self.camera is not None:
-            said += [(name, _text_of(point)) for name, point in zip((_POSITION, _LOOK_AT), self.camera, strict=True)]
-        return urlencode(said, safe=",", quote_via=quote)
-
-
-def _text_of(point: Point) -> str:
-    return ",".join(f"{value:.2f}" for value in point)
+        camera = {} if self.camera is None else dict(zip((_POSITION, _LOOK_AT), self.camera, strict=True))
+        values = {
+            "elite": self.elite,
+            "terrain": _MINIMAL if self.minimal else None,
+            "controller": self.controller,
+            "ghost": self.ghost,
+            "episode": self.episode,
+            "t": None if self.time_s is None else f"{self.time_s:.2f}".rstrip("0").rstrip("."),
+            "follow": "1" if self.follow else None,
+            **{name: ",".join(f"{value:.2f}" for value in point) for name, point in camera.items()},
+        }
+        ours = [(name, str(value)) for name, value in values.items() if value is not None]
+        return urlencode([*self.others, *ours], safe=",", quote_via=quote)
 
 
 def read_address(query: str) -> tuple[Address, list[str]]:
-    """What the address of a page says, and in words what of it means nothing.
+    """What the address of a page says, and which parts of it mean nothing, in words.
 
     Args:
         query: The address behind its question mark, with or without that.
     """
     pairs = parse_qsl(query.removeprefix("?"), keep_blank_values=True)
-    said, refused = dict(pairs), []
+    values, refused = dict(pairs), []
     ours = {"elite", "controller", "ghost", "terrain", "episode", "t", "follow", _POSITION, _LOOK_AT}
 
-    def number(name: str, words: str) -> float | None:
-        if name not in said:
+    def read(name: str, kind: type[int] | type[float]) -> Any:
+        if name not in values:
             return None
-        try:
-            value = float(said[name])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value) or (name != "t" and value != int(value)):
-            refused.append(f"{name}={said[name]} in the address is no {words}: it is left out.")
-            return None
-        return value
+        with suppress(ValueError, OverflowError):
+            if math.isfinite(value := kind(values[name])):
+                return value
+        refused.append(f"{name}={values[name]} in the address is no number that makes sense: it is left out.")
+        return None
 
-    elite, episode, time_s = number("elite", "elite"), number("episode", "episode"), number("t", "time in seconds")
-    position, look_at = _point(said.get(_POSITION)), _point(said.get(_LOOK_AT))
+    position, look_at = _point(values.get(_POSITION)), _point(values.get(_LOOK_AT))
     return Address(
-        elite=None if elite is None else int(elite),
-        controller=said.get("controller"),
-        ghost=said.get("ghost"),
-        minimal=said.get("terrain") == _MINIMAL,
-        episode=None if episode is None else int(episode),
-        time_s=time_s,
-        follow=said.get("follow") == "1",
+        elite=read("elite", int),
+        controller=values.get("controller"),
+        ghost=values.get("ghost"),
+        minimal=values.get("terrain") == _MINIMAL,
+        episode=read("episode", int),
+        time_s=read("t", float),
+        follow=values.get("follow") == "1",
         camera=None if position is None or look_at is None else (position, look_at),
         others=tuple(pair for pair in pairs if pair[0] not in ours),
     ), refused
@@ -106,7 +99,7 @@ def _point(text: str | None) -> Point | None:
 
 
 def ask_query(client: viser.ClientHandle) -> str:
-    """What stands behind the question mark in a browser's address; nothing if it does not answer in time.
+    """What a browser's address says behind its question mark; empty if the browser does not answer in time.
 
     Viser's browser does not send it. A script puts it where viser can read it: in the browser's storage, under a name
     that is made up for this one question, since tabs share that storage.
@@ -128,31 +121,22 @@ def show_query(client: viser.ClientHandle, query: str) -> None:
     run_script(client, f"history.replaceState(history.state, '', {json.dumps('?' + query)});")
 
 
-def copy_link(client: viser.ClientHandle) -> None:
-    """Have a browser copy its address; where it may not, it shows the link to be copied by hand."""
-    _copy(client, "location.href", "Copy this link")
-
-
-def copy_text(client: viser.ClientHandle, text: str) -> None:
-    """Have a browser copy a text, likewise."""
-    _copy(client, json.dumps(text), "Copy this")
-
-
-def _copy(client: viser.ClientHandle, source: str, asked: str) -> None:
-    run_script(client, f"const text = {source}, ask = () => window.prompt({json.dumps(asked)}, text);"
+def copy_text(client: viser.ClientHandle, text: str | None) -> None:
+    """Have a browser copy a text, or with None its address; if it may not, it shows that to be copied by hand."""
+    source = "location.href" if text is None else json.dumps(text)
+    run_script(client, f"const text = {source}, ask = () => window.prompt('Copy this', text);"
          "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip
 
 
-def keep_keys(client: viser.ClientHandle, names: Sequence[str]) -> None:
-    """Keep keys from viser's camera, which would move with them too; the page's commands still get them.
+def keep_keys(client: viser.ClientHandle) -> None:
+    """Keep left and right from viser's camera, which would move with them too; the page's commands still get them."""
+    run_script(client, "document.documentElement.addEventListener('keydown', e => "
+         "{ if (['ArrowLeft', 'ArrowRight'].includes(e.code)) e.stopPropagation(); });")  # fmt: skip
 
-    Args:
-        client: The browser.
-        names: As a keyboard event's ``code`` has them.
-    """
-    run_script(client, f"const kept = {json.dumps(list(names))};"
-         "document.documentElement.addEventListener('keydown', e => "
-         "{ if (kept.includes(e.code)) e.stopPropagation(); });")  # fmt: skip
+
+def let_point(client: viser.ClientHandle) -> None:
+    """Have a browser name the line of the archive's plot under the pointer, and show its elite on a click."""
+    run_script(client, Path(__file__).with_name("pointing.js").read_text(encoding="utf-8"))
 
 
 def run_script(client: viser.ClientHandle, script: str) -> None:

@@ -13,28 +13,22 @@ from qd.show.view.recorder import Report
 from sim.recording.recorder import Recording
 
 CERTIFYING, NOBODY = "who certifies it", "none"
-"""Choices beside the names of controllers: of each elite the one that certifies it, if it is at hand; nobody."""
+"""Choices beside the names of controllers: the one that certifies the elite, if it is at hand, and no ghost."""
 
 
 class Ghost:
-    """Whose crossing is shown beside the chosen controller's, and what is recorded of it."""
+    """Whose crossing is shown beside the chosen controller's, and its recording."""
 
     def __init__(self, common: Common, tab: int) -> None:
-        """Who certifies the elite, if anybody does.
-
-        Args:
-            common: What all tabs share.
-            tab: Number of the tab.
-        """
-        self._common, self._tab = common, tab
+        """The controller that certifies the elite is the ghost at first, in the tab of that number."""
+        self._common, self._key = common, (tab, "ghost")
         self.choice = CERTIFYING
-        """What was chosen: a controller's name, :data:`CERTIFYING` or :data:`NOBODY`."""
+        """A controller's name, :data:`CERTIFYING` or :data:`NOBODY`."""
         self.name: str | None = None
         """Of the controller; None if there is no ghost."""
         self.recording: Recording | None = None
         self.crossing: Crossing | None = None
         self._wanted: Wanted | None = None
-        self._asked = False
 
     @property
     def choices(self) -> tuple[str, ...]:
@@ -42,15 +36,12 @@ class Ghost:
         return (CERTIFYING, NOBODY, *self._common.show.controllers)
 
     def load(self, elite: int, beside: str | None, minimal: NDArray[np.float32] | None = None) -> str:
-        """Take another elite or controller; what is not recorded is asked for.
+        """Load the recording of another elite or controller, or ask for it; returns its status as HTML.
 
         Args:
             elite: Number of the elite.
             beside: The controller that is shown already, which can be no ghost of itself.
             minimal: Genes of the elite's minimal terrain, if that is shown.
-
-        Returns:
-            What to say of it, as HTML.
         """
         show = self._common.show
         self.recording = self.crossing = self._wanted = None
@@ -60,19 +51,15 @@ class Ghost:
             archive, policy = show.opened_run.archive, show.controllers[self.name]
             self._wanted = on_elite(archive, elite, policy=policy, replicas=show.replicas, minimal=minimal)
             self.recording = self._common.recordings.read(self._wanted)
-        missing = self._wanted if self.recording is None else None
-        if missing is not None or self._asked:
-            self._common.record(missing, (self._tab, "ghost"))
-        self._asked = missing is not None
+        self._common.recorder.record(self._wanted if self.recording is None else None, tab=self._key)
         return self.words(0)
 
     def leave(self) -> None:
         """Ask for nothing more."""
-        if self._asked:
-            self._common.record(None, (self._tab, "ghost"))
+        self._common.recorder.record(None, tab=self._key)
 
-    def take(self, report: Report) -> str | None:
-        """Take what was recorded, if it is of the ghost; returns what to say of it, as HTML, None of another's."""
+    def take_report(self, report: Report) -> str | None:
+        """Take the recording of a report on this ghost; returns its status as HTML, None for another's report."""
         if self._wanted is None or report.wanted != self._wanted or self.recording is not None:
             return None
         self.recording = report.recording
@@ -83,7 +70,7 @@ class Ghost:
         return f"{self.words(0)} {report.text}, {report.share:.0%}"
 
     def show_episode(self, replica: int) -> str:
-        """Take an episode, counted from 0; returns what to say of it, as HTML."""
+        """Load the crossing of an episode, counted from 0; returns its status as HTML."""
         archive = self._common.show.opened_run.archive
         self.crossing = None
         if self.recording is not None:
@@ -92,12 +79,12 @@ class Ghost:
         return self.words(replica)
 
     def words(self, replica: int) -> str:
-        """How its episode ended, as HTML; nothing without a ghost."""
+        """How its episode ended, as HTML; empty without a ghost."""
         if self.name is None:
             return ""
-        who = f"Ghost, {escape(self.name)}:"
+        name = f"Ghost, {escape(self.name)}:"
         if self.recording is None:
-            return f"{who} its {self._common.show.replicas} episodes are recorded …"
+            return f"{name} its {self._common.show.replicas} episodes are recorded …"
         ending = ending_of(self.recording.outcome[0, replica])
         ended = f'<span style="color:{ending.color}">{ending.words}</span>'
-        return f"{who} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s."
+        return f"{name} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s."

@@ -19,7 +19,7 @@ Color = tuple[int, int, int]
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
 _BASE, _LIMB, _FOOT, _BONE = (112, 124, 146), (150, 160, 176), (230, 92, 34), (182, 188, 198)
-_BONE_RADIUS = 0.35  # in that of the robot's thinnest limb or foot
+_BONE_RADIUS = 0.35  # of the median radius of the robot's limbs and feet
 _SEGMENTS = 20  # round a capsule
 _TOUCH_MARGIN = 0.01  # by which a coloured shape is longer than the one under it [m]
 
@@ -34,9 +34,7 @@ def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
 def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> trimesh.Trimesh:
     """The surface that the robot walks on, triangle by triangle: blue below 0, brown above, a darker line every metre.
 
-    Args:
-        heights: Height grid [m], shape (nrow, ncol), row along y, column along x.
-        ground: Friction and softness, which tint it.
+    Friction and softness of the ``ground`` tint it. The height grid [m] has shape (nrow, ncol), row along y.
     """
     nrow, ncol = heights.shape
     y, x = np.meshgrid(SPACING * np.arange(nrow), SPACING * np.arange(ncol), indexing="ij")
@@ -54,9 +52,9 @@ def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None
 
 
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
-    """Triangles with a colour (sRGB) a vertex."""
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=in_linear_light(colors), process=False)
-    return _joined([mesh])
+    """Triangles with a colour (sRGB) a vertex, or one of all."""
+    colors = np.broadcast_to(in_linear_light(colors), (len(vertices), 3))
+    return _joined([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)])
 
 
 def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -75,7 +73,7 @@ def geom_mesh(geom: Geom, color: Color) -> trimesh.Trimesh:
         shape = _primitive(geom.kind, geom.size)
     transform = trimesh.transformations.quaternion_matrix(geom.quaternion)  # w x y z too
     transform[:3, 3] = geom.position
-    return _painted(shape.apply_transform(transform), color)
+    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.array(color))
 
 
 def _primitive(kind: str, size: NDArray[np.float64]) -> trimesh.Trimesh:
@@ -90,10 +88,6 @@ def _primitive(kind: str, size: NDArray[np.float64]) -> trimesh.Trimesh:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
     ball.apply_scale(size if kind == "ellipsoid" else (radius, radius, radius))
     return ball
-
-
-def _painted(shape: trimesh.Trimesh, color: Color) -> trimesh.Trimesh:
-    return _mesh(shape.vertices, shape.faces, np.tile(np.array(color), (len(shape.vertices), 1)))
 
 
 def arrow_mesh() -> trimesh.Trimesh:
@@ -113,12 +107,7 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
 
 
 def path_mesh(points: NDArray[np.floating], radius: float) -> trimesh.Trimesh:
-    """A thin tube of three sides along a way, in one piece that can be translucent.
-
-    Args:
-        points: Of the way [m], shape (num_points, 3), at least 2.
-        radius: From its middle to its edges [m].
-    """
+    """A thin tube of three sides along two or more points [m], in one piece that can be translucent."""
     ahead = np.gradient(points, axis=0)
     left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(points))], axis=1)
     length = np.linalg.norm(left, axis=1, keepdims=True)
@@ -141,41 +130,30 @@ def touch_mesh(geom: Geom) -> trimesh.Trimesh:
 
 
 def body_meshes(skeleton: Skeleton, robot: RobotCfg) -> list[trimesh.Trimesh | None]:
-    """Each body's shapes in its own frame, coloured by role; None of a body with nothing to see.
+    """Each body's shapes in its own frame, coloured by role; None for a body without shapes.
 
-    A robot whose file has only shapes to collide with gets bones from joint to joint and to its feet, or its parts
-    would hang in the air.
+    A robot whose file has only shapes that collide gets bones from joint to joint and to its feet, or its parts would
+    hang in the air.
     """
     parts: list[list[trimesh.Trimesh]] = [[] for _ in skeleton.body_names]
     for geom in skeleton.geoms:
-        parts[geom.body].append(geom_mesh(geom, _color_of(geom.name, robot)))
+        color = _FOOT if geom.name in robot.foot_geoms else _BASE if geom.name in robot.base_geoms else _LIMB
+        parts[geom.body].append(geom_mesh(geom, color))
     if not any(geom.kind == "mesh" for geom in skeleton.geoms):
-        for body, end in _bones(skeleton, robot):
-            parts[body].append(_bone(end, _bone_radius(skeleton, robot)))
+        limbs = [geom for geom in skeleton.geoms if geom.name in (*robot.limb_geoms, *robot.foot_geoms)]
+        radius = _BONE_RADIUS * float(np.median([geom.size[0] for geom in limbs]))
+        ends = [(parent, skeleton.offsets[child]) for child, parent in enumerate(skeleton.parents) if parent >= 0]
+        ends += [(geom.body, geom.position) for geom in limbs if geom.name in robot.foot_geoms]
+        for body, end in ends:
+            parts[body].append(_bone(end, radius))
     return [_joined(meshes) if meshes else None for meshes in parts]
 
 
-def _color_of(name: str, robot: RobotCfg) -> Color:
-    if name in robot.foot_geoms:
-        return _FOOT
-    return _BASE if name in robot.base_geoms else _LIMB
-
-
-def _bones(skeleton: Skeleton, robot: RobotCfg) -> list[tuple[int, NDArray[np.float64]]]:
-    """Body and end point in its frame of every bone, which begins at the body's origin."""
-    to_child = [(parent, skeleton.offsets[child]) for child, parent in enumerate(skeleton.parents) if parent >= 0]
-    return to_child + [(geom.body, geom.position) for geom in skeleton.geoms if geom.name in robot.foot_geoms]
-
-
-def _bone_radius(skeleton: Skeleton, robot: RobotCfg) -> float:
-    sizes = [float(geom.size[0]) for geom in skeleton.geoms if geom.name in (*robot.limb_geoms, *robot.foot_geoms)]
-    return _BONE_RADIUS * float(np.median(sizes))
-
-
 def _bone(end: NDArray[np.float64], radius: float) -> trimesh.Trimesh:
+    """From its body's origin to a point."""
     length = float(np.linalg.norm(end))
     shape = trimesh.creation.capsule(height=length, radius=radius, count=(8, 8))
     direction = end / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
     transform = np.asarray(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction), dtype=np.float64)
     transform[:3, 3] = 0.5 * end
-    return _painted(shape.apply_transform(transform), _BONE)
+    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.array(_BONE))

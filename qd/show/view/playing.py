@@ -17,15 +17,13 @@ from sim.robots.skeleton import Skeleton
 
 _FORCE_LENGTH = 1e-3  # of an arrow [m/N]
 _LEAST_FORCE = 5.0  # shown [N]
-_COMMAND_LENGTH = 1.0  # of an arrow [m/(m/s)]
 _COMMAND_HEIGHT = 0.45  # over the base [m]
 
 
 class Mark(NamedTuple):
-    """Something that happened, on the timeline."""
+    """An event on the timeline."""
 
     time_s: float
-    """When [s]."""
     words: str
 
 
@@ -38,13 +36,13 @@ class Crossing:
     duration_s: float
     """Simulated time up to the end [s]."""
     ending: str
-    """Outcome in words, and whether the robot had fallen."""
+    """Outcome in words, and whether the robot has fallen."""
     positions: NDArray[np.float64]
     """Origins of the bodies, world [m], shape (F, num_bodies, 3)."""
     quaternions: NDArray[np.float64]
     """Bodies to world, w x y z, shape (F, num_bodies, 4)."""
     forces: NDArray[np.float64]
-    """Arrows of the feet's contact forces, begin and end [m], of no length where there is none, (F, num_feet, 2, 3)."""
+    """Arrows of the feet's contact forces, begin and end [m], shape (F, num_feet, 2, 3); small forces have length 0."""
     force_newtons: NDArray[np.float64]
     """Their size [N], shape (F, num_feet)."""
     command: NDArray[np.float64]
@@ -53,11 +51,10 @@ class Crossing:
     """v_x, v_y [m/s], yaw rate [rad/s], yaw frame, shape (F, 3)."""
     penalties: NDArray[np.float64]
     """Scaled sums so far, in the archive's order, shape (F, P)."""
-
     touching: NDArray[np.bool_] | None
-    """Whether each recorded geom touches something, shape (F, num_geoms); None where that was not recorded."""
+    """Whether each recorded geom touches something, shape (F, num_geoms); None if that was not recorded."""
     marks: tuple[Mark, ...]
-    """First stumble, first collision, fall and end, in the order of time."""
+    """As :func:`marks_of` has them."""
 
     @property
     def num_frames(self) -> int:
@@ -73,14 +70,9 @@ class Crossing:
 def crossing_of(
     recording: Recording, replica: int, skeleton: Skeleton, penalties: Sequence[str], scales: Sequence[float]
 ) -> Crossing | None:
-    """One episode of a recording of one terrain; None of an episode that broke before its first frame.
+    """One episode of a recording of one terrain; None if it broke before its first frame.
 
-    Args:
-        recording: The recording.
-        replica: Number of the episode.
-        skeleton: The robot's.
-        penalties: Names of the penalties to show, all of them recorded.
-        scales: What to divide each by.
+    The ``penalties`` are those to show, by name, and are divided by ``scales``.
     """
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
@@ -90,7 +82,9 @@ def crossing_of(
     newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
     size = np.linalg.norm(newtons, axis=-1)
     arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
-    feet = _foot_positions(recording, skeleton, positions, quaternions)
+    shapes = [skeleton.geom(name) for name in recording.foot_names]
+    bodies, centres = [foot.body for foot in shapes], np.stack([foot.position for foot in shapes])
+    feet = positions[:, bodies] + rotated(quaternions[:, bodies], centres)
     command = recording.command[0, replica, :frames].astype(np.float64)
     columns = [recording.penalty_names.index(name) for name in penalties]
     return Crossing(
@@ -116,28 +110,25 @@ def ending_words(recording: Recording, replica: int) -> str:
 
 
 def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
-    """What happens in an episode of one terrain that has frames, in the order of time; what never happens has no mark.
+    """First stumble, first collision, fall and end of an episode of one terrain that has frames, in the order of time.
 
-    A stumble and a collision are those that the penalties count; a robot that is not penalised for collisions has one
+    Stumbles and collisions are those that the penalties count; a robot without a penalty for collisions has one
     at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
-
-    Args:
-        recording: The recording.
-        replica: Number of the episode.
     """
     frames = int(recording.num_frames[0, replica])
-    happened = {
+    up = rotated(recording.base_quaternion[0, replica, :frames], np.array([0.0, 0.0, 1.0]))[:, 2]
+    events = {
         "first stumble": _grows(recording, replica, "stumble"),
         "first collision": _collides(recording, replica),
-        "fall": _upright(recording.base_quaternion[0, replica, :frames]) < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
+        "fall": up < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
     }
-    found = [Mark(recording.dt * int(np.argmax(when)), words) for words, when in happened.items() if when.any()]
-    found.append(Mark(recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
-    return tuple(sorted(found, key=lambda mark: mark.time_s))
+    marks = [Mark(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
+    marks.append(Mark(recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
+    return tuple(sorted(marks, key=lambda mark: mark.time_s))
 
 
 def _grows(recording: Recording, replica: int, penalty: str) -> NDArray[np.bool_]:
-    """Frames up to which a penalty has grown since the one before; none of a penalty that is not recorded."""
+    """Frames at which a penalty is larger than at the one before; none if it is not recorded."""
     frames = int(recording.num_frames[0, replica])
     if penalty not in recording.penalty_names:
         return np.zeros(frames, dtype=bool)
@@ -153,11 +144,6 @@ def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
     return np.asarray(touching.any(axis=0))
 
 
-def _upright(quaternions: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Cosine of the tilt of a base."""
-    return rotated(quaternions, np.array([0.0, 0.0, 1.0]))[..., 2]
-
-
 def next_mark(marks: Sequence[Mark], time_s: float) -> Mark:
     """The first mark after a time [s]; after the last one it is the first again."""
     return next((mark for mark in marks if mark.time_s > time_s + 1e-6), marks[0])
@@ -165,14 +151,12 @@ def next_mark(marks: Sequence[Mark], time_s: float) -> Mark:
 
 def episodes_by_outcome(recording: Recording) -> dict[str, list[int]]:
     """Episodes of one terrain by what they have in common, in words with their number; all of them first."""
-    count = recording.num_episodes
-    found = {f"all {count} episodes": list(range(count))}
-    by_ending = Counter(map(ending_of, recording.outcome[0].tolist()))
-    for ending, number in by_ending.most_common():
-        alike = [k for k, outcome in enumerate(recording.outcome[0].tolist()) if ending_of(outcome) == ending]
-        found[f"the {number} that ended: {ending.words}"] = alike
+    endings = list(map(ending_of, recording.outcome[0].tolist()))
+    groups = {f"all {len(endings)} episodes": list(range(len(endings)))}
+    for ending, number in Counter(endings).most_common():
+        groups[f"the {number} that ended: {ending.words}"] = [k for k, other in enumerate(endings) if other == ending]
     fallen = np.flatnonzero(recording.fallen[0]).tolist()
-    return found | ({f"the {len(fallen)} that fell": fallen} if fallen else {})
+    return groups | ({f"the {len(fallen)} that fell": fallen} if fallen else {})
 
 
 def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -182,45 +166,32 @@ def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) ->
     return vectors + w * twice + np.cross(axis, twice)
 
 
-def _foot_positions(
-    recording: Recording, skeleton: Skeleton, positions: NDArray[np.float64], quaternions: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Centres of the feet's shapes [m], shape (F, num_feet, 3)."""
-    feet = [skeleton.geom(name) for name in recording.foot_names]
-    bodies = [foot.body for foot in feet]
-    centres = np.stack([foot.position for foot in feet])
-    return positions[:, bodies] + rotated(quaternions[:, bodies], centres)
-
-
 def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The commanded velocity, from above the base; the command is given in the frame of the base's yaw."""
+    """Arrows of the commanded velocity, 1 m is 1 m/s, from above the base; commands are in the frame of its yaw."""
     forward = rotated(qpos[:, 3:7], np.array([1.0, 0.0, 0.0]))
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
     x = np.cos(yaw) * command[:, 0] - np.sin(yaw) * command[:, 1]
     y = np.sin(yaw) * command[:, 0] + np.cos(yaw) * command[:, 1]
     begin = qpos[:, :3] + np.array([0.0, 0.0, _COMMAND_HEIGHT])
-    return np.stack([begin, begin + _COMMAND_LENGTH * np.stack([x, y, np.zeros_like(x)], axis=1)], axis=1)
+    return np.stack([begin, begin + np.stack([x, y, np.zeros_like(x)], axis=1)], axis=1)
 
 
 def paths_of(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
-    """Way of the base in every episode: points [m], shape (num_points, 3), and the colour of its outcome.
+    """Positions of the base at every tenth frame [m], shape (num_points, 3), and the colour of the outcome, by episode.
 
-    Args:
-        recording: Of one terrain.
-        every: Frames from one point to the next.
+    The last frame is always among them.
     """
-    found = []
-    for replica in range(recording.num_episodes):
-        frames = int(recording.num_frames[0, replica])
-        points = recording.base_position[0, replica, :frames]
+    paths = []
+    for frames, outcome, positions in zip(
+        recording.num_frames[0].tolist(), recording.outcome[0], recording.base_position[0], strict=True
+    ):
         chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
-        color = ending_of(recording.outcome[0, replica]).color
-        found.append((points[chosen], ImageColor.getrgb(color)))
-    return found
+        paths.append((positions[chosen], ImageColor.getrgb(ending_of(outcome).color)))
+    return paths
 
 
 def endings(recording: Recording) -> str:
-    """How many episodes of one terrain ended how, such as ``12 out of time, 8 base collision``, in colours, as HTML."""
+    """Numbers of episodes of one terrain by ending, such as ``12 out of time, 8 base collision``, coloured, as HTML."""
     counts = Counter(map(ending_of, recording.outcome[0].tolist()))
     return ", ".join(
         f'<span style="color:{ending.color}">{count} {ending.words}</span>' for ending, count in counts.most_common()
@@ -228,29 +199,14 @@ def endings(recording: Recording) -> str:
 
 
 def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str], feet: Sequence[str]) -> str:
-    """The numbers of a frame, as Markdown: penalties so far, forces of the feet, command, height.
-
-    Args:
-        crossing: The crossing.
-        frame: Which frame.
-        penalties: Names of the penalties.
-        feet: Names of the feet.
-    """
+    """The numbers of a frame, as Markdown: penalties so far, forces on the feet, command, position of the base."""
     v_x, v_y, yaw_rate = crossing.command_values[frame]
-    forces = " · ".join(
-        f"{name} {newtons:,.0f}" for name, newtons in zip(feet, crossing.force_newtons[frame], strict=True)
-    )
+    forces = zip(feet, crossing.force_newtons[frame], strict=True)
+    force_words = " · ".join(f"{name} {newtons:,.0f}" for name, newtons in forces)
     x, y, z = crossing.positions[frame, 0]
     sums = zip(penalties, crossing.penalties[frame], strict=True)
-    rows = [f"| {label_of(name)} | {value:.2f} |" for name, value in sums]
-    return "\n".join(
-        [
-            "| penalty so far | multiples of its scale |",
-            "|---|---|",
-            *rows,
-            "",
-            f"Forces on the feet [N]: {forces}",
-            "",
-            f"Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s · base at {x:.2f}, {y:.2f}, {z:.2f} m",
-        ]
+    rows = "".join(f"| {label_of(name)} | {value:.2f} |\n" for name, value in sums)
+    return (
+        f"| penalty so far | multiples of its scale |\n|---|---|\n{rows}\nForces on the feet [N]: {force_words}\n\n"
+        f"Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s · base at {x:.2f}, {y:.2f}, {z:.2f} m"
     )

@@ -13,6 +13,7 @@ from qd.faults import elite_words
 from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank
 from qd.show.crossed import ARRIVED, Rate
 from qd.show.figures import label_of, look_of, mode_words
+from qd.show.view.playing import Crossing
 from sim.files.intervals import rate_words
 from sim.spaces.base import TerrainSpace
 
@@ -24,12 +25,10 @@ _CURVES_HEIGHT, _MARGIN, _MARK_ROW = 170, 24, 14
 _RATES = {"goal_rate": "goal reached", "collision_rate": "base collision", "fallen_rate": "fallen"}
 _CROSSED = {**_RATES, "goal_rate": ARRIVED}  # as recordings name them
 FITNESS_WORDS = (
-    "Fitness is what the search looks for: the mean of the scaled penalties, less how much they differ between "
-    "episodes, less a share of episodes without a base collision where others have one. High means costly in every "
-    "episode alike. It does not say that the robot fails: read the goal rate for that."
+    "what the search looks for: mean scaled penalties, less their spread over episodes, less a share of episodes "
+    "without a base collision where others have one; whether the robot fails says the goal rate"
 )
 """What fitness is, and what it is not."""
-_FITNESS_SHORT = "what the search looks for, costly in every episode alike; whether the robot fails says the goal rate"
 KINDS = {
     "all": VERDICTS,
     "faults": ("fault",),
@@ -38,9 +37,9 @@ KINDS = {
     "failing": VERDICTS[1:],
     "not failing": ("",),
 }
-"""Kinds of elites to choose from: the verdicts that each has."""
+"""Kinds of elites to choose from, and their verdicts."""
 MINIMAL = "with a minimal terrain"
-"""One more kind, where there are some."""
+"""One more kind, if there are some."""
 _MANY = 400  # lines, beyond which they are drawn thinner
 _RATE_STEP, _FITNESS_STEP = 0.01, 0.1
 
@@ -50,15 +49,13 @@ class Axis:
     """One quantity of every elite."""
 
     name: str
-    """Key of the axis: a penalty, ``fitness`` or a rate."""
+    """A penalty, ``fitness`` or a rate."""
     label: str
-    """In words, one line."""
     values: NDArray[np.float64]
     """Shape (num_elites,)."""
     low: float
-    """Lower end, a multiple of ``step`` not above any value."""
     high: float
-    """Upper end, above ``low`` and not below any value."""
+    """Ends, multiples of ``step`` around all values."""
     step: float
     """What ranges are set in."""
 
@@ -68,13 +65,13 @@ class Choice:
     """Which elites are listed, and in which order."""
 
     ranges: Mapping[str, tuple[float, float]]
-    """Lower and upper limit by the name of an axis, limits included; an axis without one is not looked at."""
+    """Lower and upper limit by the name of an axis, limits included."""
     order: str = next(iter(ORDERS))
-    """One of the :data:`qd.show.ranking.ORDERS`."""
+    """One of the :data:`qd.groups.ORDERS`."""
     kind: str = "all"
-    """One of the :data:`KINDS`."""
+    """One of the :data:`KINDS`, or :data:`MINIMAL`."""
     mode: int | None = None
-    """Number of the failure mode; None for all elites."""
+    """Number of the failure mode; None for all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,15 +99,15 @@ class Axes:
 
     def listed(self, choice: Choice) -> NDArray[np.int64]:
         """Numbers of the elites that are chosen, in the chosen order."""
-        kept = self._of_kind(choice.kind)
+        chosen = self._of_kind(choice.kind)
         if choice.mode is not None:
-            kept = kept & (self.ranking.modes.labels == choice.mode)
+            chosen &= self.ranking.modes.labels == choice.mode
         for name, (low, high) in choice.ranges.items():
             axis = self.axis(name)
             slack = 1e-6 * axis.step  # a slider's decimals are not those of float64
-            kept = kept & (axis.values >= low - slack) & (axis.values <= high + slack)
+            chosen &= (axis.values >= low - slack) & (axis.values <= high + slack)
         order = self._orders[choice.order]
-        return order[kept[order]]
+        return order[chosen[order]]
 
     def _of_kind(self, kind: str) -> NDArray[np.bool_]:
         if kind == MINIMAL:
@@ -118,16 +115,15 @@ class Axes:
         return np.isin(self.elites.verdict, [VERDICTS.index(verdict) for verdict in KINDS[kind]])
 
     def kinds(self) -> dict[str, str]:
-        """Kinds of elites by what they are called in words, with how many there are."""
+        """Kinds of elites by their words with the number of elites."""
         kinds = [*KINDS, MINIMAL] if self.minimal else [*KINDS]
         return {f"{kind} ({int(self._of_kind(kind).sum()):,})": kind for kind in kinds}
 
     def modes(self) -> dict[str, int | None]:
-        """Failure modes by what they are called in words, with how many elites are in each."""
-        found: dict[str, int | None] = {"all modes": None}
-        for mode in self.ranking.modes.modes:
-            found[f"{mode.number}: {mode_words(mode)} ({len(mode.members):,})"] = mode.number
-        return found
+        """Numbers of the failure modes by their words with the number of elites; None for all."""
+        modes = self.ranking.modes.modes
+        named = {f"{mode.number}: {mode_words(mode)} ({len(mode.members):,})": mode.number for mode in modes}
+        return {"all modes": None, **named}
 
     def rate_text(self, name: str, number: int) -> str:
         """A rate of an elite with its 95 % interval (Wilson), such as ``45% (31 to 60%)``."""
@@ -135,12 +131,12 @@ class Axes:
 
     def line(self, number: int) -> str:
         """An elite on one line of the list: number, verdict, goal rate with its interval, collisions."""
-        verdict, collided = self.verdict(number), self.elites.collision_rate[number]
-        goal = self.rate_text("goal_rate", number)
+        verdict, goal = self.verdict(number), self.rate_text("goal_rate", number)
+        collided = self.elites.collision_rate[number]
         return f"{number}: {f'{verdict} · ' * bool(verdict)}goal {goal} · collision {collided:.0%}"
 
     def verdict(self, number: int) -> str:
-        """What an elite is, one of :data:`qd.groups.VERDICTS`."""
+        """One of :data:`qd.groups.VERDICTS`."""
         return VERDICTS[int(self.elites.verdict[number])]
 
     def hint(self, number: int) -> str:
@@ -149,50 +145,36 @@ class Axes:
         return f"elite {number}{f', {verdict}' * bool(verdict)}: goal {self.elites.goal_rate[number]:.0%}"
 
     def details(self, number: int, crossings: Mapping[str, Mapping[str, Rate]]) -> str:
-        """All that is known of an elite, as Markdown.
+        """All that is known of an elite, as Markdown, with rates of shown crossings by their title.
 
-        Args:
-            number: Its number.
-            crossings: Rates of the crossings that are shown, as :class:`qd.show.crossed.Crossed` has them, by whose
-                they are.
+        The rates are those of :class:`qd.show.crossed.Crossed`.
         """
         archive, elites, ranking = self.archive, self.elites, self.ranking
         count, verdict = int(elites.counted[number]), self.verdict(number)
-        of = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
+        source = f"{count} fresh episodes" if elites.fresh[number] else f"the {count} episodes that found it"
         mode = ranking.mode_of(number)
-        struggles = "not failing" if mode is None else f"failure mode {mode.number}: {mode_words(mode)}"
-        family = int((ranking.families == ranking.families[number]).sum())
-        alike = f"{family - 1} other elite{'s' * (family != 2)} like it" if family > 1 else "no other elite like it"
-        heads = ["95 % intervals", f"as searched, {of}"]
-        heads += [
-            f"{escape(who)}, {next(iter(rates.values())).count} episodes here" for who, rates in crossings.items()
-        ]
+        failure = "not failing" if mode is None else f"failure mode {mode.number}: {mode_words(mode)}"
+        others = int((ranking.families == ranking.families[number]).sum()) - 1
+        alike = f"{others or 'no'} other elite{'s' * (others > 1)} like it"
+        heads = ["95 % intervals", f"as searched, {source}"]
+        heads += [f"{escape(title)}, {rates[ARRIVED].count} episodes here" for title, rates in crossings.items()]
         rows = [
             [label, self.rate_text(name, number)]
             + [rate_words(*rates[_CROSSED[name]], short=True) for rates in crossings.values()]
             for name, label in _RATES.items()
         ]
-        lines = [
-            f"**Elite {number}** of {len(elites):,}{f' · **{verdict}**' * bool(verdict)} · {struggles} · {alike}",
-            "",
-            *(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)),
-            "",
-            *elite_words(archive, number),
-            "",
-            f"Fitness **{elites.fitness[number]:.2f}** ({archive.fitness[number]:.2f} as found in iteration "
-            f"{archive.iteration[number]}): {_FITNESS_SHORT}.",
-        ]
-        return "\n".join(lines)
+        table = "\n".join(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows))
+        words = "\n".join(elite_words(archive, number))
+        fitness, before, iteration = elites.fitness[number], archive.fitness[number], archive.iteration[number]
+        return (
+            f"**Elite {number}** of {len(elites):,}{f' · **{verdict}**' * bool(verdict)} · {failure} · {alike}\n\n"
+            f"{table}\n\n{words}\n\n"
+            f"Fitness **{fitness:.2f}** ({before:.2f} as found in iteration {iteration}): {FITNESS_WORDS}."
+        )
 
 
 def axes_of(archive: Archive, space: TerrainSpace, minimal: Sequence[int] = ()) -> Axes:
-    """The axes of an archive that has elites.
-
-    Args:
-        archive: The archive.
-        space: Of its genes.
-        minimal: Numbers of the elites that have a minimal terrain.
-    """
+    """The axes of an archive with at least one elite; ``minimal`` are the elites that have a minimal terrain."""
     ranking = rank(archive, space)
     elites = ranking.elites
     axes = [_axis_of(name, label_of(name), elites.ratios[:, k], _RATE_STEP) for k, name in enumerate(archive.penalties)]
@@ -203,41 +185,32 @@ def axes_of(archive: Archive, space: TerrainSpace, minimal: Sequence[int] = ()) 
 
 
 def _axis_of(name: str, label: str, values: NDArray[np.float64], step: float) -> Axis:
-    """An axis as long as its values need: 0 to 1 at most for what is a share."""
+    """An axis as long as its values need."""
     low = float(np.floor(values.min() / step + 1e-9)) * step
     high = float(np.ceil(values.max() / step - 1e-9)) * step
-    if high <= low:
-        high = low + step
-    return Axis(name=name, label=label, values=values, low=round(low, 6), high=round(high, 6), step=step)
+    high = round(max(high, low + step), 6)
+    return Axis(name=name, label=label, values=values, low=round(low, 6), high=high, step=step)
 
 
-def axes_svg(axes: Axes, kept: NDArray[np.int64], ranges: Mapping[str, tuple[float, float]], picked: int | None) -> str:
+def axes_svg(axes: Axes, listed: NDArray[np.int64], ranges: Mapping[str, tuple[float, float]], picked: int) -> str:
     """The archive on parallel axes: a line an elite, grey if it is not listed, the picked one on top.
 
-    The lines can be pointed at in the browser (``pointing.js``): their paths name the elites they are of.
-
-    Args:
-        axes: Of all elites.
-        kept: Numbers of those that are listed, in their order.
-        ranges: Range of each brushed axis.
-        picked: Number of the picked elite, if any.
+    The paths name their elites, so that lines can be pointed at in the browser (``pointing.js``).
     """
     x = np.linspace(_LEFT, _WIDTH - _RIGHT, len(axes.axes))
     y = np.stack([_height_of(axis, axis.values) for axis in axes.axes], axis=1)
-    dropped = np.setdiff1d(np.arange(len(axes.elites)), kept)
-    parts = [_lines(x, y[dropped], _GREY, 0.6, 0.6)]
-    width = 0.8 * min(1.0, _MANY / max(len(kept), 1)) ** 0.5  # else many lines are one blue area
+    parts = [_lines(x, np.delete(y, listed, axis=0), _GREY, 0.6, 0.6)]
+    width = 0.8 * min(1.0, _MANY / max(len(listed), 1)) ** 0.5  # else many lines are one blue area
     # Equally many a shade, so that the first stand out whatever they are sorted by.
-    for shade, numbers in zip(_SHADES, reversed(np.array_split(kept, len(_SHADES))), strict=True):
+    for shade, numbers in zip(_SHADES, reversed(np.array_split(listed, len(_SHADES))), strict=True):
         parts.append(_lines(x, y[numbers], shade, width, 0.75, _named(axes, numbers)))
-    if picked is not None:
-        parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
+    parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
     parts += [_axis(axis, float(place), ranges.get(axis.name)) for axis, place in zip(axes.axes, x, strict=True)]
     return _svg(_HEIGHT, parts)
 
 
 def _named(axes: Axes, numbers: NDArray[np.int64]) -> str:
-    """Attributes of a path that name the elites its lines are of."""
+    """Attributes of a path that name the elites of its lines."""
     hints = "|".join(map(axes.hint, numbers.tolist()))
     return f'data-elites="{" ".join(map(str, numbers.tolist()))}" data-hints="{escape(hints)}"'
 
@@ -270,13 +243,9 @@ def _axis(axis: Axis, x: float, brushed: tuple[float, float] | None) -> str:
     parts.append(_text(x, bottom + 12, f"{axis.low:.{decimals}f}", "middle"))
     turned = f'transform="rotate(-52 {x:.0f} {bottom + 24})"'
     explained = f"<title>{escape(FITNESS_WORDS)}</title>" if axis.name == "fitness" else ""
-    parts.append(f"<g>{explained}{_text(x + 4, bottom + 24, _shortened(axis.label), 'end', turned)}</g>")
+    label = axis.label if len(axis.label) <= 22 else f"{axis.label[:21]}…"
+    parts.append(f"<g>{explained}{_text(x + 4, bottom + 24, label, 'end', turned)}</g>")
     return "".join(parts)
-
-
-def _shortened(label: str) -> str:
-    """A label that has room under the axes."""
-    return label if len(label) <= 22 else f"{label[:21]}…"
 
 
 def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
@@ -290,61 +259,44 @@ def _svg(height: int, parts: Iterable[str]) -> str:
 
 
 class Curves:
-    """Running penalties of one crossing, drawn once; only the mark of the shown time moves."""
+    """Running penalties of one crossing, drawn once; only the line at the shown time moves."""
 
-    def __init__(
-        self,
-        times_s: NDArray[np.floating],
-        sums: NDArray[np.floating],
-        penalties: Sequence[str],
-        marks: Sequence[tuple[float, str]] = (),
-    ) -> None:
-        """Draw the curves.
-
-        Args:
-            times_s: Time of each frame [s], shape (num_frames,).
-            sums: Scaled penalty sums so far, shape (num_frames, num_penalties).
-            penalties: Their names.
-            marks: Times [s] and words of what happened, above the curves.
-        """
-        self._top = _MARK_ROW * len(marks)
-        self._end = max(float(times_s[-1]), 1e-9)
-        most = max(float(np.max(sums)), 1e-9)
-        step = max(1, len(times_s) // 200)
-        chosen = np.unique([*range(0, len(times_s), step), len(times_s) - 1])
-        x = self._x(times_s[chosen])
-        bottom, top = self._top + _CURVES_HEIGHT - 18, self._top + 12
+    def __init__(self, crossing: Crossing, penalties: Sequence[str]) -> None:
+        times_s, sums, marks = crossing.times_s, crossing.penalties, crossing.marks
+        self._top, self._end = _MARK_ROW * len(marks), max(float(times_s[-1]), 1e-9)
+        self._bottom = bottom = self._top + _CURVES_HEIGHT - 18
+        top, most = self._top + 12, max(float(np.max(sums)), 1e-9)
+        chosen = np.unique([*range(0, len(times_s), max(1, len(times_s) // 200)), len(times_s) - 1])
+        x = np.array([self._x(time_s) for time_s in times_s[chosen]])
         parts = [
-            *(self._mark(row, when, words) for row, (when, words) in enumerate(marks)),
             f'<line x1="{_MARGIN + 8}" y1="{bottom}" x2="{_WIDTH - 8}" y2="{bottom}" stroke="#444"/>',
             _text(_MARGIN + 4, top + 4, f"{most:.3g}", "end"),
             _text(_MARGIN + 4, bottom, "0", "end"),
             _text(_MARGIN + 8, bottom + 13, "penalties so far, in multiples of their scales", "start"),
             _text(_WIDTH - 8, bottom + 13, f"{self._end:.1f} s", "end"),
         ]
+        for row, (time_s, words) in enumerate(marks):  # words stand on the side with more room
+            at, y = self._x(time_s), _MARK_ROW * (row + 1) - 3
+            side, anchor = (4, "start") if at < 0.5 * _WIDTH else (-4, "end")
+            parts.append(self._upright(time_s, y - 8, 'stroke="#555" stroke-dasharray="2 3"'))
+            parts.append(_text(at + side, y, f"{words}, {time_s:.1f} s", anchor))
         for column, penalty in enumerate(penalties):
             color = look_of(penalty).color
-            y = bottom - np.asarray(sums[chosen, column], dtype=np.float64) / most * (bottom - top)
+            y = bottom - sums[chosen, column] / most * (bottom - top)
             parts.append(_lines(x, y[None], color, 1.6, 1.0))
-            parts.append(
-                _text(_MARGIN + 16, top + 12 * column + 4, label_of(penalty), "start", f'style="fill:{color}"')
-            )
+            style = f'style="fill:{color}"'
+            parts.append(_text(_MARGIN + 16, top + 12 * column + 4, label_of(penalty), "start", style))
         self._drawn = "".join(parts)
 
-    def _x(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        return _MARGIN + 8 + np.asarray(times_s, dtype=np.float64) / self._end * (_WIDTH - _MARGIN - 16)
+    def _x(self, time_s: float) -> float:
+        """Pixels from the left; a second crossing may last longer than this one."""
+        return _MARGIN + 8 + min(float(time_s), self._end) / self._end * (_WIDTH - _MARGIN - 16)
 
-    def _mark(self, row: int, time_s: float, words: str) -> str:
-        """A dashed line at a time [s], and its words in a row of their own, on the side with more room."""
-        x = float(self._x(np.array([time_s]))[0])
-        y, bottom = _MARK_ROW * (row + 1) - 3, self._top + _CURVES_HEIGHT - 18
-        line = f'<line x1="{x:.1f}" y1="{y - 8}" x2="{x:.1f}" y2="{bottom}" stroke="#555" stroke-dasharray="2 3"/>'
-        side, anchor = (4, "start") if x < 0.5 * _WIDTH else (-4, "end")
-        return line + _text(x + side, y, f"{words}, {time_s:.1f} s", anchor)
+    def _upright(self, time_s: float, top: int, look: str) -> str:
+        x = self._x(time_s)
+        return f'<line x1="{x:.1f}" y1="{top}" x2="{x:.1f}" y2="{self._bottom}" {look}/>'
 
     def at(self, time_s: float) -> str:
-        """The curves with a mark at a time [s]."""
-        x = float(self._x(np.array([min(time_s, self._end)]))[0])  # a second crossing may last longer
-        bottom = self._top + _CURVES_HEIGHT - 18
-        mark = f'<line x1="{x:.1f}" y1="6" x2="{x:.1f}" y2="{bottom}" stroke="#d00" stroke-width="1.5"/>'
-        return _svg(self._top + _CURVES_HEIGHT, [self._drawn, mark])
+        """The curves with a line at a time [s]."""
+        line = self._upright(time_s, 6, 'stroke="#d00" stroke-width="1.5"')
+        return _svg(self._top + _CURVES_HEIGHT, [self._drawn, line])

@@ -36,15 +36,11 @@ _NAME_HEIGHT = 0.12  # of a foot's name over it [m]
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Where the camera stands and what it looks at [m]."""
 
 
 def overview_of(width: int, height: int) -> View:
-    """Where the camera stands and what it looks at [m], to see the whole terrain.
-
-    Args:
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
-    """
+    """A view of the whole terrain, for a picture of that size [pixels]."""
     if width < PHONE:
         return (-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)
     if width < height:  # the terrain's length goes up the picture
@@ -53,12 +49,7 @@ def overview_of(width: int, height: int) -> View:
 
 
 def first_view_of(width: int, height: int) -> View:
-    """Where the camera stands and what it looks at [m] at first: over the robot's start along its way.
-
-    Args:
-        width: Of the picture [pixels].
-        height: Of the picture [pixels].
-    """
+    """The view at first, over the robot's start along its way, for a picture of that size [pixels]."""
     if width < PHONE:
         return (-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
@@ -66,14 +57,13 @@ def first_view_of(width: int, height: int) -> View:
 
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
-    """What all tabs show of the robot."""
+    """What all tabs show of the robot, in the frames of its bodies."""
 
     bodies: list[trimesh.Trimesh | None]
-    """Shape of each body in its own frame, None of one without."""
     touches: list[tuple[str, int, trimesh.Trimesh]]
-    """Name, body, and shape in the body's frame of each geom whose touch may be recorded."""
+    """Name, body and shape of each geom whose touch may be recorded."""
     feet: tuple[str, ...]
-    """Names of the feet."""
+    """Their names."""
 
 
 def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
@@ -84,142 +74,95 @@ def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
 
 
 class Scene:
-    """What stands in the 3-D view of a tab."""
+    """What stands in the 3-D view of a tab: at first the robot, unseen."""
 
-    def __init__(self, client: viser.ClientHandle, shapes: Shapes, cfg: CrossingCfg) -> None:
-        """Put the robot there, unseen.
-
-        Args:
-            client: The tab's browser.
-            shapes: The robot's.
-            cfg: The crossing, for start and goal.
-        """
-        self._client, self._shapes, self._cfg = client, shapes, cfg
+    def __init__(self, client: viser.ClientHandle, shapes: Shapes) -> None:
+        self._client, self._shapes, self._cfg = client, shapes, CrossingCfg()
         scene = client.scene
-        self._robot = scene.add_frame("/robot", show_axes=False, visible=False)
-        self._bodies = [
+        self.robot = scene.add_frame("/robot", show_axes=False, visible=False)
+        self.bodies = [
             None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh, receive_shadow=False)
             for k, mesh in enumerate(shapes.bodies)
         ]
-        self._touches = {
+        self.touches = {
             name: self._add_mesh(f"/robot/touch/{name}", mesh, FOOT_TOUCH_COLOR if name in shapes.feet else TOUCH_COLOR)
             for name, _, mesh in shapes.touches
         }
-        self._ghost = scene.add_frame("/ghost", show_axes=False, visible=False)
-        self._ghosts: list[Any] = []  # its bodies, from when there is one
+        self.ghost = scene.add_frame("/ghost", show_axes=False, visible=False)
+        self.ghost_bodies: list[Any] = []  # its bodies, from when there is one
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
-        self._forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
+        self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
         self._command = self._add_mesh("/command", arrow, COMMAND_COLOR)
         self._names = [scene.add_label(f"/feet/{name}", name, visible=False) for name in shapes.feet]
-        self._paths: list[Any] = []
+        self.paths: list[Any] = []
+        self._paths_wanted = True
         self._followed: Points | None = None
         self.follow = False
         """Whether the camera goes along with the robot."""
-        self.show_forces = True
-        """Whether forces of the feet are shown."""
-        self.show_paths = True
-        """Whether the ways of all episodes are shown, while the camera does not follow."""
-        self.show_names = False
-        """Whether the feet have their names on them."""
+        self.show_forces, self.show_names = True, False
+        """Whether forces on the feet, and the names of the feet, are shown."""
 
     def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
-        """Show another terrain, and no crossing on it yet.
-
-        Args:
-            heights: Height grid [m], shape (nrow, ncol).
-            ground: Its friction and softness.
-        """
+        """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), and friction and softness."""
+        start, goal, scene = self._cfg.start, self._cfg.goal, self._client.scene
         with self._client.atomic():
             self.hide_crossing()
             mesh = terrain_mesh(heights, ground)
-            self._client.scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
-            self._mark(
-                "start",
-                self._cfg.start,
-                _START_COLOR,
-                heights,
-                height=_DISC_HEIGHT,
-                radius=_DISC_RADIUS,
-                label_from=(-0.9, 0.15),
-            )
-            self._mark(
-                "goal",
-                self._cfg.goal,
-                _GOAL_COLOR,
-                heights,
-                height=_POST_HEIGHT,
-                radius=_POST_RADIUS,
-                label_from=(0.0, 1.35),
-            )
+            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
+            for name, (x, y), color, height, radius, (back, up) in (
+                ("start", start, _START_COLOR, _DISC_HEIGHT, _DISC_RADIUS, (0.9, 0.15)),
+                ("goal", goal, _GOAL_COLOR, _POST_HEIGHT, _POST_RADIUS, (0.0, 1.35)),
+            ):
+                z = float(_heights_at(heights, np.array([[x, y]]))[0])
+                middle = (x, y, z + 0.5 * height)
+                scene.add_cylinder(f"/{name}/post", radius=radius, height=height, color=color, position=middle)
+                scene.add_label(f"/{name}/label", name, position=(x - back, y, z + up))
             self._draw_way(heights)
 
-    def _mark(
-        self,
-        name: str,
-        place: tuple[float, float],
-        color: tuple[int, int, int],
-        heights: Points,
-        *,
-        height: float,
-        radius: float,
-        label_from: tuple[float, float],
-    ) -> None:
-        """A post or a disc [m] with a name, so far behind and above it."""
-        ground = float(_heights_at(heights, np.array([place]))[0])
-        scene = self._client.scene
-        middle = (*place, ground + 0.5 * height)
-        scene.add_cylinder(f"/{name}/post", radius=radius, height=height, color=color, position=middle)
-        scene.add_label(f"/{name}/label", name, position=(place[0] + label_from[0], place[1], ground + label_from[1]))
-
     def _draw_way(self, heights: Points) -> None:
-        """The straight way from start to goal along the ground."""
+        """A dashed line from start to goal along the ground."""
         start, goal = np.array(self._cfg.start), np.array(self._cfg.goal)
         length = float(np.linalg.norm(goal - start))
         share = np.linspace(0.0, 1.0, round(length / SPACING) + 1)
         places = start + share[:, None] * (goal - start)
         points = np.column_stack([places, _heights_at(heights, places) + _WAY_LIFT])
-        segments = np.stack([points[:-1], points[1:]], axis=1)[::2]  # dashed
+        segments = np.stack([points[:-1], points[1:]], axis=1)[::2]
         self._client.scene.add_line_segments("/way/line", segments, colors=_START_COLOR, thickness=0.02)
 
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
-        self._robot.visible = False
+        self.robot.visible = False
         self.hide_ghost()
         self._followed = None
-        for handle in (*self._touches.values(), *self._forces, self._command, *self._names):
+        for handle in (*self.touches.values(), *self.forces, self._command, *self._names):
             handle.visible = False
         self._drop_paths()
 
     def _drop_paths(self) -> None:
-        for handle in self._paths:
+        for handle in self.paths:
             handle.remove()
-        self._paths = []
+        self.paths = []
 
-    def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], tuple[int, int, int]]]) -> None:
-        """Show the way of the base in every episode, thin and translucent.
-
-        Args:
-            paths: Points [m], shape (num_points, 3), and colour of each.
-        """
+    def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], Color]]) -> None:
+        """Show the way of the base in every episode as points [m] and colour, thin and translucent."""
         self._drop_paths()
         for color in dict.fromkeys(color for _, color in paths):
-            tubes = [path_mesh(points, _PATH_RADIUS) for points, own in paths if own == color and len(points) > 1]
+            tubes = [path_mesh(points, _PATH_RADIUS) for points, other in paths if other == color and len(points) > 1]
             if tubes:
                 mesh: Any = trimesh.util.concatenate(tubes)
-                name = f"/paths/{len(self._paths)}"
-                self._paths.append(self._add_mesh(name, mesh, color, opacity=_PATH_OPACITY))
+                name = f"/paths/{len(self.paths)}"
+                self.paths.append(self._add_mesh(name, mesh, color, opacity=_PATH_OPACITY))
         self._show_paths()
 
-    def set_show_paths(self, show: bool) -> None:
+    def switch_paths(self, shown: bool) -> None:
         """Show or hide the paths of all episodes."""
-        self.show_paths = show
+        self._paths_wanted = shown
         self._show_paths()
 
     def _show_paths(self) -> None:
-        """Following, paths would hide the robot."""
-        for handle in self._paths:
-            handle.visible = self.show_paths and not self.follow
+        for handle in self.paths:
+            handle.visible = self._paths_wanted and not self.follow  # near the robot, paths would hide it
 
     def set_follow(self, follow: bool) -> None:
         """Go near the robot and along with it from now on, or stay."""
@@ -232,48 +175,46 @@ class Scene:
         """Put the robot where it is at a frame of a crossing, with what touches, its forces and command."""
         positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
-            self._robot.visible = True
-            for k, handle in enumerate(self._bodies):
+            self.robot.visible = True
+            for k, handle in enumerate(self.bodies):
                 if handle is not None:
                     _place(handle, positions[k], quaternions[k])
             for k, (name, body, _) in enumerate(self._shapes.touches):
-                handle = self._touches[name]
-                handle.visible = bool(crossing.touching[frame, k]) if crossing.touching is not None else False
+                handle = self.touches[name]
+                handle.visible = crossing.touching is not None and bool(crossing.touching[frame, k])
                 if handle.visible:
                     _place(handle, positions[body], quaternions[body])
-            for handle, arrow in zip(self._forces, crossing.forces[frame], strict=True):
-                _set_arrow(handle, arrow, shown=self.show_forces)
             _set_arrow(self._command, crossing.command[frame], shown=True)
-            for handle, arrow in zip(self._names, crossing.forces[frame], strict=True):
-                handle.visible = self.show_names
-                handle.position = tuple(arrow[0] + np.array([0.0, 0.0, _NAME_HEIGHT]))
+            for handle, name, arrow in zip(self.forces, self._names, crossing.forces[frame], strict=True):
+                _set_arrow(handle, arrow, shown=self.show_forces)
+                name.visible = self.show_names
+                name.position = tuple(arrow[0] + np.array([0.0, 0.0, _NAME_HEIGHT]))
         self._go_along(positions[0])
 
     def show_ghost(self, crossing: Crossing, frame: int) -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing."""
         with self._client.atomic():
-            if not self._ghosts:
-                self._ghosts = [
+            if not self.ghost_bodies:
+                self.ghost_bodies = [
                     None if mesh is None else self._add_mesh(f"/ghost/{k}", mesh, GHOST_COLOR, opacity=_GHOST_OPACITY)
                     for k, mesh in enumerate(self._shapes.bodies)
                 ]
-            self._ghost.visible = True
-            for k, handle in enumerate(self._ghosts):
+            self.ghost.visible = True
+            for k, handle in enumerate(self.ghost_bodies):
                 if handle is not None:
                     handle.visible = True
                     _place(handle, crossing.positions[frame, k], crossing.quaternions[frame, k])
 
     def hide_ghost(self) -> None:
         """Show the robot alone."""
-        self._ghost.visible = False
+        self.ghost.visible = False
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, *, opacity: float | None = None) -> Any:
-        """A shape of one colour that is not to be seen yet."""
-        look: dict[str, Any] = {"color": color, "opacity": opacity, "visible": False}
-        add = self._client.scene.add_mesh_simple
-        return add(
-            name, np.asarray(mesh.vertices), np.asarray(mesh.faces), **look, cast_shadow=False, receive_shadow=False
-        )
+        """A shape of one colour, not visible yet."""
+        return self._client.scene.add_mesh_simple(
+            name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, opacity=opacity, visible=False,
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
 
     def _go_along(self, base: Points) -> None:
         """Move the camera as the base has moved, if it is to follow."""
@@ -290,11 +231,7 @@ class Scene:
         self.go_to((tuple(base + _BEHIND), tuple(base)))
 
     def go_to(self, view: View) -> None:
-        """Move the camera.
-
-        Args:
-            view: Where it is to stand and what to look at [m].
-        """
+        """Move the camera."""
         with self._client.atomic():
             self._client.camera.position, self._client.camera.look_at = view
 
@@ -304,7 +241,7 @@ def _place(handle: Any, position: Points, quaternion: Points) -> None:
 
 
 def _set_arrow(handle: Any, arrow: Points, *, shown: bool) -> None:
-    """Put an arrow from one point to another, shape (2, 3); one without length is not shown."""
+    """Show an arrow from one point to another, shape (2, 3), unless it has no length."""
     shown = shown and bool(np.any(arrow[0] != arrow[1]))
     if shown:
         handle.wxyz, length = arrow_pose(arrow[0], arrow[1])

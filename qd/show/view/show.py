@@ -1,4 +1,4 @@
-"""What is to be shown; what a user may have got wrong is found before a page opens."""
+"""What to show. What a user may have got wrong is refused before a page opens."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,13 +20,14 @@ SEARCHED = "as searched"
 
 @dataclass(frozen=True, kw_only=True)
 class Show:
-    """What is to be shown, and is there."""
+    """What the viewer shows."""
 
     opened_run: OpenedRun
+    """Archive, robot and search."""
     elite: int | None
     """Which to show first; None for the first of the list."""
     controllers: dict[str, str]
-    """What each controller is loaded from, by its name; empty if that of the search is lost."""
+    """File or code of each controller, by its name; empty if the search's controller is lost."""
     replicas: int = 20
     """Episodes of each elite."""
     note: str = ""
@@ -43,22 +44,21 @@ class Show:
         return axes_of(self.opened_run.archive, self.opened_run.space, minimal)
 
     @cached_property
-    def _certifiers(self) -> dict[str, int]:
-        """Place among the archive's certifiers of the controllers that are some."""
-        faults = self.opened_run.archive.faults
-        known = () if faults is None else faults.certifier_sha256
-        hashes = {name: controller_hash(policy) for name, policy in self.controllers.items()}
-        return {name: known.index(digest) for name, digest in hashes.items() if digest in known}
+    def _hashes(self) -> dict[str, str | None]:
+        return {name: controller_hash(policy) for name, policy in self.controllers.items()}
 
     def certifying(self, number: int) -> str | None:
-        """The controller that crosses an elite which fails, the best of several; None if none of these does."""
-        archive = self.opened_run.archive
-        faults = archive.faults
-        if faults is None or not archive.certified[number]:
+        """Name of the controller that crosses a failing elite, the best of several; None if none of these does."""
+        faults = self.opened_run.archive.faults
+        if faults is None or not self.opened_run.archive.certified[number]:
             return None
-        crosses, rates = faults.certificates()[number], goal_rates(faults.certifier_outcomes[number])
-        names = [name for name, place in self._certifiers.items() if crosses[place]]
-        return max(names, key=lambda name: rates[self._certifiers[name]], default=None)
+        rows = zip(
+            faults.certifier_sha256, faults.certificates()[number], goal_rates(faults.certifier_outcomes[number]),
+            strict=True,
+        )  # fmt: skip
+        rates = {digest: rate for digest, crosses, rate in rows if crosses}
+        names = [name for name, digest in self._hashes.items() if digest in rates]
+        return max(names, key=lambda name: rates[str(self._hashes[name])], default=None)
 
     @property
     def robot(self) -> RobotCfg:
@@ -74,7 +74,6 @@ def find_show(
     minimal: str | None = None,
     policies: Sequence[str] = (),
     space: str | None = None,
-    replicas: int = 20,
 ) -> Show:
     """What a user asks to see.
 
@@ -82,10 +81,9 @@ def find_show(
         run: Run directory or archive file; the newest of the robot, else its published one.
         robot: Name or settings file of the robot.
         elite: Number of the elite to show first.
-        minimal: The same of a minimal terrain, or ``all``.
+        minimal: Number of the elite whose minimal terrain to show first, or ``all``.
         policies: Controllers to choose from, ``NAME=FILE`` each; those of the search and its certifiers if empty.
         space: A user's own terrain space that the run names.
-        replicas: Episodes of each elite.
     """
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
@@ -96,13 +94,17 @@ def find_show(
         number = minima.chosen(minimal, opened_run.path)[0]
     controllers, note = _controllers_of(policies, opened_run)
     return Show(
-        opened_run=opened_run, elite=number, controllers=controllers, replicas=replicas, note=note, minima=minima,
+        opened_run=opened_run,
+        elite=number,
+        controllers=controllers,
+        note=note,
+        minima=minima,
         minimal=minimal is not None,
-    )  # fmt: skip
+    )
 
 
 def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dict[str, str], str]:
-    """The controllers by name, and why there are none; terrains can be looked at without."""
+    """The controllers by name, and why there are none."""
     if any(map(str.strip, policies)):
         controllers = controllers_of(policies, opened_run.robot)
         for policy in controllers.values():
@@ -120,7 +122,7 @@ def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dic
 
 
 def _panel_of(opened_run: OpenedRun) -> dict[str, str]:
-    """The robot's panel as far as it crossed the archive, by the names it has there."""
+    """Those of the robot's panel that crossed the archive, by their names in it."""
     faults = opened_run.archive.faults
     if faults is None:
         return {}

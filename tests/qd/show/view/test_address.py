@@ -18,16 +18,14 @@ def test_what_an_address_says_comes_back(address):
 
 
 def test_an_address_can_be_written_by_hand():
-    found, refused = read_address("?elite=12&controller=C-G&t=8.4")
-    assert (found, refused) == (Address(elite=12, controller="C-G", time_s=8.4), [])
-    assert found.query() == "elite=12&controller=C-G&t=8.4"
+    address, refused = read_address("?elite=12&controller=C-G&t=8.4")
+    assert (address, refused) == (Address(elite=12, controller="C-G", time_s=8.4), [])
+    assert address.query() == "elite=12&controller=C-G&t=8.4"
 
 
 def test_what_means_nothing_is_said_and_left_out():
-    found, refused = read_address("elite=twelve&episode=1.5&t=nan&initialCameraPosition=1,2&initialCameraLookAt=1,2,3")
-    assert found == Address()
-    assert refused == [
-        "elite=twelve in the address is no elite: it is left out.",
-        "episode=1.5 in the address is no episode: it is left out.",
-        "t=nan in the address is no time in seconds: it is left out.",
-    ]
+    address, refused = read_address(
+        "elite=twelve&episode=1.5&t=nan&initialCameraPosition=1,2&initialCameraLookAt=1,2,3"
+    )
+    assert address == Address()
+    assert [words.split("=")[0] for words in refused] == ["elite", "episode", "t"]

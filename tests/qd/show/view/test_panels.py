@@ -17,16 +17,16 @@ def selection(axes):
 
 
 def test_ranges_keep_what_lies_in_all_of_them(selection):
-    assert selection.kept.tolist() == list(range(20))
+    assert selection.matching.tolist() == list(range(20))
     selection.brush("goal_rate", 0.25, 0.5)  # ends included
-    assert selection.kept.tolist() == [5, 6, 7, 8, 9, 10]
+    assert selection.matching.tolist() == [5, 6, 7, 8, 9, 10]
     selection.brush("collision_rate", 0.5, 1.0)
-    assert selection.kept.tolist() == [5, 7, 9]
+    assert selection.matching.tolist() == [5, 7, 9]
     selection.brush("goal_rate", 0.0, 0.95)  # its full range
     assert selection.ranges == {"collision_rate": (0.5, 1.0)}
-    assert selection.kept.tolist() == list(range(1, 20, 2))
+    assert selection.matching.tolist() == list(range(1, 20, 2))
     selection.clear()
-    assert selection.kept.tolist() == list(range(20)) and selection.ranges == {}
+    assert selection.matching.tolist() == list(range(20)) and selection.ranges == {}
 
 
 def test_the_list_has_pages(selection):
@@ -54,19 +54,19 @@ def test_the_list_begins_with_each_way_of_failing_and_sorts_by_what_is_chosen(ax
     selection = Selection(axes)
     ranking = axes.ranking
     leaders, failing = ranking.leaders(), [mode for mode in ranking.modes.modes if (mode.members < 10).any()]
-    assert selection.picked == 0 and selection.kept[: len(leaders)].tolist() == leaders
+    assert selection.picked == 0 and selection.matching[: len(leaders)].tolist() == leaders
     assert sorted(ranking.modes.labels[leaders].tolist()) == [mode.number for mode in failing]
-    assert sorted(selection.kept.tolist()) == list(range(20))
+    assert sorted(selection.matching.tolist()) == list(range(20))
     selection.choose(order="collision_rate")
-    assert selection.kept.tolist() == [*range(1, 20, 2), *range(0, 20, 2)]
+    assert selection.matching.tolist() == [*range(1, 20, 2), *range(0, 20, 2)]
     selection.choose(order="goal_rate")
-    assert selection.kept.tolist() == list(range(20)) and (selection.pick(3), selection.step(1)) == (True, 4)
+    assert selection.matching.tolist() == list(range(20)) and (selection.pick(3), selection.step(1)) == (True, 4)
     selection.choose(kind="not failing", order="fitness")
-    assert selection.kept.tolist() == list(range(10, 20)) and selection.step(1) == 10  # on from where it was
+    assert selection.matching.tolist() == list(range(10, 20)) and selection.step(1) == 10  # on from where it was
     selection.choose(kind="faults")
-    assert selection.kept.tolist() == []
+    assert selection.matching.tolist() == []
     selection.choose(kind="all", mode=failing[0].number)
-    assert selection.kept.tolist() == failing[0].members.tolist()
+    assert selection.matching.tolist() == failing[0].members.tolist()
 
 
 def test_faults_come_before_certified_confirmed_and_other_failing_elites():

@@ -78,12 +78,12 @@ def test_marks_stand_where_things_happen_first():
     tilts = np.deg2rad(np.where(np.arange(21) < 15, 59.0, 61.0))
     quaternion[0, 0] = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
     made = dataclasses.replace(made, penalties=sums, base_quaternion=quaternion)
-    found = marks_of(made, 0)
-    assert [mark.words for mark in found] == ["first stumble", "first collision", "fall", "end: base collision"]
-    np.testing.assert_allclose([mark.time_s for mark in found], [0.16, 0.24, 0.30, 0.40])
+    marks = marks_of(made, 0)
+    assert [mark.words for mark in marks] == ["first stumble", "first collision", "fall", "end: base collision"]
+    np.testing.assert_allclose([mark.time_s for mark in marks], [0.16, 0.24, 0.30, 0.40])
     assert marks_of(made, 1) == (Mark(pytest.approx(0.4), "end: reached the goal"),)
-    assert next_mark(found, 0.0) == found[0] and next_mark(found, 0.16) == found[1]
-    assert next_mark(found, 0.4) == found[0]  # round again
+    assert next_mark(marks, 0.0) == marks[0] and next_mark(marks, 0.16) == marks[1]
+    assert next_mark(marks, 0.4) == marks[0]  # round again
 
 
 def test_episodes_are_chosen_by_what_they_have_in_common():

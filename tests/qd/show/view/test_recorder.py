@@ -31,17 +31,17 @@ def recorder(anymal, reports):
 
 def last_of(reports):
     """Reports up to the one that ends a recording."""
-    found = []
-    while not found or not (found[-1].recording or found[-1].failed):
-        found.append(reports.get(timeout=60))
-    return found
+    received = []
+    while not received or not (received[-1].recording or received[-1].failed):
+        received.append(reports.get(timeout=60))
+    return received
 
 
 def test_progress_comes_before_the_recording(recorder, reports):
     recorder.record(wish(2))
-    found = last_of(reports)
-    assert [report.share for report in found] == [0.0, 0.5, 1.0]
-    assert "building" in found[0].text and found[-1].recording == "fast on 2"
+    received = last_of(reports)
+    assert [report.share for report in received] == [0.0, 0.5, 1.0]
+    assert "building" in received[0].text and received[-1].recording == "fast on 2"
     recorder.record(wish(3))
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
@@ -65,8 +65,12 @@ def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, r
     recorder.record_ahead([wish(1, "droppable"), wish(2, "droppable")])
     time.sleep(0.5)  # it may be at the first
     recorder.record(wish(7, "droppable"))
-    found = last_of(reports)  # of what nobody waits for nothing is told but the end
-    assert found[-1].recording == "droppable on 7" and {report.wanted.terrain_seed for report in found} <= {0, 1, 7}
+    received = last_of(reports)  # of what nobody waits for nothing is told but the end
+    assert received[-1].recording == "droppable on 7" and {report.wanted.terrain_seed for report in received} <= {
+        0,
+        1,
+        7,
+    }
     later = last_of(reports)[-1].recording
     assert later in ("droppable on 1", "droppable on 2")  # the other one is dropped, or done before
     recorder.record_ahead([wish(13)])  # it breaks, and nobody waits for it
@@ -104,13 +108,13 @@ def test_a_simulation_is_recorded(anymal):
     reports = queue.SimpleQueue()
     recorder = Recorder(anymal, reports.put)
     try:
-        found = []
+        received = []
         for seed in (1, 2):  # it falls on the spike at once, every time from another start
             stands = {"terrain": spike(), "policy": "tests.sim.policies:stand"}
             recorder.record(Wanted(label="", **stands, replicas=4, terrain_seed=seed))
-            found.append(last_of(reports)[-1].recording)
+            received.append(last_of(reports)[-1].recording)
     finally:
         recorder.stop()
-    assert [recording.seeds.tolist() for recording in found] == [[1], [2]]
-    assert all((recording.outcome == Outcome.BASE_COLLISION).all() for recording in found)
-    assert (found[0].base_position[:, :, 0] != found[1].base_position[:, :, 0]).any()
+    assert [recording.seeds.tolist() for recording in received] == [[1], [2]]
+    assert all((recording.outcome == Outcome.BASE_COLLISION).all() for recording in received)
+    assert (received[0].base_position[:, :, 0] != received[1].base_position[:, :, 0]).any()

@@ -1,4 +1,4 @@
-"""What is found before a page opens: archive, controllers, port."""
+"""What is read before a page opens: archive, controllers, port."""
 
 import json
 import shutil
@@ -11,7 +11,7 @@ import pytest
 
 from qd.archive import write_archive
 from qd.run.directory import RESULTS
-from qd.show.view.serve import check_port
+from qd.show.view.app import check_port
 from qd.show.view.show import find_show
 from sim.files.records import robot_digest
 from sim.robots.find import get_robot
@@ -72,10 +72,10 @@ def test_a_run_without_elites_is_refused(tmp_path):
 
 
 def test_a_port_in_use_is_refused_until_it_is_free():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        port = busy.getsockname()[1]
         with pytest.raises(ValueError, match=f"port {port}"):
             check_port("127.0.0.1", port)
     check_port("127.0.0.1", port)
