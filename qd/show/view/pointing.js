@@ -25,7 +25,7 @@
     return best;
   };
 
-  const drop = () => document.querySelectorAll("svg .pointed").forEach((one) => one.remove());
+  const drop = () => document.querySelectorAll("svg .pointed").forEach((mark) => mark.remove());
 
   document.addEventListener("pointermove", (event) => {
     drop();

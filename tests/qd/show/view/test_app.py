@@ -94,7 +94,7 @@ def status(tab) -> str:
 
 
 def wait_until(true):
-    until = time.perf_counter() + 10.0
+    until = time.perf_counter() + 20.0
     while not true():
         assert time.perf_counter() < until
         time.sleep(0.05)
