@@ -146,8 +146,9 @@ class Tab:
         show, name, space = self.common.show, self.controller, self.common.show.opened_run.space
         terrain = {"elite" if self.genes is None else "minimal": self.selection.picked}
         text = command_line(
-            "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None, **terrain,
+            "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None,
             policy=None if name is None or name == SEARCHED else show.controllers[name], replicas=show.replicas,
+            **terrain,
         )  # fmt: skip
         copy_text(self.client, text)
         self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
