@@ -32,11 +32,6 @@ class FreshValues(Evaluation):
     reproduced: NDArray[np.bool_]
     """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
 
-    @property
-    def failing(self) -> NDArray[np.bool_]:
-        """Whether an elite is valid and under half of the robots reach the goal, shape (N,)."""
-        return self.not_crossed
-
     def std(self) -> NDArray[np.float64]:
         """Sum over penalties of the standard deviation over the episodes, of the valid elites, shape (num_valid,)."""
         return self.penalty_std[self.valid].sum(axis=1)
@@ -191,7 +186,7 @@ class Archive(Evaluation):
     @property
     def failing(self) -> NDArray[np.bool_]:
         """Whether fresh episodes say that the controller fails an elite, shape (N,)."""
-        return np.zeros(len(self), bool) if self.fresh is None else self.fresh.failing
+        return np.zeros(len(self), bool) if self.fresh is None else self.fresh.not_crossed
 
     @property
     def confirmed(self) -> NDArray[np.bool_]:
@@ -244,12 +239,7 @@ PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (
 
 
 def write_archive(path: Path, archive: Archive) -> None:
-    """Writes an archive as a compressed npz; equal archives give equal bytes.
-
-    Args:
-        path: File to write, atomically.
-        archive: What to write.
-    """
+    """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
     settings = {name: getattr(archive, name) for name in _SETTINGS}
     content = {name: np.asarray(value) for name, value in settings.items() if value is not None}
     content |= {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}

@@ -59,10 +59,7 @@ def calibrate(
         open_evaluator: Opens what crosses terrains.
 
     Returns:
-        The content of the file.
-
-    Raises:
-        ValueError: If a value cannot be used; if a penalty never occurred, once the scales of the others are written.
+        The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written.
     """
     if policy is not None and out is None and robot.settings_file is None:
         raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")

@@ -99,21 +99,12 @@ def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
 
 
-def paper_fitness(
+def _paper_fitness(
     mean: NDArray[np.float64], std: NDArray[np.float64], collision_rate: NDArray[np.float64], cfg: FitnessCfg
 ) -> NDArray[np.float64]:
-    """The paper's fitness: sum of means - alpha * sum of standard deviations - lambda * u.
+    """The paper's fitness, shape (T,): sum of means - alpha * sum of standard deviations - lambda * u.
 
     u is the share of episodes without a base collision, and 0 where no episode has one.
-
-    Args:
-        mean: Mean of each scaled penalty, shape (T, P).
-        std: Standard deviation of each, shape (T, P).
-        collision_rate: Share of episodes with a base collision, shape (T,).
-        cfg: alpha and lambda.
-
-    Returns:
-        Fitness, shape (T,).
     """
     inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
     return mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
@@ -138,7 +129,7 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
     collision_rate = _rate(result.base_collision, counted)
     ratios = terrain_ratios(penalties, counted)
     return Evaluation(
-        fitness=np.where(counted.any(axis=1), paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
+        fitness=np.where(counted.any(axis=1), _paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
         ratios=ratios,
         cell=cells.cell_of(ratios, collision_rate > 0.0),
         penalty_mean=mean,

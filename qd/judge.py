@@ -53,7 +53,7 @@ PANEL_FOLDER = "panel"
 
 _BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
 _MOST_IN_MUJOCO_C = 100  # failing elites
-_FRESH_STREAM, _DRAW_STREAM = 1, 3
+_FRESH_STREAM = 1
 _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _MUJOCO_C_STREAM = 5, 6, 7, 8
 
 
@@ -72,14 +72,6 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
     names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
     rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
     return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
-
-
-def drawn_elites(archive: Archive, most: int, seed: int) -> Archive:
-    """An archive of ``most`` elites, drawn by the search's seed and its iterations; all if there are no more."""
-    if len(archive) <= most:
-        return archive
-    rng = np.random.default_rng(np.random.SeedSequence([seed, archive.iterations], spawn_key=(_DRAW_STREAM,)))
-    return archive.rows(np.sort(rng.choice(len(archive), most, replace=False)))
 
 
 def fresh_values(

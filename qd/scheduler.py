@@ -26,15 +26,7 @@ _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not a
 
 
 class RandomEmitter:
-    """Asks for terrains drawn anew each time, whatever it is told.
-
-    Args:
-        archive: The elites, of which it learns nothing.
-        space: What genes mean.
-        method: ``uniform_random`` or ``hard_random``.
-        batch_size: Terrains asked for at once.
-        stream: Seed.
-    """
+    """Asks for terrains drawn anew each time by ``uniform_random`` or ``hard_random``, whatever it is told."""
 
     def __init__(
         self, archive: GridArchive, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence
@@ -54,13 +46,7 @@ class RandomEmitter:
 
 
 class SurrogateEmitter:
-    """Asks for what a surrogate proposes, which all such emitters of a search share.
-
-    Args:
-        archive: The elites.
-        surrogate: Proposes terrains, for all emitters of a group at once.
-        batch_size: Terrains asked for at once.
-    """
+    """Asks for what a surrogate proposes: one surrogate for all such emitters of a search."""
 
     def __init__(self, archive: GridArchive, surrogate: Surrogate, batch_size: int) -> None:
         self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
@@ -78,12 +64,6 @@ class Scheduler:
     ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what
     CMA-MAE's emitters are judged by: their own, with thresholds that lag behind. All others go by ``result``, and where
     there are none of CMA-MAE's, ``archive`` is ``result``.
-
-    Args:
-        cfg: Settings.
-        space: What genes mean.
-        cells: The reachable cells.
-        seed: Seed of emitters and archives.
     """
 
     def __init__(self, cfg: SchedulerCfg, *, cells: Cells, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> None:
@@ -188,7 +168,14 @@ class Scheduler:
             raise RuntimeError("tell() must follow ask(), got no terrains asked for")
         if len(evaluation.fitness) != len(asked):
             raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
-        rows = _archive_rows(asked, evaluation, iteration)
+        columns = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
+        rows = columns | {
+            "solution": asked,
+            "objective": evaluation.fitness,
+            "measures": evaluation.cell[:, None] + 0.5,
+            "genes": clipped(asked),
+            "iteration": np.full(len(asked), iteration),
+        }
         self._asked[group] = None
         if self.surrogate is not None:
             self.surrogate.learn(asked, evaluation)
@@ -227,22 +214,11 @@ class Scheduler:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Scheduler":
-        """A search that goes on where another stood; a state of something else is a ValueError."""
-        archive, result, emitters, asked = (state.get(name) for name in ("archive", "result", "emitters", "asked"))
-        if not (
-            isinstance(archive, GridArchive)
-            and isinstance(result, GridArchive)
-            and isinstance(emitters, list)
-            and emitters
-            and all(isinstance(emitter, Emitter) for emitter in emitters)
-            and isinstance(asked, list)
-            and 1 <= len(asked) <= len(emitters)
-            and all(isinstance(genes, np.ndarray | None) for genes in asked)
-        ):
-            raise ValueError("a search has two archives, emitters, and what they asked for, got something else")
+        """A search that goes on where another stood."""
         scheduler = cls.__new__(cls)
-        scheduler.archive, scheduler.result, scheduler.emitters, scheduler._asked = archive, result, emitters, asked
-        surrogates = [emitter.surrogate for emitter in emitters if isinstance(emitter, SurrogateEmitter)]
+        scheduler.archive, scheduler.result = state["archive"], state["result"]
+        scheduler.emitters, scheduler._asked = state["emitters"], state["asked"]
+        surrogates = [emitter.surrogate for emitter in scheduler.emitters if isinstance(emitter, SurrogateEmitter)]
         scheduler.surrogate = surrogates[0] if surrogates else None
         return scheduler
 
@@ -271,15 +247,3 @@ def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, 
         extra_fields=extra_fields,
         **learning,
     )
-
-
-def _archive_rows(solutions: NDArray[np.float32], evaluation: Evaluation, iteration: int) -> dict[str, NDArray[Any]]:
-    """What both archives are told: one row a terrain."""
-    columns = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
-    return columns | {
-        "solution": solutions,
-        "objective": evaluation.fitness,
-        "measures": evaluation.cell[:, None] + 0.5,
-        "genes": clipped(solutions),
-        "iteration": np.full(len(solutions), iteration),
-    }

@@ -1,8 +1,6 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from qd.archive import Archive, read_archive
 from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
-from qd.judge import drawn_elites, fresh_values
+from qd.judge import fresh_values
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import ProgressBar, clock, describe_search
 from qd.run.settings import SearchCfg
@@ -38,8 +36,8 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space
 
-MOST_DRAWN = 200
-"""Elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)."""
+_MOST_SAMPLED = 200  # elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)
+_SAMPLE_STREAM = 3
 
 
 def search(
@@ -62,39 +60,51 @@ def search(
         open_evaluator: Opens what crosses terrains.
 
     Returns:
-        The archive; with what judging says of its elites if nothing was left to do.
-
-    Raises:
-        Interrupted: On Ctrl-C or SIGTERM; all iterations that ended are saved.
-        EvaluatorError: If a worker is lost; likewise.
-        AllInvalidError: If no episode of a group is valid; likewise.
+        The archive; with what judging says of its elites if nothing was left to do. Whatever stops a search, all
+        iterations that ended are saved.
     """
     robot = robot or get_robot(cfg.robot)
     policy = policy or spec_of(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
-    evaluator = _evaluator_cfg(cfg, robot, policy, compute)
-    run = RunDirectory(path)
+    space, run = get_space(cfg.space, cfg.space_sha256), RunDirectory(path)
+    evaluator = EvaluatorCfg(
+        robot=robot,
+        policy=policy,
+        num_terrains=cfg.scheduler.num_terrains,
+        num_replicas=cfg.replicas,
+        device=compute.device,
+        workers=compute.workers,
+        lots=cfg.scheduler.num_groups,
+        num_envs=compute.num_envs,
+        space=space.name,  # where its code is now
+    )
     with claimed(path):
         saved = run.load(cfg)
-        scheduler, metrics = begin(cfg) if saved is None else (Scheduler.from_state(saved[0]), saved[1])
+        if saved is None:
+            scheduler, metrics = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
+        else:
+            scheduler, metrics = Scheduler.from_state(saved[0]), saved[1]
         scheduler.compute_on(compute.device)
         done = len(metrics)
         print(describe_search(cfg, path, done, compute.device, evaluator.num_workers), flush=True)
         if note := robot.scaled_by_another(policy):
             print(note)
         if done < cfg.iterations:
-            with _saying_what_is_saved(path), open_evaluator(evaluator) as pipeline:
-                run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
-                with ProgressBar(cfg.iterations, done) as bar:
-                    run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
+            try:
+                with open_evaluator(evaluator) as pipeline:
+                    run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
+                    with ProgressBar(cfg.iterations, done) as bar:
+                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
+            except KeyboardInterrupt:
+                raise Interrupted(f"Stopped; finished iterations are saved: go on with --resume {path}") from None
         archive = archive_of(cfg, scheduler, len(metrics))
         if (stored := _written_archive(run, archive)) is not None:
             return stored
-        write_results(run, archive, metrics)
+        _write_results(run, archive, metrics)
     return archive
 
 
-def run_iterations(
+def _run_iterations(
     cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: ProgressBar
 ) -> None:
     """Runs the iterations that are left, and saves each.
@@ -102,14 +112,6 @@ def run_iterations(
     A group of emitters that was told asks again at once, and its next terrains wait in the queue while those of the
     other groups are crossed. The order is fixed, and what a group has asked for is part of the saved state: a search
     that goes on where it was stopped is the same as one that was not.
-
-    Args:
-        cfg: The search.
-        run: Where it is saved.
-        scheduler: Its state, told so far.
-        metrics: Rows so far; one more an iteration.
-        pipeline: Crosses terrains.
-        bar: Shows progress.
     """
     num_groups = cfg.scheduler.num_groups
     pipeline.clear()
@@ -134,7 +136,8 @@ def run_iterations(
             evaluations.append(evaluation)
         num_under_way = num_groups if goes_ahead else 0
         archive = archive_of(cfg, scheduler, iteration)
-        row = metrics_row(archive, join_results(results, join=1), join_evaluations(evaluations), iteration, search_s)
+        row = _metrics_row(archive, join_results(results, join=1), join_evaluations(evaluations), iteration)
+        row["search_s"] = search_s
         if samples:
             row |= _sample_elites(cfg, archive, pipeline)
         ended = time.perf_counter()
@@ -153,18 +156,8 @@ def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: in
     return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
 
 
-def metrics_row(
-    archive: Archive, result: RolloutResult, evaluation: Evaluation, iteration: int, search_s: float
-) -> dict[str, Any]:
-    """An iteration's row of metrics without its timing.
-
-    Args:
-        archive: What the search has found.
-        result: The iteration's crossings.
-        evaluation: What the emitters were told of them.
-        iteration: Number of the iteration, from 1.
-        search_s: Time that telling and asking the emitters took [s].
-    """
+def _metrics_row(archive: Archive, result: RolloutResult, evaluation: Evaluation, iteration: int) -> dict[str, Any]:
+    """An iteration's row of metrics without the search's times."""
     return {
         "iteration": iteration,
         **archive.scores(),
@@ -174,45 +167,18 @@ def metrics_row(
         "robot_steps": int(result.robot_steps),
         "idle_share": result.idle_share,
         "rollout_s": float(result.wall_s),
-        "search_s": search_s,
         "mean_duration_s": float(result.duration_s.mean()),
     }
 
 
 def _sample_elites(cfg: SearchCfg, archive: Archive, pipeline: Pipeline) -> dict[str, Any]:
     """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
-    sample = drawn_elites(archive, MOST_DRAWN, cfg.seed)
+    sample = archive
+    if len(archive) > _MOST_SAMPLED:
+        rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(_SAMPLE_STREAM,)))
+        sample = archive.rows(np.sort(rng.choice(len(archive), _MOST_SAMPLED, replace=False)))
     fresh = fresh_values(sample, pipeline, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
     return fresh_numbers(sample, fresh, sampled=True)
-
-
-def _evaluator_cfg(cfg: SearchCfg, robot: RobotCfg, policy: str, compute: Compute) -> EvaluatorCfg:
-    """What crosses an iteration's terrains, all of them at once."""
-    return EvaluatorCfg(
-        robot=robot,
-        policy=policy,
-        num_terrains=cfg.scheduler.num_terrains,
-        num_replicas=cfg.replicas,
-        device=compute.device,
-        workers=compute.workers,
-        lots=cfg.scheduler.num_groups,
-        num_envs=compute.num_envs,
-        space=get_space(cfg.space, cfg.space_sha256).name,  # where its code is now
-    )
-
-
-def begin(cfg: SearchCfg) -> tuple[Scheduler, Metrics]:
-    """A search that has asked for nothing yet, and its metrics."""
-    space = get_space(cfg.space, cfg.space_sha256)
-    return Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
-
-
-@contextmanager
-def _saying_what_is_saved(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise Interrupted(f"Stopped; finished iterations are saved: go on with --resume {path}") from None
 
 
 def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
@@ -244,14 +210,8 @@ def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:
     return stored if is_whole else None
 
 
-def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
-    """Writes archive, figures and numbers of a search, and prints what it found.
-
-    Args:
-        run: The run directory, claimed.
-        archive: Elites of the search.
-        metrics: One row an iteration.
-    """
+def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
+    """Writes archive, figures and numbers of a search, and prints what it found."""
     config = run.read_config()
     origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)

@@ -17,7 +17,6 @@ from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Networks, Training
 from qd.run.presets import SchedulerCfg
-from qd.variation import vary_elites
 from sim.corridor import corridor_ground, corridor_heights
 from sim.policy.loaders import prepare_torch
 from sim.spaces.base import TerrainSpace, clipped
@@ -60,14 +59,7 @@ class Prediction(NamedTuple):
 
 
 class Surrogate:
-    """Networks, what they have learned from, and the inner loop.
-
-    Args:
-        cfg: Settings of the search.
-        cells: The archive's cells.
-        space: What genes mean.
-        stream: Seed of first weights, draws and proposals.
-    """
+    """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals."""
 
     def __init__(self, cfg: SchedulerCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
         self.cfg, self.cells, self.device = cfg, cells, "cpu"
@@ -125,7 +117,7 @@ class Surrogate:
             self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
-        units = _in_units(genes)
+        units = np.rint(genes * _GENE_UNITS).astype(np.int16)
         if self._maps is not None:
             self._maps = torch.cat([self._maps, self._map_units(units)])[-MOST:]
         self._genes = np.concatenate([self._genes, units])[-MOST:]
@@ -299,16 +291,39 @@ class Surrogate:
         moments = [
             {name: torch.from_numpy(array).clone() for name, array in arrays.items()} for arrays in state["learned"]
         ]
-        stored, weights = [tensors.pop("weights") for tensors in moments], list(self._networks.parameters())
-        if [tensor.shape for tensor in stored] != [tensor.shape for tensor in weights]:
-            raise ValueError("its surrogate has networks of another shape")
-        for tensor, value in zip(weights, stored, strict=True):
-            tensor.data.copy_(value)
+        for weights, tensors in zip(self._networks.parameters(), moments, strict=True):
+            weights.data.copy_(tensors.pop("weights"))
         self._training = Training(self._networks, self._loss, self.device, moments)
 
 
-def _in_units(genes: NDArray[np.float32]) -> NDArray[np.int16]:
-    return np.rint(genes * _GENE_UNITS).astype(np.int16)
+def vary_elites(
+    pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | None, draw: torch.Generator
+) -> Tensor:
+    """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
+
+    A share of them takes each of its parts, such as bumps, from a further elite with a chance of a half, where the
+    space has parts.
+
+    Args:
+        pool: Genes of the elites, shape (E, num_genes).
+        count: Number of children.
+        cfg: Step sizes and that share.
+        genes_per_part: As of :attr:`sim.spaces.base.TerrainSpace.genes_per_part`.
+        draw: What they are drawn from, on the pool's device.
+
+    Returns:
+        Genes in [-1, 1], shape (count, num_genes).
+    """
+    on = {"generator": draw, "device": pool.device}
+    elites, others, further = pool[torch.randint(len(pool), (3, count), **on)]
+    noise = cfg.iso_sigma * torch.randn(elites.shape, **on)
+    along = cfg.line_sigma * torch.randn((count, 1), **on)
+    children = elites + noise + along * (others - elites)
+    if cfg.crossover_share and genes_per_part:
+        crossed = torch.rand((count, 1), **on) < cfg.crossover_share
+        swapped = (torch.rand((count, pool.shape[1] // genes_per_part), **on) < 0.5) & crossed
+        children = torch.where(swapped.repeat_interleave(genes_per_part, dim=1), further, children)
+    return children.clamp(-1.0, 1.0)
 
 
 def _targets_of(evaluation: Evaluation) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ LIBRARY_DOORS = {  # a room, or a folder of one
     "rsl_rl": ("train",),
     "PIL": ("sim", "qd"),
     "imageio_ffmpeg": ("qd",),
-    "torch": ("sim", "train", "qd/surrogate.py", "qd/networks.py", "qd/variation.py"),
+    "torch": ("sim", "train", "qd/surrogate.py", "qd/networks.py"),
     "onnx": ("sim", "train"),
     "onnxruntime": ("sim",),
     "viser": ("qd/show/view",),

@@ -20,11 +20,6 @@ def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> P
         cfg: What, and from which seed.
         run_dir: Where checkpoint, controller, record and TensorBoard's file go.
         run: Where and for how long.
-
-    Raises:
-        ValueError: If a setting cannot be used; raised before any long work.
-        Interrupted: On Ctrl-C, when all is saved.
-        FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
     """
     deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
     cfg = cfg.sized(robot, device)

@@ -52,11 +52,6 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         cfg: What, and on which terrains.
         run_dir: Where checkpoint, controller, record and TensorBoard's file go.
         run: Where and for how long.
-
-    Raises:
-        ValueError: If controller, archives or a setting cannot be used; raised before any long work.
-        Interrupted: On Ctrl-C, when all is saved.
-        FloatingPointError: If the training leaves the finite numbers; the last checkpoint is kept.
     """
     deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
     if Ranks.of_environment().size > 1:

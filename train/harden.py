@@ -147,11 +147,7 @@ class _Hardening:
     choices: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def _seed(self, number: int) -> int:
-        """Seed of a round.
-
-        Searches of one seed begin with the same terrains, of which some are held out. From 100 on seeds are apart from
-        those of searches of seed 0, 1 and so on, on whose elites controllers are tested.
-        """
+        """Seed of a round, from 100 on: controllers are tested on elites of searches with seeds 0, 1 and so on."""
         return _SEEDS * (self.cfg.seed + 1) + number
 
     def _searches(self) -> list[Path]:

@@ -138,11 +138,7 @@ def claimed(path: Path) -> Iterator[None]:
 
 
 class RunDirectory:
-    """Files of one run.
-
-    Args:
-        path: The directory.
-    """
+    """Files of one run in its directory."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

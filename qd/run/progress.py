@@ -34,14 +34,7 @@ def describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers:
 
 @contextmanager
 def share_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar over one piece of work.
-
-    Args:
-        what: Name of the work.
-
-    Yields:
-        A function that moves the bar to the share that is done.
-    """
+    """A bar over one piece of work; yields a function that moves it to the share that is done."""
     with tqdm(total=1.0, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT) as bar:
 
         def move_to(share: float) -> None:
@@ -51,12 +44,7 @@ def share_bar(what: str) -> Iterator[Callable[[float], None]]:
 
 
 class ProgressBar(tqdm):
-    """A bar over iterations that moves within them; closes on leaving its context.
-
-    Args:
-        iterations: Iterations to reach.
-        done: Iterations done before.
-    """
+    """A bar over iterations, some of them done before, that moves within them; closes on leaving its context."""
 
     def __init__(self, iterations: int, done: int) -> None:
         self._iterations, self._first = iterations, done

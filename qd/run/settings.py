@@ -74,15 +74,7 @@ def preset(
     space: str = "super_gaussian",
     space_sha256: str | None = None,
 ) -> SearchCfg:
-    """Settings of a search by the name of a preset.
-
-    Args:
-        name: Of the preset.
-        robot: Robot to search.
-        policy: Controller to search; the robot's own if None.
-        space: Name of the terrain space.
-        space_sha256: Hash of its code if it is a user's own.
-    """
+    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller."""
     return SearchCfg(
         robot=robot.name,
         **robot_identity(robot),

@@ -118,13 +118,7 @@ class Cache:
 
 
 class _Stored:
-    """Crossings in a cache that were made in one way, each terrain under the hash of itself and its seed.
-
-    Args:
-        cache: Where they are.
-        way: Hash of what they depend on beside terrain and seed.
-        penalty_names: Columns of their penalties.
-    """
+    """Crossings in a cache by the hash of terrain and seed; ``way`` is the hash of all else that they depend on."""
 
     def __init__(self, cache: Cache, way: str, penalty_names: tuple[str, ...]) -> None:
         self._cache, self._way, self._penalty_names = cache, way, penalty_names
@@ -247,7 +241,6 @@ class Crossings:
             neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
 
         Raises:
-            AllInvalidError: If no episode is valid.
             EvaluatorError: If a worker is lost.
         """
         if seeds.shape != (len(terrains),):

@@ -7,7 +7,6 @@ however terrains are spread.
 import importlib
 import os
 import re
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -240,18 +239,13 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
     Args:
         cfg: What, with what, where.
         build: Makes the simulation; a module-level function, since processes import it by name.
-
-    Raises:
-        ValueError: If the simulation cannot be built as asked for.
-        EvaluatorError: If a process dies; of a Ray cluster, if no worker is left and none comes.
-        OSError: If there is no Ray cluster at RAY_ADDRESS.
     """
     if parse_workers(cfg.workers).on_ray:
         with _ray_workers().open_ray_workers(cfg, build) as workers:
             yield workers
         return
     if cfg.device.startswith("cuda"):
-        yield _Here(build(cfg, cfg.num_terrains), cfg.num_terrains)
+        yield Pipeline(cfg.num_terrains, build(cfg, cfg.num_terrains))
         return
     processes: list[WorkerProcess] = []
     try:
@@ -267,29 +261,31 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
             process.stop()
 
 
-class Pipeline(ABC):
+class Pipeline:
     """Evaluates any number of terrains: lots of them are put in, and come out in the same order.
 
     Robots go on with the lots behind while the last robots of the first one still walk.
 
     Args:
         num_terrains: Terrains that may be under way at once.
+        crosser: The simulation, in this process; subclasses have others.
     """
 
-    def __init__(self, num_terrains: int) -> None:
+    def __init__(self, num_terrains: int, crosser: Any = None) -> None:
         self.num_terrains = num_terrains
+        self._crosser = crosser
 
-    @abstractmethod
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
         """Lets a lot of terrains be crossed; waits for nothing."""
+        self._crosser.put(terrains, seeds)
 
-    @abstractmethod
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Waits for the lot that was put in first; ``progress`` is told the share of it that is done."""
+        """Waits for the lot that was put in first; ``progress`` gets the share of it that is done."""
+        return self._crosser.take(progress)
 
-    @abstractmethod
     def clear(self) -> None:
         """Has nothing under way afterwards: what an evaluation that was stopped has left is of no later one."""
+        self._crosser.clear()
 
     def status(self) -> WorkerStatus | None:
         """How Ray workers fare; None without them."""
@@ -344,26 +340,6 @@ class Pipeline(ABC):
             yield lot, result
 
 
-class _Here(Pipeline):
-    """A simulation in this process."""
-
-    def __init__(self, crosser: Crosser, num_terrains: int) -> None:
-        super().__init__(num_terrains)
-        self._crosser = crosser
-
-    def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands a lot to the simulation."""
-        self._crosser.put(terrains, seeds)
-
-    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Waits for the simulation."""
-        return self._crosser.take(progress)
-
-    def clear(self) -> None:
-        """Lets the simulation forget."""
-        self._crosser.clear()
-
-
 class _Processes(Pipeline):
     """Processes that each cross a part of every lot, whole terrains in order."""
 
@@ -374,7 +350,7 @@ class _Processes(Pipeline):
         self._lots: deque[dict[int, Any]] = deque()  # of each lot under way, the results by process, None to come
 
     def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands a part to each process; over all lots none gets more than one terrain more than another."""
+        # Over all lots no process gets more than one terrain more than another.
         each, rest = divmod(len(terrains), len(self._processes))
         parts, begin = dict[int, Any](), 0
         for index, process in enumerate(self._processes):
@@ -386,7 +362,6 @@ class _Processes(Pipeline):
         self._lots.append(parts)
 
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Puts the parts of a lot together."""
         parts = self._lots[0]
         shares = dict.fromkeys(parts, 0.0)
         while waiting := {self._processes[k].connection: k for k, result in parts.items() if result is None}:
@@ -403,7 +378,6 @@ class _Processes(Pipeline):
         return join_results(list(parts.values()), join=0)
 
     def clear(self) -> None:
-        """Waits for what is under way."""
         while self._lots:
             self.take()
 

@@ -69,10 +69,7 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
     Args:
         result: The episodes.
         label: What was crossed, for the line.
-        all_ok: Whether all of them may be.
-
-    Raises:
-        AllInvalidError: If no episode is valid.
+        all_ok: Whether all of them may be; else that is an AllInvalidError.
     """
     if not all_ok:
         refuse_all_invalid(result)

@@ -23,12 +23,6 @@ class EvaluatorError(UserError):
 class Crosser(Protocol):
     """What lets robots cross terrains: :class:`sim.rollout.Rollout`."""
 
-    def evaluate(
-        self, terrains: NDArray, seeds: NDArray, *, progress: Callable[[float], None] | None = None
-    ) -> RolloutResult:
-        """Cross each terrain."""
-        ...
-
     def clear(self) -> None:
         """Forget what is under way."""
         ...
@@ -72,11 +66,7 @@ class WorkerProcess:
                 self.receive()
 
     def receive(self) -> tuple[str, Any]:
-        """The next message: ``ready``, ``progress`` or ``result``, and its value.
-
-        Raises:
-            ValueError: If the worker refused its work; EvaluatorError if it failed otherwise, or is dead.
-        """
+        """The next message: ``ready``, ``progress`` or ``result``, and its value; raises what ended the worker."""
         try:
             message, value = self.connection.recv()
         except (EOFError, OSError):

@@ -70,15 +70,7 @@ _ray: Any = ray  # its annotations leave out what it documents
 
 @_ray.remote
 class RayWorker:
-    """One device's simulation.
-
-    Args:
-        cfg: Settings of the evaluator; the device is the one that Ray gave to this process.
-        controller: Its controller.
-        robot: Its robot, or the name of one.
-        space: Code of its terrain space, if it is a user's own.
-        build: Makes the simulation of ``cfg`` for a number of terrains.
-    """
+    """One device's simulation, which Ray gave to this process; controller, robot and space come with their files."""
 
     def __init__(
         self,
@@ -106,7 +98,8 @@ class RayWorker:
 
     def cross(self, terrains: NDArray, seeds: NDArray) -> RolloutResult:
         """Crosses terrains, at most as many as it was prepared for."""
-        return self._crosser.evaluate(terrains, seeds)
+        self._crosser.put(terrains, seeds)
+        return self._crosser.take()
 
 
 @dataclass(eq=False)
@@ -123,10 +116,6 @@ class RayWorkers(Pipeline):
     """Evaluates terrains on Ray workers, one for each device that the cluster has or as many as asked for.
 
     A worker that fails in any way is replaced, and its terrains are crossed again by another.
-
-    Args:
-        cfg: What is crossed, with what; ``num_terrains`` at once over all workers.
-        build: Makes a worker's simulation.
     """
 
     def __init__(self, cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Crosser]) -> None:

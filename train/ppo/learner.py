@@ -105,12 +105,8 @@ class Learner:
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
         """Draw the networks from ``seed``, as the actions are.
 
-        Args:
-            env: What is learned.
-            cfg: Settings.
-            seed: A number from 0.
-            random_ages: Begin episodes with clocks set forward, so that they do not end together; such an episode is
-                shorter than its length says, and ends by the clock without having had its time.
+        With ``random_ages`` episodes begin with clocks set forward, so that they do not end together; such an episode
+        is shorter than its length says, and ends by the clock without having had its time.
         """
         torch.manual_seed(seed)
         torch.set_float32_matmul_precision("high")  # TF32 on CUDA: half the learning time, no measurable loss

@@ -30,12 +30,7 @@ class Progress:
     ) -> None:
         """Begin a piece of training of ``iterations`` in all; of several processes the first prints and writes.
 
-        Args:
-            run_dir: Where TensorBoard's file goes.
-            learner: What is trained.
-            iterations: In all.
-            about: Provenance of this piece.
-            saved: :meth:`state` of the pieces before.
+        ``about`` is the provenance of this piece, ``saved`` the :meth:`state` of those before.
         """
         before = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
         self._learner = learner

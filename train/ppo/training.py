@@ -147,17 +147,10 @@ class Training:
         tiles: Tiles | None = None,
         random_ages: bool = True,
     ) -> None:
-        """Begin, or go on from a checkpoint.
+        """Begin, or go on from a checkpoint (:func:`read_saved`); without ``tiles`` on those of the curriculum.
 
-        Args:
-            robot: Who learns.
-            cfg: What, with its sizes.
-            run_dir: Where to write; the directory exists.
-            device: Warp device name.
-            settings: What checkpoint and record say of it (:func:`settings_of`).
-            saved: The checkpoint (:func:`read_saved`).
-            tiles: Terrains; those of the curriculum if left out.
-            random_ages: As of :class:`Learner`.
+        ``settings`` are what checkpoint and record say of it (:func:`settings_of`), ``random_ages`` as of
+        :class:`Learner`.
         """
         self._robot, self._cfg, self._run_dir, self._settings = robot, cfg, run_dir, settings
         ranks = Ranks.of_environment()

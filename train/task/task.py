@@ -57,16 +57,7 @@ class CommandTask:
     def __init__(
         self, robot: RobotCfg, cfg: TaskCfg, *, num_envs: int, device: str, seed: int, tiles: Tiles | None = None
     ) -> None:
-        """Build the terrain, the robots and the graph; every episode begins.
-
-        Args:
-            robot: Robot settings.
-            cfg: Task settings.
-            num_envs: Number of robots.
-            device: Warp device name.
-            seed: Of everything drawn.
-            tiles: The terrains; those of the curriculum if left out.
-        """
+        """Build terrain, robots and graph; every episode begins. Without ``tiles``, those of the curriculum."""
         problems = task_problems(cfg, robot.control_dt)
         if problems:
             raise ValueError("; ".join(problems))
