@@ -245,21 +245,21 @@ def take_apart(
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
     minima = dict[int, Minimal]()
     while True:
-        wanted = list[tuple[int, Trial]]()
+        trials = list[tuple[int, Trial]]()
         for number, step in list(steps.items()):
             try:
-                wanted += [(number, trial) for trial in next(step)]
+                trials += [(number, trial) for trial in next(step)]
             except StopIteration as end:
                 minima[number] = end.value
                 del steps[number]
-        if not wanted:
+        if not trials:
             return dict(sorted(minima.items()))
-        rows = [np.repeat(genes_of(archive.genes[n], trial, space)[None], trial.rows, axis=0) for n, trial in wanted]
+        rows = [np.repeat(genes_of(archive.genes[n], trial, space)[None], trial.rows, axis=0) for n, trial in trials]
         result = crossings.cross(
-            search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in wanted]),
+            search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
             replicas=_ROW_EPISODES, space=search.space, at_most=most_rows, invalid_ok=True,
             label=f"{len(minima)} of {len(cases)} elites done",
         )  # fmt: skip
-        ends = np.cumsum([trial.rows for _, trial in wanted])
-        for (number, trial), counts in zip(wanted, np.split(outcome_counts(result), ends[:-1]), strict=True):
+        ends = np.cumsum([trial.rows for _, trial in trials])
+        for (number, trial), counts in zip(trials, np.split(outcome_counts(result), ends[:-1]), strict=True):
             cases[number].counts[trial] = counts.sum(axis=0)

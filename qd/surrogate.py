@@ -240,15 +240,15 @@ class Surrogate:
 
     def _gain(self, prediction: Prediction, best: Tensor) -> Tensor:
         """QD score that terrains would add, the mean over the networks, shape (N,)."""
-        cells = self._cells(prediction.ratios, prediction.collided)
+        cells = self.cells_of(prediction.ratios, prediction.collided)
         gains = (prediction.fitness - best[cells]).clamp_min(0.0)
         return torch.where(cells >= 0, gains, 0.0).mean(0)
 
     def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
-        return self._cells(prediction.ratios.mean(0), prediction.collided.float().mean(0) >= 0.5)
+        return self.cells_of(prediction.ratios.mean(0), prediction.collided.float().mean(0) >= 0.5)
 
-    def _cells(self, ratios: Tensor, collided: Tensor) -> Tensor:
+    def cells_of(self, ratios: Tensor, collided: Tensor) -> Tensor:
         """Cell of each row of ratios, as :meth:`Cells.cell_of` has it; -1 of one on the edge of what can be reached."""
         if self._codes is None:
             self._codes = torch.from_numpy(self.cells.codes).to(self.device)

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from itertools import count
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -140,12 +139,11 @@ def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
 
 def _run_dir(flags: _OfTraining, name: str) -> Path:
     """Where a training works; a new directory is called after ``name`` and the time."""
+    from qd.run.directory import free_path
+
     if flags.resume is not None and flags.run_dir is not None:
         raise ValueError("--resume goes on where it is, got --run-dir too: leave it out")
-    stamp = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    names = (f"{stamp}-{number}" if number else stamp for number in count())  # two may begin in one second
-    new = next(place for place in map(Path("runs").joinpath, names) if not place.exists())
-    return flags.run_dir or flags.resume or new
+    return flags.run_dir or flags.resume or free_path(f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
 
 
 def _part(kind: type[_Cfg], flags: Any) -> _Cfg:

@@ -77,8 +77,8 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             return run_dir / POLICY
     with run_directory(run_dir, run.export, overwrite=run.overwrite):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
-        what = f"on {cfg.terrains} terrains at a time ({cfg.mix})"
-        print(f"Fine-tuning '{robot.name}' {what}: {sizes}, in {run_dir}", flush=True)
+        terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
+        print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
         training = FineTuning(
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
@@ -194,9 +194,10 @@ class FineTuning(Training):
         )  # fmt: skip
         if start is not None:
             before = recorded_marks(str(cfg.policy or robot.policy_file))
-            asked = cfg.recipe.critic_iterations
-            alone = min(_CRITIC_ITERATIONS, cfg.iterations // 2) if asked is None else asked
-            self._alone = alone if start.critic is None else 0
+            iterations = cfg.recipe.critic_iterations
+            if iterations is None:
+                iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+            self._alone = iterations if start.critic is None else 0
             self._trained_on = sorted({*chain(*map(marks_of, elites.genes)), *before})
             tiles = self.mix.next()
         else:

@@ -107,8 +107,8 @@ def _begin(robot: RobotCfg, cfg: HardenCfg, run_dir: Path, compute: Compute) -> 
     tune = cfg.tune.sized(robot, compute.device, **({} if robot.name == "cassie" else LARGE))
     tune.check(robot)
     full = (paper_terrains(robot.name), EPISODES)
-    asked = cfg.evaluation
-    terrains, episodes = sizes_for(compute, asked.terrains or None, asked.episodes or None, full=full, small=(24, 4))
+    terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
+    terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=(24, 4))
     cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
     settings = json.loads(to_json({**asdict(cfg), **identity(robot, base)}))  # as they are read again
     del settings["rounds"]
@@ -221,9 +221,9 @@ class _Hardening:
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
         judge(run, certifiers=self.certifiers, **settings)
         counts = RunDirectory(run).read_summary()
-        about = {key: value for key, value in identity(self.robot, policy).items() if key.startswith("policy")}
+        digest = {key: value for key, value in identity(self.robot, policy).items() if key.startswith("policy")}
         tuned = f"tune-{number}" if number else None
-        row = {"controller": name, **about, "tuned": tuned, "kept": tuned and self.choices[tuned]["kept"]}
+        row = {"controller": name, **digest, "tuned": tuned, "kept": tuned and self.choices[tuned]["kept"]}
         self.rows.append({**row, "search": run.name, **{key: counts.get(key) for key in _COUNTS}})
 
     def search_cfg(self, number: int, policy: str | None) -> SearchCfg:

@@ -107,9 +107,9 @@ class Cache:
 
     def remove_least_used(self, *, but: str) -> None:
         """Removes the files that were not used for longest, but one, until the folder has its size."""
-        about = [(file, file.stat()) for file in self.folder.glob("*.npz")]
-        size = sum(stat.st_size for _, stat in about)
-        for file, stat in sorted(about, key=lambda pair: pair[1].st_mtime_ns):
+        files = [(file, file.stat()) for file in self.folder.glob("*.npz")]
+        size = sum(stat.st_size for _, stat in files)
+        for file, stat in sorted(files, key=lambda pair: pair[1].st_mtime_ns):
             if size <= self._most_bytes:
                 return
             if file.stem != but:

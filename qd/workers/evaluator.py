@@ -196,8 +196,8 @@ def origin_of(device: str, seed: int, workers: str | None = None) -> dict[str, A
 def check_policy(policy: str, robot: RobotCfg | str, device: str) -> None:
     """Loads a controller and tries it on the robot, so that a bad one is found before any long work."""
     # A cluster's GPUs need not be this machine's.
-    here = device if device == "cpu" else resolve_device(None)
-    load_policy(policy, get_robot(robot), device if here.startswith("cuda") else "cpu")
+    local_device = device if device == "cpu" else resolve_device(None)
+    load_policy(policy, get_robot(robot), device if local_device.startswith("cuda") else "cpu")
 
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:

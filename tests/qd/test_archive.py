@@ -58,10 +58,9 @@ def test_missing_archive(tmp_path):
         read_archive(tmp_path)
 
 
-@pytest.mark.parametrize("fresh", [False, True])
-def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path, fresh):
-    file, archive = tmp_path / "archive.npz", small_archive(5)
-    write_archive(file, dataclasses.replace(archive, fresh=fresh_values(archive) if fresh else None))
+def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path):
+    file = tmp_path / "archive.npz"
+    write_archive(file, judged_archive())
     whole = file.read_bytes()
     refused = 0
     for position in np.random.default_rng(1).integers(0, len(whole), 200):
@@ -81,11 +80,7 @@ def changed_file(folder, archive, **changes):
     np.savez(folder / "archive.npz", **{name: array for name, array in arrays.items() if array is not None})
 
 
-NAMES = ["genes", "cell", "robot_sha256", "penalties", "fresh_cell", "fresh_reproduced", "certifiers"]
-NAMES += ["resolved_outcomes", "certifier_resolved_outcomes"]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["cell", "robot_sha256", "fresh_reproduced", "certifiers", "resolved_outcomes"])
 def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
     changed_file(tmp_path, judged_archive(), **{name: None})
     with pytest.raises(ValueError, match=name):
@@ -97,12 +92,8 @@ def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
     [
         ("genes", np.zeros((4, 64), np.float32)),
         ("ratios", np.ones((5, 3))),
-        ("fresh_ratios", np.ones((5, 3))),
         ("fresh_cell", np.zeros((5, 1), int)),
-        ("resolved_outcomes", np.zeros((5, 3), int)),
         ("certifier_outcomes", np.zeros((5, 1, 4), int)),
-        ("certifier_sha256", np.array(["a"])),
-        ("scales", np.ones(3)),
         ("robot", np.array(["anymal"])),
         ("fitness", np.array(list("abcde"))),
         ("penalties", np.ones(2)),

@@ -12,7 +12,7 @@ from kernels.episode import Outcome
 from qd import judge as judging
 from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
-from qd.judge import drawn_elites, elite_seeds, fresh_values, judge, outcome_counts, seen_by
+from qd.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
 from qd.show import figures
 from qd.workers.evaluator import Compute
 from sim.mujoco_c.crossing import PlainCrossings
@@ -99,12 +99,6 @@ def test_seeds_follow_from_what_names_an_elite():
     assert len({*seeds.tolist(), *np.concatenate(others).tolist()}) == 16
     # Stored crossings and published numbers are of these.
     assert elite_seeds(archive, 3, stream=1)[0] == np.random.SeedSequence([3, 1, 0], spawn_key=(1,)).generate_state(1)
-
-
-def test_drawn_elites_are_some_of_them_each_once():
-    archive = small_archive(3)
-    assert drawn_elites(archive, 3, seed=0) is archive
-    assert set(drawn_elites(archive, 2, seed=0).cell.tolist()) < set(archive.cell.tolist())
 
 
 def test_outcomes_are_counted_by_hand():

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from qd.workers import evaluator
-from qd.workers.evaluator import (
-    EvaluatorCfg,
-    EvaluatorError,
-    open_evaluator,
-    parse_workers,
-)
+from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, parse_workers
 from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
 
@@ -27,7 +22,8 @@ class Crosser(crossers.Crosser):
         if self.cfg.policy == f"refuse at {seeds[0]}":
             raise ValueError("terrains of another kind")
         result = super().evaluate(terrains, seeds, progress=progress)
-        return dataclasses.replace(result, wall_s=float(seeds[0]), physics_steps=int(seeds[0]))
+        steps = int(seeds[0])
+        return dataclasses.replace(result, wall_s=float(steps), physics_steps=steps, robot_steps=steps)
 
 
 class Echo(crossers.Crosser):
@@ -72,24 +68,38 @@ def test_sizes(monkeypatch, num_terrains, num_replicas, workers, processes, terr
     assert (cfg.num_workers, cfg.terrains_of_worker) == (processes, terrains)
 
 
-@pytest.mark.parametrize(("device", "workers"), [("cpu", "1"), ("cpu", "2"), ("cuda:0", None)])
-def test_how_terrains_are_spread_changes_nothing(device, workers):
-    for num_terrains in (1, 6):
-        cfg = dataclasses.replace(CFG, device=device, workers=workers, num_terrains=num_terrains)
-        with open_evaluator(cfg, build=Crosser) as evaluate:
-            for count in (1, 6, 15):
-                seen = []
-                result = evaluate(GENES[:count], SEEDS[:count], seen.append)
-                assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
-                assert seen == sorted(seen) and seen[-1] == 1.0
+@pytest.fixture(scope="module", params=["2", "cuda:0"])
+def evaluate(request):
+    """Two processes that have six terrains under way, or a simulation in this process, as on a GPU."""
+    changes = {"device": request.param, "workers": None} if request.param != "2" else {"workers": "2"}
+    with open_evaluator(dataclasses.replace(CFG, **changes), build=Crosser) as pipeline:
+        yield pipeline
 
 
-def test_shards_run_at_the_same_time_and_turns_one_after_the_other():
-    with open_evaluator(dataclasses.replace(CFG, workers="2"), build=Crosser) as evaluate:
-        assert evaluate(GENES[:6], SEEDS[:6]).wall_s == 103.0  # shards begin at seeds 100 and 103
-        # Twelve, of which six fit, go in lots of three, as parts of two and one, one and two, ... in turn: the second
-        # parts begin at 102, 104, 108 and 110.
-        assert evaluate(GENES[:12], SEEDS[:12]).physics_steps == 102 + 104 + 108 + 110
+@pytest.mark.parametrize("count", [1, 6, 15])
+def test_how_terrains_are_spread_changes_nothing(evaluate, count):
+    shares = []
+    result = evaluate(GENES[:count], SEEDS[:count], shares.append)
+    assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(evaluate):
+    def stop(share: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
+    assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
+
+
+@pytest.mark.parametrize("evaluate", ["2"], indirect=True)
+def test_shards_run_at_the_same_time_and_turns_one_after_the_other(evaluate):
+    result = evaluate(GENES[:6], SEEDS[:6])  # shards begin at seeds 100 and 103
+    assert (result.wall_s, result.physics_steps, result.robot_steps) == (103.0, 103, 203)
+    # Twelve, of which six fit, go in lots of three, as parts of two and one, one and two, ... in turn: the second parts
+    # begin at 102, 104, 108 and 110, or where the other process has its turn at 101, 105, 107 and 111.
+    assert evaluate(GENES[:12], SEEDS[:12]).physics_steps in (102 + 104 + 108 + 110, 101 + 105 + 107 + 111)
 
 
 def test_contact_is_resolved_at_the_same_control_rate():
@@ -103,24 +113,12 @@ def test_contact_is_resolved_at_the_same_control_rate():
     assert (as_searched.sim.solver.mjw_model.geom_solref.numpy()[..., 0] > 0.005).all()
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
-def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(device):
-    def stop(share: float) -> None:
-        raise KeyboardInterrupt
-
-    cfg = dataclasses.replace(CFG, device=device, workers="2" if device == "cpu" else None)
-    with open_evaluator(cfg, build=Crosser) as evaluate:
-        with pytest.raises(KeyboardInterrupt):
-            evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
-        assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
-
-
 @pytest.mark.parametrize(
     ("how", "error", "reason"),
     [("build", ValueError, "does not fit"), ("raise", EvaluatorError, "broken"), ("die", EvaluatorError, "SIGKILL")],
 )
 def test_why_a_worker_ended_is_known(tmp_path, how, error, reason):
-    cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1", workers="2")
+    cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1")
     with pytest.raises(error, match=reason), open_evaluator(cfg, build=crossers.Failing) as evaluate:
         evaluate(GENES, SEEDS)
 
@@ -128,8 +126,8 @@ def test_why_a_worker_ended_is_known(tmp_path, how, error, reason):
 def test_a_worker_that_ended_in_between_is_heard_when_it_gets_the_next_lot():
     """It refuses its second lot while nobody listens: the third cannot be sent, and the reason is no death."""
     with open_evaluator(dataclasses.replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
-        for own in (slice(0, 2), slice(2, 4)):
-            evaluate.put(GENES[own], SEEDS[own])
+        for lot in (slice(0, 2), slice(2, 4)):
+            evaluate.put(GENES[lot], SEEDS[lot])
         assert same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
         end = time.monotonic() + 20
         with pytest.raises(ValueError, match="terrains of another kind"):
