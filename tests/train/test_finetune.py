@@ -21,7 +21,7 @@ from tests.builders import fresh_values
 from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor
-from train.cfg import LARGE, SPECIALIST, FinetuneCfg, RunCfg
+from train.cfg import FinetuneCfg, RunCfg
 from train.commands import Finetune
 from train.finetune import FineTuning, elites_of, finetune, train_specialist
 from train.ppo import training
@@ -274,9 +274,8 @@ def test_what_is_left_out_is_the_robots_own_recipe_and_on_a_gpu_of_the_papers_si
 
     cfg = FinetuneCfg.of(get_robot(robot))
     assert sizes(cfg) == paper
-    assert sizes(cfg, **SPECIALIST) == (8192, 2000, paper[2], 1000)
     given = replace(cfg, terrains=70, recipe=replace(cfg.recipe, swap_every=7))
-    assert sizes(given, **LARGE) == (8192, 70, 7, paper[3])
+    assert sizes(given, num_envs=8192) == (8192, 70, 7, paper[3])
     flags = Finetune.defaults(["--robot", robot])
     assert (flags.task, flags.ppo, flags.recipe) == (cfg.task, cfg.ppo, cfg.recipe)
     assert (cfg.task.rewards.termination, cfg.task.rewards.tracking_lin_vel) == (-200.0, tracking)

@@ -38,7 +38,7 @@ class World:
 
     def __init__(self, *worse: str) -> None:
         self.worse, self.stop_in = worse, ""
-        self.searched, self.trained, self.crossed = {}, {}, []
+        self.searched, self.trained = {}, {}
 
     def _work(self, run) -> bool:
         """Whether there is work to do in a run; Ctrl-C comes in the middle of ``stop_in``."""
@@ -75,7 +75,6 @@ class World:
     @contextmanager
     def open(self, cfg):
         def evaluate(terrains, seeds, progress=None):
-            self.crossed.append((cfg.policy, len(seeds)))
             arrive = "tune-" in cfg.policy and not any(f"/{name}/" in cfg.policy for name in self.worse)
             ends = np.full((len(seeds), cfg.num_replicas), Outcome.BASE_COLLISION, np.uint8)
             ends[:, 1::2] = Outcome.GOAL if arrive else Outcome.BASE_COLLISION
@@ -136,18 +135,7 @@ def test_rounds_from_end_to_end(place, hardened):
     assert all(row == {"base": 0.0, "round-1": 0.5, "round-2": 0.5} for row in goal.values())
 
 
-def test_a_finished_one_finds_all_of_it_and_goes_on_for_more_rounds(hardened):
-    first = hardened(World(), rounds=1)
-    world = World()
-    assert hardened(world, rounds=1) == first
-    assert not world.searched and not world.trained and not world.crossed
-    longer = hardened(world)
-    assert longer["rounds"][:2] == first["rounds"] and list(world.searched) == ["search-2"]
-    with pytest.raises(ValueError, match="rounds"):
-        hardened(World(), rounds=1)
-
-
-def test_stopped_it_comes_to_the_same(hardened, place):
+def test_stopped_it_comes_to_the_same_and_goes_on_for_more_rounds(hardened, place):
     expected = hardened(World(), rounds=1)
     (place / "run").rename(place / "whole")
     world = World()
@@ -158,6 +146,12 @@ def test_stopped_it_comes_to_the_same(hardened, place):
     assert sorted([*world.searched, *world.trained]) == ["search-0", "search-1", "tune-1"]  # nothing is done twice
     for key in ("rounds", "choices", "tables", "settings"):
         assert again[key] == expected[key], key
+    world = World()
+    longer = hardened(world)
+    assert longer["rounds"][:2] == again["rounds"]
+    assert (list(world.searched), list(world.trained)) == (["search-2"], ["tune-2"])
+    with pytest.raises(ValueError, match="rounds"):
+        hardened(World(), rounds=1)
 
 
 def test_a_training_that_makes_it_worse_is_not_kept(hardened, place):

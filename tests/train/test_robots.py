@@ -1,6 +1,5 @@
 """Training another robot: its own settings, on the command line too, its rewards, and a training that goes on."""
 
-import json
 from dataclasses import asdict
 
 import numpy as np
@@ -8,11 +7,7 @@ import pytest
 import torch
 import tyro
 
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
-from tests.train.conftest import CURRICULUM
-from train.base import train
-from train.cfg import RunCfg, TrainCfg
 from train.commands import Train
 from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
@@ -62,15 +57,3 @@ def test_falls_are_paid_for_and_clipped_nowhere(make_task):
     assert sums["dof_pos_limits"] <= 0.0 < sums["no_fly"]
     assert total == pytest.approx(sum(sums[name] for name in asdict(task.cfg.rewards)), rel=1e-4)
     assert sums["overflow"] == sums["invalid"] == 0
-
-
-def test_the_training_of_another_robot_is_saved_and_goes_on(tmp_path):
-    robot, run = get_robot("cassie"), tmp_path / "run"
-    task = TaskCfg.of(robot, curriculum=CURRICULUM)
-    for iterations in (1, 2):
-        train(robot, TrainCfg(num_envs=6, iterations=iterations, task=task, ppo=PPO), run, RunCfg(device="cpu"))
-    record = json.loads((run / "policy.train.json").read_text())
-    assert (record["robot"], record["iterations"]) == ("cassie", 2)
-    assert record["settings"]["task"]["rewards"]["termination"] == -200.0
-    policy = load_policy(run / "policy.pt", robot, "cpu")
-    assert policy(torch.randn(3, 169)).shape == (3, 12)

@@ -24,32 +24,21 @@ def robot(policy_file: Path = ROBOTS["anymal"].policy_file, scales=stand_in.SCAL
 def test_paper_has_the_papers_numbers():
     cfg = preset("paper", robot())
     assert (cfg.scheduler.emitters, cfg.scheduler.batch_size, cfg.replicas, cfg.iterations) == (10, 20, 20, 1000)
+    wide = preset("wide", robot())  # as many episodes
     assert cfg.episodes_per_iteration == 4000
-    assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
-
-
-def test_wide_has_as_many_episodes_and_small_fits_a_laptop():
-    wide, small = preset("wide", robot()), preset("small", robot())
     assert wide.episodes_per_iteration * wide.iterations == 4000 * 1000
-    assert (small.episodes_per_iteration, small.replicas) == (128, 4)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("iterations", 0), ("intervals", 100), ("seed", 1.5)],
-)
-def test_values_out_of_range_are_named(name, value):
-    with pytest.raises(ValueError, match=f"{name} must"):
-        dataclasses.replace(preset("paper", robot()), **{name: value})
+    assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("emitters", 0), ("method", "ppo"), ("method", "cma_me+cma_me"), ("learning_rate", 1.5),
-        ("disagree_share", 0.9), ("sigma0", float("nan")), ("sigma0", 1e30),  # its square is no float32
+        ("method", "ppo"),
+        ("method", "cma_me+cma_me"),
+        ("disagree_share", 0.9),
+        ("sigma0", 1e30),  # its square is no float32
     ],
-)  # fmt: skip
+)
 def test_values_of_the_scheduler_out_of_range_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name} must"):
         SchedulerCfg(**{name: value})
@@ -62,16 +51,9 @@ def test_settings_survive_json():
     assert "iterations" not in as_settings(cfg)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"scheduler": "wide"}, {"fitness": {}}, {"certified_by": []}],
-)
-def test_settings_of_something_else_are_refused_by_name(change):
-    settings = as_settings(preset("small", robot())) | change
-    with pytest.raises(ValueError, match=next(iter(change))):
-        from_settings(settings, 1)
-    with pytest.raises(ValueError, match="a search"):
-        from_settings({}, 1)
+def test_settings_of_something_else_are_refused_by_name():
+    with pytest.raises(ValueError, match="certified_by"):
+        from_settings(as_settings(preset("small", robot())) | {"certified_by": []}, 1)
 
 
 def test_differences_name_every_key():
