@@ -105,8 +105,8 @@ def test_flags_come_to_the_settings_of_the_run():
     }  # fmt: skip
     assert settings["scheduler"]["method"] == "map_elites" and settings["scheduler"]["emitters"] == 1
     assert archive("--resume", "a", *MORE, "2") == 0  # all of these are defaults now
-    found = read_archive("a")
-    assert (found.iterations, found.ratios.shape[1]) == (2, 3)
+    stored = read_archive("a")
+    assert (stored.iterations, stored.ratios.shape[1]) == (2, 3)
 
 
 def test_a_preset_has_its_own_defaults():

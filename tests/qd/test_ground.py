@@ -78,8 +78,8 @@ def test_a_minimal_terrain_may_be_a_patch(run):
     fresh = replace(fresh_values(archive), goal_rate=np.zeros(1))
     write_archive(run / "archive.npz", archive.corrected_by(fresh))
     compute = Compute(workers="1")
-    found = minimise(run, compute=compute, elite="0", how="greedy", open_evaluator=nobody_crosses_ice)
-    (entry,) = found.numbers["elites"]
+    minima = minimise(run, compute=compute, elite="0", how="greedy", open_evaluator=nobody_crosses_ice)
+    (entry,) = minima.numbers["elites"]
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])
     Export(run=run, minimal="all", formats=("npz",)).execute()

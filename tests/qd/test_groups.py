@@ -172,7 +172,7 @@ def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
     child[31], grandchild[31] = strangers[1, 31] - 0.5, strangers[1, 31] - 1.0  # the height of a bump
     genes = np.stack([*strangers, child, grandchild])
     first, second, third = heights_of(genes[[1, 4, 5]])
-    near = [float(np.sqrt(((one - other) ** 2).mean())) for one, other in ((first, second), (second, third))]
+    near = [float(np.sqrt(((heights - others) ** 2).mean())) for heights, others in ((first, second), (second, third))]
     assert max(near) < KIN_M < np.sqrt(((first - third) ** 2).mean())
     assert families_of(genes[[0, 5, 1, 2, 4, 3]], SUPER_GAUSSIAN).tolist() == [0, 1, 1, 2, 1, 3]
     assert families_of(genes[:0], SUPER_GAUSSIAN).tolist() == []

@@ -34,7 +34,7 @@ def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> N
         search.tell(evaluation_of(stand_in.evaluate(genes, seeds), cells, FITNESS), iteration)
 
 
-def told(cell, fitness, invalid=None) -> Evaluation:
+def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
     """An evaluation of terrains with the given cells and fitness."""
     cell = np.asarray(cell)
     rates = np.zeros(len(cell))
@@ -58,10 +58,10 @@ def test_asks_for_clipped_genes_of_every_emitter():
 def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     search = make_search()
     genes = search.ask()
-    search.tell(told([7, 7] + [9] * 10, [5.0, 1.0] + [0.0] * 10), 1)
+    search.tell(evaluation_with([7, 7] + [9] * 10, [5.0, 1.0] + [0.0] * 10), 1)
     # A threshold of 3, the mean of 5 and 1, would let 4 in.
     search.ask()
-    search.tell(told([7] * 12, [4.0] * 12), 2)
+    search.tell(evaluation_with([7] * 12, [4.0] * 12), 2)
     elites = search.elites()
     assert elites["cell"].tolist() == [7, 9]
     assert elites["fitness"].tolist() == [5.0, 0.0]
@@ -72,7 +72,7 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
 def test_an_invalid_terrain_is_never_an_elite():
     search = make_search()
     search.ask()
-    search.tell(told(np.arange(12), [FITNESS_FLOOR] * 6 + [1.0] * 6, invalid=[4] * 6 + [0] * 6), 1)
+    search.tell(evaluation_with(np.arange(12), [FITNESS_FLOOR] * 6 + [1.0] * 6, invalid=[4] * 6 + [0] * 6), 1)
     assert sorted(search.elites()["cell"].tolist()) == [6, 7, 8, 9, 10, 11]
 
 
@@ -99,7 +99,7 @@ def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_v
         assert genes.shape == (12, 64)
         assert np.abs(genes).max() <= 1.0
         assert len(np.unique(genes, axis=0)) == 12
-        search.tell(told([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
+        search.tell(evaluation_with([0] * 12, [FITNESS_FLOOR] * 12, invalid=[4] * 12), iteration)
     assert len(search.elites()["fitness"]) == 0
     advance(search, 3, 6)
     assert len(search.elites()["fitness"]) > 0
@@ -110,24 +110,24 @@ def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_t
     first = hard.ask()
     assert (np.abs(first[:, 7::8]) == 1.0).all()
     assert not (np.abs(uniform.ask()[:, 7::8]) == 1.0).any()
-    hard.tell(told([0] * 40, [1.0] * 40), 1)
+    hard.tell(evaluation_with([0] * 40, [1.0] * 40), 1)
     assert not np.isin(hard.ask(), first).all(axis=1).any()
 
 
 def test_map_elites_varies_its_elites():
     search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="map_elites", iso_sigma=0.0, line_sigma=0.0))
     first = search.ask()
-    search.tell(told(np.arange(12), np.arange(12.0)), 1)
+    search.tell(evaluation_with(np.arange(12), np.arange(12.0)), 1)
     assert all(any(np.array_equal(row, elite) for elite in first) for row in search.ask())
 
 
 def test_cma_me_is_judged_by_the_archive_it_fills():
     search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="cma_me"))
     search.ask()
-    search.tell(told(np.arange(12), [1.0] * 12), 1)
+    search.tell(evaluation_with(np.arange(12), [1.0] * 12), 1)
     before = [emitter.restarts for emitter in search.emitters]
     search.ask()
-    search.tell(told(np.arange(12), [0.5] * 12), 2)  # nothing new: both start again at an elite
+    search.tell(evaluation_with(np.arange(12), [0.5] * 12), 2)  # nothing new: both start again at an elite
     assert [emitter.restarts - old for emitter, old in zip(search.emitters, before, strict=True)] == [1, 1]
 
 

@@ -84,7 +84,7 @@ def test_seed_decides(tmp_path):
 
 
 def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path):
-    kept = [0, 1, 3, 5]  # without vel_y and stumble
+    columns = [0, 1, 3, 5]  # without vel_y and stumble
     fitness = CFG.fitness.of_penalties(("yaw_rate", "vel_x", "contact_force", "collision"))
     settings = {"fitness": fitness, "intervals": 5}
     archive = run(tmp_path / "whole", iterations=5, **settings)
@@ -99,7 +99,7 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     assert archive.ratios.sum(axis=1) == pytest.approx(np.ones(len(archive)))
     assert np.array_equal(archive.cells.cell_of(archive.ratios), archive.cell)
     # The stand-in's penalties are scale * 4 * hardness^3 of genes k, k + 6, ..., but for noise of 10 %.
-    hardness = np.stack([np.abs(archive.genes[:, k::6]).mean(axis=1) for k in kept], axis=1)
+    hardness = np.stack([np.abs(archive.genes[:, k::6]).mean(axis=1) for k in columns], axis=1)
     assert archive.penalty_mean == pytest.approx(4.0 * hardness**3, rel=0.1)
 
 

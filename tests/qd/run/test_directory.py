@@ -53,7 +53,7 @@ def test_what_a_run_was_asked_to_do_comes_back_with_all_its_sessions(tmp_path):
     assert run.read_cfg() == longer and search_seed(tmp_path) == 3
     config = run.read_config()
     assert config["command"] == "faultline archive"  # that of the beginning
-    assert [(one["command"], one["from_iteration"]) for one in config["sessions"]] == [
+    assert [(session["command"], session["from_iteration"]) for session in config["sessions"]] == [
         ("faultline archive", 0), ("faultline archive --resume", 2),
     ]  # fmt: skip
 

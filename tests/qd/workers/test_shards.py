@@ -38,11 +38,11 @@ def test_the_files_of_a_controller_travel(tmp_path, name):
     pytest.importorskip("ray")
     from qd.workers.ray_workers import PackedCode
 
-    here, there = tmp_path / "here", tmp_path / "there"
-    here.mkdir()
+    sent_from, sent_to = tmp_path / "sent_from", tmp_path / "sent_to"
+    sent_from.mkdir()
     content = {"model.pt": b"weights", "mine.py": b"x = 1"}
     for file, text in content.items():
-        (here / file).write_bytes(text)
-    assert PackedCode.of(name.format(here, here)).unpacked(there) == name.format(there, there)
-    sent = {file.name: file.read_bytes() for file in there.iterdir()}
+        (sent_from / file).write_bytes(text)
+    assert PackedCode.of(name.format(sent_from, sent_from)).unpacked(sent_to) == name.format(sent_to, sent_to)
+    sent = {file.name: file.read_bytes() for file in sent_to.iterdir()}
     assert sent == {file: text for file, text in content.items() if file in name}
