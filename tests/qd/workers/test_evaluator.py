@@ -148,7 +148,7 @@ def test_large_height_maps_go_in_while_results_come_out():
 
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
-    cfg = dataclasses.replace(CFG, policy=f"sleep:{tmp_path}:2", workers="2")
+    cfg = dataclasses.replace(CFG, policy=f"sleep:{tmp_path}:2")
     with open_evaluator(cfg, build=crossers.Failing) as evaluate:
         evaluate.put(GENES, SEEDS)
         began = time.monotonic()
