@@ -149,10 +149,10 @@ _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> Figure:
     """One terrain: its height map with the paths, its profile, and the penalties by place."""
-    figure = new_figure(9.5, 7.6)
+    figure = new_figure(9.5, 8.4)
     figure.suptitle(title)
-    top, profile, places = figure.subplots(3, 1, sharex=True, height_ratios=(3.2, 0.9, 1.1))
-    figure.colorbar(draw_map(top, crossed), ax=top, label="height [m]", shrink=0.85, pad=0.01)
+    top, profile, places = panels = figure.subplots(3, 1, sharex=True, height_ratios=(3.2, 0.9, 1.1))
+    figure.colorbar(draw_map(top, crossed), ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
     _draw_profile(profile, crossed)
     _draw_places(places, crossed, penalties)
     handles = _legend(crossed)
