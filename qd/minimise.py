@@ -38,7 +38,7 @@ _ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "go
 
 
 @dataclass(frozen=True, kw_only=True)
-class MinimalFound:
+class MinimalTerrains:
     """Minimal terrains of elites that are in an archive."""
 
     numbers: dict[str, Any]
@@ -85,7 +85,7 @@ def minimise(
     policy: str | None = None,
     space: str | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
-) -> MinimalFound | None:
+) -> MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
     Args:
@@ -141,7 +141,7 @@ def minimise(
         write_atomically(run / MINIMAL_FILE, npz_bytes(arrays))
         write_atomically(run / NUMBERS_FILE, to_json(content))
         save_figure(run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, terrain_space))
-    return MinimalFound(numbers=content, genes=genes)
+    return MinimalTerrains(numbers=content, genes=genes)
 
 
 def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[int]:
@@ -227,7 +227,7 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def read_minimal(folder: Path, archive: Archive) -> MinimalFound | None:
+def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
     """The minimal terrains of a run; None where nobody looked for them, or of none of the archive's elites.
 
     Args:
@@ -252,7 +252,7 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalFound | None:
     rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
     if not rows:
         return None
-    return MinimalFound(
+    return MinimalTerrains(
         numbers=numbers | {"elites": [entries[row] for row in rows]},
         genes={entries[row]["elite"]: genes[row] for row in rows},
     )

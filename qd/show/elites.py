@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
 from qd.fitness import FitnessCfg
-from qd.minimise import MinimalFound, read_minimal
+from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
 from qd.run.settings import SearchCfg, find_policy, suffix_of
 from sim.files.command import chosen_elites
@@ -102,7 +102,7 @@ class OpenedRun:
         """Where a file about a terrain goes, without its ending: into the run, or for a published one under runs/."""
         return folder_for(self.path, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
 
-    def minima(self) -> MinimalFound:
+    def minima(self) -> MinimalTerrains:
         """The minimal terrains of its elites."""
         minima = read_minimal(self.folder, self.archive)
         if minima is None:

@@ -9,7 +9,7 @@ from typing import Any
 from qd.archive import ARCHIVE_FILE, Archive
 from qd.evaluate.tables import read_tables
 from qd.groups import Elites, Modes, Ranking
-from qd.minimise import MinimalFound, read_minimal
+from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, Metrics, RunDirectory, folder_for
 from qd.run.settings import SearchCfg
 from qd.show.crossed import Crossed
@@ -39,7 +39,7 @@ class Material:
     origin: dict[str, Any]
     """Command, commit, device, versions, seed and date of the search, as far as they are known."""
     gpus: int | None
-    minimal: MinimalFound | None
+    minimal: MinimalTerrains | None
     tables: dict[str, Any] | None
     tables_file: Path
     """Where the tables are, or would be looked for."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from qd.archive import goal_rates
 from qd.judge import panel_of
-from qd.minimise import MinimalFound, read_minimal
+from qd.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
 from qd.show.view.plots import Axes, axes_of
 from qd.workers.evaluator import check_policy
@@ -32,7 +32,7 @@ class Show:
     """Episodes of each elite."""
     note: str = ""
     """Why there is no controller; empty if there is one."""
-    minima: MinimalFound | None = None
+    minima: MinimalTerrains | None = None
     """Minimal terrains of the elites, if there are some."""
     minimal: bool = False
     """Whether the first terrain is the elite's minimal one."""

@@ -10,7 +10,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.archive import read_archive
-from qd.minimise import MinimalFound
+from qd.minimise import MinimalTerrains
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.recorder import Report
@@ -217,7 +217,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
     genes[:8] = 0.0
     entry = {"elite": 0, "bumps": [1], "of": 8, "goal_rate": 0.1, "goal_interval": [0.03, 0.25], "cause": None,
              "margin_m": None}  # fmt: skip
-    minima = MinimalFound(numbers={"elites": [entry]}, genes={0: genes})
+    minima = MinimalTerrains(numbers={"elites": [entry]}, genes={0: genes})
     recordings = Recordings(show.robot, folder=tmp_path)
     recordings.keep(*worst_crossed)
     shown = Shown(dataclasses.replace(show, minima=minima), recordings)
