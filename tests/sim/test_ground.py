@@ -105,9 +105,9 @@ def test_ground_that_changes_nothing_gives_the_same_bits(anymal):
     genes, seeds, cfg = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32), CrossingCfg(max_duration_s=0.4)
     sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu", "cfg": cfg}
     without = Rollout(anymal, anymal.policy_file, **sizes).evaluate(genes, seeds)
-    found = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
-    np.testing.assert_array_equal(found.penalties, without.penalties)
-    np.testing.assert_array_equal(found.final_position, without.final_position)
+    plain = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
+    np.testing.assert_array_equal(plain.penalties, without.penalties)
+    np.testing.assert_array_equal(plain.final_position, without.final_position)
 
 
 def test_a_bank_takes_maps_only_where_it_has_room_for_them():

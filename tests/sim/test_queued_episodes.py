@@ -93,9 +93,9 @@ def test_lots_run_into_each_other(anymal, alone):
         assert 0.0 <= result.idle_share <= 1.0
     # No step is counted twice: what all took together is what was made, of which episodes to the end of their last
     # control step were busy.
-    used = sum(np.ceil(one.duration_s / anymal.control_dt - 1e-3).sum() for one in results) * anymal.decimation
-    assert sum(one.busy_steps for one in results) == used
-    robot_steps = sum(one.robot_steps for one in results)
+    used = sum(np.ceil(result.duration_s / anymal.control_dt - 1e-3).sum() for result in results) * anymal.decimation
+    assert sum(result.busy_steps for result in results) == used
+    robot_steps = sum(result.robot_steps for result in results)
     assert 0.5 * robot_steps < used <= robot_steps
     with pytest.raises(RuntimeError):
         rollout.take()
@@ -114,7 +114,9 @@ def test_lots_in_which_robots_go_on_after_the_goal(anymal):
     for rows, result in zip(lots, results, strict=True):
         check_same(expected, result, rows)
     # A robot at the goal stands there and is paid: it does not wait. It has more steps than its crossing.
-    assert sum(one.busy_steps for one in results) * anymal.physics_dt > sum(one.duration_s.sum() for one in results)
+    assert sum(result.busy_steps for result in results) * anymal.physics_dt > sum(
+        result.duration_s.sum() for result in results
+    )
 
 
 @ONLY_ANYMAL

@@ -29,14 +29,14 @@ def test_no_episode_counts_where_more_than_a_quarter_are_invalid():
 
 def test_bias_and_distance_are_of_terrains_that_both_have():
     # Success .75 and 0 against 1 and .25: both .25 lower. Goal .5 and 0 against .25 and .25: once more, once less.
-    found = agreement(OURS, THEIRS, seed=0)
-    assert found["terrains"] == 2
-    assert found["success_bias"] == -0.25 and found["success_difference"] == 0.25
-    assert found["success_bias_interval"] == pytest.approx([-0.25, -0.25])
-    assert found["goal_bias"] == 0.0 and found["goal_difference"] == 0.25
-    assert found["goal_bias_interval"] == pytest.approx([-0.25, 0.25])
+    numbers = agreement(OURS, THEIRS, seed=0)
+    assert numbers["terrains"] == 2
+    assert numbers["success_bias"] == -0.25 and numbers["success_difference"] == 0.25
+    assert numbers["success_bias_interval"] == pytest.approx([-0.25, -0.25])
+    assert numbers["goal_bias"] == 0.0 and numbers["goal_difference"] == 0.25
+    assert numbers["goal_bias_interval"] == pytest.approx([-0.25, 0.25])
 
 
 def test_without_terrains_nothing_is_said():
-    found = agreement(OURS[2:], THEIRS[2:], seed=0)
-    assert found.pop("terrains") == 0 and set(found.values()) == {None}
+    numbers = agreement(OURS[2:], THEIRS[2:], seed=0)
+    assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}

@@ -33,11 +33,11 @@ def dose_of(name, *values, **others):
 @pytest.mark.parametrize("name", IN_RANGE)
 def test_an_obstacle_is_the_element_of_a_course(name):
     genes, value = IN_RANGE[name]
-    (found,) = dose_of(name, *value.values()).terrains(1, np.random.default_rng(0))
+    (heights,) = dose_of(name, *value.values()).terrains(1, np.random.default_rng(0))
     expected = oracle.heights(course([*genes[:1], *element("flat", lead=4)[1:2], *genes[2:]])[0])
     # There it begins behind 4 cells of flat ground, at column 84; here at column 100.
-    np.testing.assert_allclose(found[:, 16:], expected[:, : 321 - 16], atol=1e-5)
-    assert not found[:, :17].any()
+    np.testing.assert_allclose(heights[:, 16:], expected[:, : 321 - 16], atol=1e-5)
+    assert not heights[:, :17].any()
 
 
 def test_sizes_go_beyond_what_the_space_has():

@@ -63,10 +63,10 @@ def test_a_patch_is_a_part_that_is_absent_where_it_changes_nothing():
 def test_words_say_what_lies_beside_the_way():
     genes = np.zeros(128)
     genes[64:] = np.repeat([1.0, -1.0, 0.0, 1.0, -1.0, 1.0, -1.0, -1.0], 8)
-    told = BOTH.describe(genes).splitlines()[-2:]
+    lines = BOTH.describe(genes).splitlines()[-2:]
     right, left = " ".join(["0.15"] * 8), " ".join(["0.57"] * 8)
-    assert told[0] == f"friction every 2 m along the way: left of the way {left}, right of it {right}"
-    assert "left of the way 0.00 0.00" in told[1] and "right of it 0.06 0.06" in told[1]
+    assert lines[0] == f"friction every 2 m along the way: left of the way {left}, right of it {right}"
+    assert "left of the way 0.00 0.00" in lines[1] and "right of it 0.06 0.06" in lines[1]
 
 
 def test_an_element_of_a_course_has_its_ground_behind_it():
@@ -104,9 +104,9 @@ def test_ground_is_named_by_the_space(tmp_path):
     assert load_space("super_gaussian+softness+friction") == BOTH
     with pytest.raises(ValueError, match="ice"):
         load_space("course+ice")
-    own = write_ridges(tmp_path)
-    space = load_space(f"{own}+friction")
-    assert (space.num_genes, space.name) == (3 + 32, f"{own}+friction")
+    ridges = write_ridges(tmp_path)
+    space = load_space(f"{ridges}+friction")
+    assert (space.num_genes, space.name) == (3 + 32, f"{ridges}+friction")
     assert get_space(space.name, space.sha256).num_genes == 35
     assert identity(space.name, space.sha256) == f"{space.sha256}+friction" == identity("x.py:X+friction", space.sha256)
     assert identity("course+friction", None) == "course+friction"

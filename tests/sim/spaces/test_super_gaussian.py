@@ -54,10 +54,10 @@ def test_clip_keeps_the_inside_and_cuts_the_outside():
 
 def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
     genes = SUPER_GAUSSIAN.hard_random(2, 5)
-    kept = SuperGaussian(num_bumps=5)
+    five = SuperGaussian(num_bumps=5)
     without = SUPER_GAUSSIAN.without(genes, [0, 3, 7])
     others = genes.reshape(2, 8, 8)[:, [1, 2, 4, 5, 6]].reshape(2, 40)
-    np.testing.assert_array_equal(heights_of(without), heights_of(others, kept))
+    np.testing.assert_array_equal(heights_of(without), heights_of(others, five))
     assert not heights_of(SUPER_GAUSSIAN.without(genes, range(8))).any()
     np.testing.assert_array_equal(SUPER_GAUSSIAN.without(genes, []), genes)
 
