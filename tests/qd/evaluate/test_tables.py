@@ -9,7 +9,6 @@ import pytest
 from qd.evaluate.figures import draw_tables
 from qd.evaluate.labels import FATES, MEASURES
 from qd.evaluate.measures import measure
-from qd.evaluate.paper import published
 from qd.evaluate.sets import Certificates
 from qd.evaluate.show import show_tables
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
@@ -151,12 +150,6 @@ def test_one_training_is_not_several(tmp_path):
     for controllers in bad:
         with pytest.raises(ValueError, match="@2"):
             check_seeds(controllers)
-
-
-def test_the_papers_numbers():
-    anymal, cassie = published("anymal"), published("cassie")
-    assert anymal["success"]["generated"] == {"C-HC": 0.598, "C-HR": 0.876, "C-G": 0.914}
-    assert cassie["reward"]["hand_crafted"] == {"C-HC": 32.7, "C-HR": 29.7, "C-G": 32.9}
 
 
 def test_tables_are_read_as_they_were_written(certified, report, anymal, tmp_path):
