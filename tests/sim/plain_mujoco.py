@@ -31,11 +31,3 @@ def run(model: mujoco.MjModel, joint_q, duration_s: float):
     for _ in range(round(duration_s / model.opt.timestep)):
         mujoco.mj_step(model, data)
     return np.concatenate([data.qpos[:3], data.qpos[[4, 5, 6, 3]], data.qpos[7:]])
-
-
-def geom_positions(model: mujoco.MjModel, joint_q, names):
-    """World positions of geoms, shape (num, 3)."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = to_c(joint_q)
-    mujoco.mj_forward(model, data)
-    return np.array([data.geom_xpos[model.geom(name).id] for name in names])

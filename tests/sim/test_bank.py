@@ -51,8 +51,3 @@ def test_wrong_genes_are_named(device, genes):
 def test_wrong_heights_are_named(device, heights):
     with pytest.raises(ValueError, match="heights"):
         TerrainBank(2, device=device).set_heights(heights)
-
-
-def test_an_empty_bank_is_refused(device):
-    with pytest.raises(ValueError, match="terrain"):
-        TerrainBank(0, device=device)

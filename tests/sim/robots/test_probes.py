@@ -149,15 +149,6 @@ def test_a_mesh_without_volume_is_refused():
         hull_probes(CORNERS * [1, 1, 0])
 
 
-def mesh_body(folder, vertices, mass=2.0):
-    """A free body whose only geom is a mesh, as a robot of one body."""
-    robot = free_body(folder, 'type="mesh" mesh="shape"', mass=mass)
-    points = " ".join(f"{value:.9f}" for value in np.ravel(vertices))
-    asset = f'<asset><mesh name="shape" vertex="{points}"/></asset><worldbody>'
-    robot.model_file.write_text(robot.model_file.read_text().replace("<worldbody>", asset))
-    return robot
-
-
 def test_no_edge_slips_between_the_probes(device, tmp_path):
     # Ridges of one node, as sharp as the grid makes them, under a lying plate at twelve places: a ridge enters its hull
     # by no more than the tolerance and what the contacts give.
@@ -165,7 +156,11 @@ def test_no_edge_slips_between_the_probes(device, tmp_path):
     height, num = 0.3, 12
     grid = np.zeros((161, 321), np.float32)
     grid[:, [158, 162]] = height
-    sim = simulate(mesh_body(tmp_path, plate, mass=1.0), [grid] * num, device)
+    robot = free_body(tmp_path, 'type="mesh" mesh="shape"', mass=1.0)
+    points = " ".join(f"{value:.9f}" for value in np.ravel(plate))
+    asset = f'<asset><mesh name="shape" vertex="{points}"/></asset><worldbody>'
+    robot.model_file.write_text(robot.model_file.read_text().replace("<worldbody>", asset))
+    sim = simulate(robot, [grid] * num, device)
     q = lying(num, 8, 4, height + 0.012)
     q[:, 0] += np.linspace(-0.02, 0.02, num)
     put(sim, q)

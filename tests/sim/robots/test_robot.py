@@ -11,8 +11,7 @@ from kernels.penalties import BASE, FOOT, LIMB
 from sim.files.records import robot_identity
 from sim.robots.find import get_robot
 from sim.robots.model import build_robot, leaf_name
-from tests.sim import plain_mujoco
-from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE, lying
+from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE
 
 
 @pytest.fixture(scope="module")
@@ -96,8 +95,10 @@ def test_cassies_published_limits_and_frames(c_model, builder):
 
 
 def test_the_default_pose_is_symmetric(robot, c_model):
-    q = np.concatenate([lying(1, 0, 0, robot.default_base_height)[0], robot.default_joint_pos])
-    feet = dict(zip(robot.foot_geoms, plain_mujoco.geom_positions(c_model, q, robot.foot_geoms), strict=True))
+    data = mujoco.MjData(c_model)
+    data.qpos[:] = [0, 0, robot.default_base_height, 1, 0, 0, 0, *robot.default_joint_pos]
+    mujoco.mj_forward(c_model, data)
+    feet = {name: data.geom(name).xpos for name in robot.foot_geoms}
     pairs = {"anymal": [("LF", "RF"), ("LH", "RH")], "cassie": [("left", "right")]}[robot.name]
     foot = {"anymal": "FOOT", "cassie": "toe"}[robot.name]
     for left, right in pairs:

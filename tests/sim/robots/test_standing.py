@@ -29,15 +29,10 @@ def inclines():
     return np.stack([slope(np.radians(a), np.radians(b)) for a in (0, 5) for b in (0, -8, 5, 8)])
 
 
-@pytest.fixture(scope="module")
-def eight_single_stepper(eight):
-    """Steps the eight robots by one physics step at a time."""
-    return Stepper(eight, steps=1)
-
-
-def test_contact_forces_are_what_changes_the_momentum(eight, eight_single_stepper, robot):
+def test_contact_forces_are_what_changes_the_momentum(eight, robot):
     # Whatever a robot does, landing, sliding or going over: the ground's impulse less that of its weight is the change
     # of its momentum. Forces are those at the beginning of a step, so it is not exact.
+    stepper = Stepper(eight, steps=1)  # makes steps of its own
     eight.bank.set_heights(inclines())
     q, qd = standing(robot), np.zeros(eight.joint_qd.shape)
     q[:, 2] += 0.08
@@ -50,7 +45,7 @@ def test_contact_forces_are_what_changes_the_momentum(eight, eight_single_steppe
         return (masses * np.array(eight._state.body_qd.numpy()).reshape(8, -1, 6)[:, :, :3]).sum(1)
 
     before, impulse, duration_s = momentum(), np.zeros((8, 3)), 1.0
-    eight_single_stepper.run(
+    stepper.run(
         duration_s, lambda: np.add(impulse, PHYSICS_DT * np.array(eight.geom_force.numpy()).sum(1), out=impulse)
     )
     weight = masses.sum(1) * GRAVITY * duration_s
