@@ -20,21 +20,8 @@ pytestmark = [
 def address(tmp_path_factory, published):
     """Of a viewer of the published archive, with one controller under two names."""
     port = free_port()
-    cache = str(tmp_path_factory.mktemp("cache"))
-    run = published / "anymal" / "archive"
-    flags = [
-        "--run",
-        str(run),
-        "--elite",
-        "0",
-        "--port",
-        str(port),
-        "--cache",
-        cache,
-        "--policies",
-        "base=shipped",
-        "C-G=shipped",
-    ]
+    cache, run = tmp_path_factory.mktemp("cache"), published / "anymal" / "archive"
+    flags = f"--run {run} --elite 0 --port {port} --cache {cache} --policies base=shipped C-G=shipped".split()
     process, lines = serve(view_command(*flags))
     assert process.poll() is None, "".join(lines)
     yield f"http://127.0.0.1:{port}/"
