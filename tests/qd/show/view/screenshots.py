@@ -7,7 +7,6 @@ not there yet. Pictures are JPEGs of docs/pictures.
 import argparse
 import io
 import itertools
-import signal
 from pathlib import Path
 
 from PIL import Image
@@ -18,9 +17,8 @@ from qd.show.recordings import Recordings, on_elite
 from qd.show.report.report import write_report
 from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
 from sim.recording.renderer import Renderer
-from tests.builders import free_port
 from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
-from tests.qd.show.view.visitor import ROOT, serve, view_command
+from tests.qd.show.view.visitor import ROOT, serve
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDE, NARROW = (1400, 900), (390, 844)
@@ -45,12 +43,11 @@ def take(page, name: str) -> None:
 
 def viewer_pictures(browser, address: str, elite: int) -> None:
     """The viewer at a desk, along with the robot, with one failure mode listed, and on a phone."""
-    query = f"?elite={elite}&episode=1"
 
-    def opened(size, more: str = ""):
+    def opened(size):
         page = browser.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(LIMIT_MS)
-        page.goto(f"{address}{query}{more}")
+        page.goto(f"{address}?elite={elite}&episode=1")
         see(page, "^Episode 1: ")
         page.wait_for_timeout(SETTLE_MS)
         return page
@@ -75,8 +72,6 @@ def report_picture(browser, file: Path) -> None:
     """The top of a report."""
     page = browser.new_page(viewport={"width": WIDE[0], "height": WIDE[1]})
     page.goto(file.absolute().as_uri())
-    height = page.evaluate("document.documentElement.scrollHeight")
-    print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, {height:,} pixels high")
     take(page, "report")
     page.close()
 
@@ -106,16 +101,10 @@ def main() -> None:
     report = args.report if args.report.exists() else write_report(args.run, out=args.report, device="cpu")
     opened_run = open_run(None, args.run)
     elite = rank(opened_run.archive, opened_run.space).worst(1)[0] if args.elite is None else args.elite
-    port = free_port()
-    process, _ = serve(view_command("--run", str(args.run), "--port", str(port)))
-    try:
-        with open_chromium() as browser:
-            viewer_pictures(browser, f"http://127.0.0.1:{port}/", elite)
-            report_picture(browser, report)
+    with serve("--run", str(args.run)) as (address, _), open_chromium() as browser:
+        viewer_pictures(browser, address, elite)
+        report_picture(browser, report)
         film_picture(args.run, elite)
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """The page in a real browser: chromium without a screen, driven by playwright."""
 
 import re
-import signal
 
 import pytest
 
-from tests.builders import free_port
 from tests.qd.show.view.browser import BROWSER, LIMIT_MS, click_another, open_chromium, said, see, wait_until
-from tests.qd.show.view.visitor import serve, view_command
+from tests.qd.show.view.visitor import serve
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 pytestmark = [
@@ -19,15 +17,10 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def address(tmp_path_factory, published):
     """Of a viewer of the published archive, with one controller under two names."""
-    port = free_port()
     cache, run = tmp_path_factory.mktemp("cache"), published / "anymal" / "archive"
-    flags = f"--run {run} --elite 0 --port {port} --cache {cache} --policies base=shipped C-G=shipped".split()
-    process, lines = serve(view_command(*flags))
-    assert process.poll() is None, "".join(lines)
-    yield f"http://127.0.0.1:{port}/"
-    process.send_signal(signal.SIGINT)
-    rest = process.communicate(timeout=60)[0]
-    assert process.returncode == 0 and "Traceback" not in rest, rest
+    flags = f"--run {run} --elite 0 --cache {cache} --policies base=shipped C-G=shipped"
+    with serve(*flags.split()) as (address, _):
+        yield address
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,10 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 
 import msgspec
@@ -13,27 +16,29 @@ import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from tests.builders import free_port
+
 WIDTH, HEIGHT = 1400, 900
 ROOT = Path(__file__).parents[4]
 
 
-def view_command(*flags: str) -> list[str]:
-    return [sys.executable, "-m", "faultline", "view", *flags]
-
-
-def serve(command: list[str]) -> tuple[subprocess.Popen[str], list[str]]:
-    """The process of a viewer that serves its page, and what it has printed until then."""
+@contextmanager
+def serve(*flags: str) -> Iterator[tuple[str, str]]:
+    """Address of a viewer that serves its page, and what it has printed until then; Ctrl-C must end it well."""
+    port = free_port()
     process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        [sys.executable, "-m", "faultline", "view", "--port", str(port), *flags], cwd=ROOT, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background ignores it
     )  # fmt: skip
     assert process.stdout is not None
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if line.startswith("Open "):
-            break
-    return process, lines
+    lines = list(takewhile(lambda line: not line.startswith("Open "), process.stdout))
+    try:
+        yield f"http://127.0.0.1:{port}/", "".join(lines)
+    finally:
+        process.send_signal(signal.SIGINT)
+        rest = process.communicate(timeout=180)[0]
+    assert process.returncode == 0 and "Traceback" not in rest, [*lines, rest]
 
 
 class Visitor:
