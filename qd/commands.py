@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, command_line, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -114,7 +114,8 @@ class Archive(ControllerFlags, WorkerFlags):
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         search(cfg, path, compute, robot=robot, policy=policy)
         if cfg.preset == "small":
-            print(f"Preset small judges nothing: `faultline judge --run {path}` says which elites are faults.")
+            again = command_line("judge", run=path, robot=self.robot, policy=self.policy, space=self.space)
+            print(f"Preset small judges nothing: `{again}` says which elites are faults.")
         else:
             judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
 

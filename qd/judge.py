@@ -367,6 +367,7 @@ def judge(
                 families = families_of(archive.genes, get_space(search.cfg.space, search.cfg.space_sha256))
             origin = origin_of(compute.device, fresh_seed, compute.workers) | identity(search.robot, search.policy)
             _write(archive, families, search, certifiers, {stage: origin})
+    print(f"{run}: {len(archive):,} elites, of which {archive.failing.sum():,} fail by their fresh episodes.")
     for line in fault_words(archive):
         print(line)
     return archive

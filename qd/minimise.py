@@ -130,6 +130,8 @@ def minimise(
             entry = _entry(archive, number, cases[number], minimal, terrain_space, half_width)
             entries[number] = entry | {"verdict": verdict_of(elites, place), **judgement(elites, place)}
             genes[number] = elites.genes[place]
+        if not numbers:
+            print(f"{run}: none of {len(archive):,} elites fails.")
         if not entries:
             return None
         ordered = [entries[number] for number in sorted(entries)]
@@ -141,7 +143,11 @@ def minimise(
         write_atomically(run / MINIMAL_FILE, npz_bytes(arrays))
         write_atomically(run / NUMBERS_FILE, to_json(content))
         save_figure(run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, terrain_space))
-    return MinimalTerrains(numbers=content, genes=genes)
+    found = MinimalTerrains(numbers=content, genes=genes)
+    for number in minima:
+        print(f"Elite {number}: {found.words(number)}.")
+    print(f"Numbers: {run / NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
+    return found
 
 
 def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[int]:

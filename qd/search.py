@@ -29,12 +29,12 @@ from qd.workers.evaluator import (
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
-from sim.files.command import Interrupted
-from sim.policy.spec import spec_of
+from sim.files.command import Interrupted, command_line
+from sim.policy.spec import ControllerSpec, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.registry import get_space
+from sim.spaces.registry import get_space, is_own
 
 _MOST_SAMPLED = 200  # elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)
 _SAMPLE_STREAM = 3
@@ -96,12 +96,23 @@ def search(
                     with ProgressBar(cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
             except KeyboardInterrupt:
-                raise Interrupted(f"Stopped; finished iterations are saved: go on with --resume {path}") from None
+                again = _command_to_resume(path, robot, policy, space.name)
+                raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
         archive = archive_of(cfg, scheduler, len(metrics))
         if (stored := _written_archive(run, archive)) is not None:
             return stored
         _write_results(run, archive, metrics)
     return archive
+
+
+def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str) -> str:
+    """The command that goes on with a search; code that it needs is named."""
+    own = {
+        "robot": robot.spec if robot.settings_file else None,
+        "policy": policy if ControllerSpec.parse(policy).runs_code else None,
+        "space": space if is_own(space) else None,
+    }
+    return command_line("archive", resume=path, **own)
 
 
 def _run_iterations(

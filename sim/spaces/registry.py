@@ -59,7 +59,10 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
 
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
     if not is_own(name):
-        raise ValueError(f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS")
+        raise ValueError(
+            f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
+            "+friction, +softness or both"
+        )
     for space in _loaded:
         if space.name == name if sha256 is None else space.sha256 == sha256:
             return space

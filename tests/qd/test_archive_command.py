@@ -147,6 +147,12 @@ def test_a_controller_may_move_but_not_change(capsys):
     assert archive("--resume", "a", *MORE, "3") == 0
 
 
+def test_the_command_that_comes_next_can_be_typed(capsys):
+    fine = f"{__name__}:fine_policy"
+    assert archive(*TINY, "--policy", fine, "--run-dir", "a b") == 0
+    assert f"`faultline judge --run 'a b' --policy {fine}`" in capsys.readouterr().out
+
+
 def test_code_runs_only_if_the_command_line_names_it(capsys):
     fine = f"{__name__}:fine_policy"
     assert archive(*TINY, "--policy", fine, "--run-dir", "a") == 0

@@ -140,10 +140,12 @@ def numbers_in(path):
     return json.loads((path / "archive.json").read_text())
 
 
-def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):
+def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path, capsys):
     path, robots = Path(shutil.copytree(made / "found", tmp_path / "run")), Robots(result_of)
     searched = read_archive(path)
     archive = judged(path, robots, stages=("fresh",))
+    said = f"{len(archive)} elites, of which {archive.failing.sum()} fail by their fresh episodes."
+    assert said in capsys.readouterr().out
     assert archive.fresh.episodes.tolist() == [40] * len(searched) == [40] * len(robots.crossed)
     assert sorted(archive.cell.tolist()) == sorted(searched.cell.tolist())
     assert (np.diff(archive.fresh.fitness) <= 0).all() and (np.diff(archive.fitness) > 0).any()

@@ -48,8 +48,9 @@ def minimised(path, elites, robots=None, **changes):
     return minimise(path, compute=Compute(workers="1"), elite=elite, open_evaluator=robots or Robots(fails), **changes)
 
 
-def test_minimal_terrains_from_end_to_end(path, elites):
+def test_minimal_terrains_from_end_to_end(path, elites, capsys):
     minima = minimised(path, elites)
+    assert f"Elite {elites[0]}: 1 of 8 parts" in capsys.readouterr().out
     numbers = json.loads((path / "minimal.json").read_text())
     assert numbers == minima.numbers
     assert numbers["seed"] == 3 and numbers["robot"] == "anymal" and numbers["space"] == "super_gaussian"
