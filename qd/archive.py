@@ -304,3 +304,5 @@ def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
         is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties")
         if array.dtype.kind not in ("U" if is_text else "bif"):
             raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")
+        if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite")

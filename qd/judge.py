@@ -27,7 +27,15 @@ from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fault_words, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
 from qd.groups import families_of
-from qd.run.directory import CONFIG_FILE, METRICS_FILE, RESULTS, SUMMARY_FILE, RunDirectory, claimed
+from qd.run.directory import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    RESULTS,
+    SUMMARY_FILE,
+    RunDirectory,
+    check_space,
+    claimed,
+)
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
@@ -139,12 +147,14 @@ class Search:
 
     def read_archive(self) -> Archive:
         """Its archive, which must be of the settings beside it."""
-        archive, fitness = read_archive(self.run), self.cfg.fitness
-        if (archive.robot, archive.penalties, archive.scales) != (self.cfg.robot, fitness.penalties, fitness.scales):
+        archive, cfg = read_archive(self.run), self.cfg
+        of_archive = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
+        if of_archive != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
             raise ValueError(
-                f"{self.run / ARCHIVE_FILE} must have robot, penalties and scales of {CONFIG_FILE} beside it, got "
-                f"{archive.robot}, {archive.penalties} and {archive.scales}: put back the one that is not this run's"
+                f"{self.run / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
+                f"{', '.join(map(str, of_archive))}: put back the one that is not this run's"
             )
+        check_space(archive, None)
         return archive
 
 

@@ -93,7 +93,11 @@ def check_space(archive: Archive, named: str | None) -> None:
     """Refuses an archive whose terrain space is not at hand, once the one that the command line names is loaded."""
     if named is not None:
         load_space(named)
-    get_space(archive.space, archive.space_sha256)
+    expected, got = get_space(archive.space, archive.space_sha256).num_genes, archive.genes.shape[1]
+    if got != expected:
+        raise ValueError(
+            f"the archive must have {expected} genes a terrain of {archive.space}, got {got}: put a copy of it back"
+        )
 
 
 def folder_for(run: Path, robot: str) -> Path:

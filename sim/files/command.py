@@ -4,6 +4,8 @@ A command is a frozen dataclass: its docstring is its help, its fields are its f
 module loads quickly; what takes seconds to import (torch, warp, newton, pyribs) is imported inside ``execute``.
 """
 
+import contextlib
+import io
 import os
 import shlex
 import signal
@@ -117,7 +119,7 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         defaults = {"default": cls.defaults(argv)} if hasattr(cls, "defaults") else {}
-        command = tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
+        command = _parse(cls, argv, name, defaults)
         check(command)
         status = command.execute()
         return status if isinstance(status, int) else 0
@@ -129,6 +131,22 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
+    """The command with its flags; what tyro says of wrong ones in a box is an error of one line."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
+    except SystemExit as stop:
+        if not stop.code:  # it was asked for help
+            raise
+        lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in said.getvalue().splitlines()]
+        _title, *words = [line for line in lines if line.strip("-")]
+        is_help = (line.startswith(("Argument helptext", "For full helptext")) for line in words)
+        end = next((place for place, found in enumerate(is_help) if found), len(words))
+        raise UserError(f"{' '.join(words[:end]).rstrip('.')}; `faultline {name} --help` tells all flags") from None
 
 
 def peek(argv: Sequence[str], flag: str) -> str | None:

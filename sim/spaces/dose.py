@@ -3,6 +3,8 @@
 An obstacle is an element of a course (:mod:`kernels.course`) of any size, within the ranges of its space or beyond.
 """
 
+import contextlib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -263,7 +265,7 @@ def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
 
 
 def _number(text: str, word: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None
+    with contextlib.suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}")

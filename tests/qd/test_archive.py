@@ -96,6 +96,7 @@ def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
         ("certifier_outcomes", np.zeros((5, 1, 4), int)),
         ("robot", np.array(["anymal"])),
         ("fitness", np.array(list("abcde"))),
+        ("fitness", np.full(5, np.nan)),
         ("penalties", np.ones(2)),
     ],
 )

@@ -60,6 +60,9 @@ def test_errors_become_one_line_and_an_exit_status(capsys, how):
 def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsys):
     assert (run(), run("--status", "1")) == (0, 1)
     assert run("--status", "-1") == 2 and "status" in capsys.readouterr().err
+    assert run("--status", "x") == run("--nobody") == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and "--status" in lines[0] and "--nobody" in lines[1]
     with pytest.raises(SystemExit):
         run("--help")
     assert "usage: faultline toy" in capsys.readouterr().out
