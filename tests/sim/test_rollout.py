@@ -199,7 +199,7 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
     columns = [PENALTIES.index(name) for name in robot.penalties]
     tolerance = {"rtol": 1e-3, "atol": 1e-4} if device.startswith("cuda") else {"rtol": 1e-4, "atol": 1e-6}
     np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], **tolerance)
-    assert (sums[:, :3] > 0.0003).all()  # far above the tolerance
+    assert (sums[:, :3] > 0.0002).all()  # above the tolerance, on every device
     assert sums[2:, 5].min() > 0  # the base's touch itself is counted
 
 
