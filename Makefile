@@ -73,10 +73,10 @@ view: setup ## Show an archive in the browser
 bench: setup ## Time every kernel against torch and against the device's ceiling
 	$(BIN)/python -m tests.bench $(if $(ROBOT),--robot $(call quoted,$(ROBOT))) $(ARGS)
 
-test: setup ## Run the quick tests: about five minutes on two cores
+test: setup ## Run the quick tests: about three minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray' $(ARGS)
 
-test-all: setup ## Run all tests: about twenty minutes on two cores
+test-all: setup ## Run all tests: about seven minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) $(ARGS)
 
 test-gpu: setup ## Run on a GPU (FAULTLINE_DEVICE, default cuda:0) what can run there
