@@ -13,27 +13,37 @@ _TEMPORARY = ".tmp"
 _PROBE = ".write-test"
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replaces a file in one step that survives a kill and a power cut; after an OSError the old file is whole."""
-    temporary = path.with_name(f".{path.name}{_TEMPORARY}")  # the next write overwrites what a kill leaves behind
+@contextlib.contextmanager
+def explain_failed_write(path: Path) -> Iterator[None]:
+    """Has an OSError of writing a file say which file it is and what helps."""
     try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # or the renaming may be lost
-        finally:
-            os.close(folder)
+        yield
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
         raise OSError(
             f"{path} cannot be written: {error.strerror or error}: make room there or give another place; what was "
             "saved before is whole"
         ) from error
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replaces a file in one step that survives a kill and a power cut; after an OSError the old file is whole."""
+    temporary = path.with_name(f".{path.name}{_TEMPORARY}")  # the next write overwrites what a kill leaves behind
+    with explain_failed_write(path):
+        try:
+            with temporary.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)  # or the renaming may be lost
+            finally:
+                os.close(folder)
+        except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
 
 
 def is_leftover(path: Path) -> bool:

@@ -11,6 +11,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from kernels.rewards import REWARDS
 from qd.run.progress import clock
+from sim.files.atomic import explain_failed_write
 from sim.files.intervals import value_words
 from train.ppo.learner import Iteration, Learner
 
@@ -152,11 +153,8 @@ def _scalars_of(row: dict[str, Any]) -> dict[str, float]:
 def _write_event(file: Path, event: Event) -> None:
     """Adds to TensorBoard's file. Its own writer works in a thread, which dies with a traceback on a full disk."""
     event.wall_time = time.time()
-    try:
-        with file.open("ab") as opened:
-            RecordWriter(opened).write(event.SerializeToString())
-    except OSError as error:
-        raise OSError(f"{file} cannot be written: {error.strerror}: make room there or name another place") from error
+    with explain_failed_write(file), file.open("ab") as opened:
+        RecordWriter(opened).write(event.SerializeToString())
 
 
 def _rounded(value: Any) -> Any:
