@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.show.figures import label_of, look_of
+from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
 from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
@@ -121,6 +122,46 @@ def crossed_of(recording: Recording, penalties: tuple[str, ...], scales: tuple[f
         scales=np.asarray(scales, dtype=np.float64),
         rates={label: Rate(int(hit.sum()), len(chosen)) for label, hit in hits.items()},
     )
+
+
+_STUCK = 0.3  # a robot that gets stuck is stuck once it is so near to where it ends [m]
+
+
+def moment_of_failure(recording: Recording, episode: int) -> float:
+    """When an episode went wrong [s]: at its base collision, or at its fall where the robot fell before that.
+
+    A robot that ran out of time without a fall got stuck when it first came within 0.3 m of where it ended. Of every
+    other episode it is the end. A fall is the one from which the robot did not rise.
+
+    Args:
+        recording: Of one terrain.
+        episode: Index of the episode.
+    """
+    last = max(int(recording.num_frames[0, episode]) - 1, 0)
+    outcome, frame = recording.outcome[0, episode], last
+    if outcome in (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT):
+        quaternion = recording.base_quaternion[0, episode, : last + 1].astype(np.float64)
+        cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
+        upright = np.flatnonzero(cosine >= np.cos(np.deg2rad(FALLEN_TILT_DEG)))
+        fall = int(upright[-1]) + 1 if len(upright) else 0
+        if fall <= last:
+            frame = fall
+        elif outcome == Outcome.TIME_OUT:
+            place = recording.base_position[0, episode, : last + 1, :2].astype(np.float64)
+            frame = int(np.argmax(np.linalg.norm(place - place[-1], axis=1) <= _STUCK))
+    return frame * recording.dt
+
+
+def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
+    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties."""
+    outcome = recording.outcome[0]
+    candidates = np.flatnonzero(outcome == np.bincount(outcome).argmax())
+    last = np.maximum(recording.num_frames[0, candidates] - 1, 0)
+    sums = recording.penalties[0, candidates, last].astype(np.float64)
+    names = recording.penalty_names
+    costs = sum(sums[:, names.index(name)] / scale for name, scale in scales.items() if name in names)
+    order = np.argsort(np.broadcast_to(costs, len(candidates)), kind="stable")
+    return int(candidates[order[(len(candidates) - 1) // 2]])
 
 
 def penalties_by_place(crossed: Crossed, penalties: tuple[str, ...], edges: NDArray[np.float64]) -> NDArray[np.float64]:

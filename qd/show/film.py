@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from qd.show.cross import OWN_FOLDER, OwnTerrain
+from qd.show.crossed import typical_episode
 from qd.show.elites import OpenedRun, Terrain
 from qd.show.film_cfg import FilmCfg
 from qd.show.replay import record_terrains
-from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures, typical_episode
+from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures
 from sim.files.atomic import prepare_output, write_atomically
 from sim.policy.spec import crosser_name
 from sim.recording.file import read_recording, write_recording

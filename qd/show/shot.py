@@ -60,15 +60,6 @@ class Shot:
         return {name: sums[:, names.index(name)] / scale for name, scale in self.scales.items() if name in names}
 
 
-def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
-    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties."""
-    outcome = recording.outcome[0]
-    candidates = np.flatnonzero(outcome == np.bincount(outcome).argmax())
-    shots = [Shot(recording=recording, episode=k, scales=scales) for k in candidates.tolist()]
-    sums = [sum(values[-1] for values in shot.penalties.values()) for shot in shots]
-    return int(candidates[np.argsort(sums, kind="stable")[(len(sums) - 1) // 2]])
-
-
 def caption(shot: Shot) -> tuple[str, str]:
     """Two lines: what is shown, and how all recorded episodes of the terrain ended, with 95 % intervals (Wilson)."""
     recording, k = shot.recording, shot.episode

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
-from qd.show.crossed import Crossed, ending_of
-from qd.show.shot import typical_episode
+from qd.show.crossed import Crossed, ending_of, typical_episode
 from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps

@@ -10,6 +10,7 @@ import pytest
 from kernels.episode import Outcome
 from qd.archive import write_archive
 from qd.show.commands import Film
+from qd.show.crossed import moment_of_failure, typical_episode
 from qd.show.film import write_film
 from qd.show.shot import (
     PANEL_HEIGHT,
@@ -22,7 +23,6 @@ from qd.show.shot import (
     frames_of,
     num_pictures,
     shown_frames,
-    typical_episode,
 )
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
@@ -57,6 +57,24 @@ def test_the_typical_episode_ends_like_most_and_costs_the_middle(recording):
     # Out of time are 0, 2 and 3; scaled sums 1/2 + 1, 3/2 + 3 and 2/2 + 6.
     assert typical_episode(recording, SCALES) == 2
     assert typical_episode(recording, {"yaw_rate": 1.0}) == 3
+
+
+def test_the_moment_of_failure_by_hand(recording):
+    def moment(**fields):
+        return moment_of_failure(replace(recording, **fields), 4)
+
+    # 51 frames of 0.02 s from x = 2 to 6 m, 0.08 m apart
+    assert moment() == pytest.approx(1.0)  # the base collision ends the episode
+    stuck = np.full((1, 5), LATE, np.uint8)
+    # Within 0.3 m of x = 6 m for the first time at frame 47: 2 + 47 * 0.08 = 5.76; frame 46 is at 5.68.
+    assert moment(outcome=stuck) == pytest.approx(0.94)
+    lying = recording.base_quaternion.copy()
+    lying[:, :, 10:15] = lying[:, :, 30:] = [np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0]  # rolled by 90 degrees
+    for outcome in (stuck, recording.outcome, np.full((1, 5), Outcome.OUT, np.uint8)):
+        assert moment(outcome=outcome, base_quaternion=lying) == pytest.approx(0.6)  # it rose from the first fall
+    arrived = np.full((1, 5), Outcome.GOAL, np.uint8)
+    assert moment(outcome=arrived, base_quaternion=lying) == pytest.approx(1.0)
+    assert moment(num_frames=np.full((1, 5), 31, np.int32)) == pytest.approx(0.6)
 
 
 def test_the_caption_has_the_episode_and_the_rates_of_all(recording):

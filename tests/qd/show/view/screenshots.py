@@ -12,10 +12,11 @@ from pathlib import Path
 from PIL import Image
 
 from qd.groups import rank
+from qd.show.crossed import typical_episode
 from qd.show.elites import open_run
 from qd.show.recordings import Recordings, on_elite
 from qd.show.report.report import write_report
-from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, typical_episode
+from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of
 from sim.recording.renderer import Renderer
 from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
 from tests.qd.show.view.visitor import ROOT, serve
