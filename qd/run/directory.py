@@ -101,15 +101,19 @@ def check_space(archive: Archive, named: str | None) -> None:
 
 
 def folder_for(run: Path, robot: str) -> Path:
-    """Where what is made from a run goes: into its directory, or of a published one to runs/<robot>-published.
+    """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
+
+    That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
 
     Args:
         run: Run directory or archive file.
         robot: Name of its robot.
     """
     folder = directory_of(run)
-    is_published = RESULTS.resolve() in folder.resolve().parents
-    return RUNS / f"{robot}-published" if is_published else folder
+    if RESULTS.resolve() not in folder.resolve().parents:
+        return folder
+    name = folder.resolve().name
+    return RUNS / (f"{robot}-published" + ("" if name == "archive" else f"-{name}"))
 
 
 def free_path(name: str) -> Path:

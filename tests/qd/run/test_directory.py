@@ -98,6 +98,8 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
         find_run(robot)
     published = make_run(results / "anymal" / "archive")
     assert find_run(robot) == published and folder_for(published, "anymal") == Path("runs/anymal-published")
+    course = published.parent / "spaces" / "course" / "archive.npz"
+    assert folder_for(course, "anymal") == Path("runs/anymal-published-course")
     with pytest.raises(FileNotFoundError):
         find_run(robot, published="never")
     for number in (1, 3, 2):
