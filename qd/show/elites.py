@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, read_archive
+from qd.archive import Archive, goal_rates, read_archive
 from qd.fitness import FitnessCfg
+from qd.judge import CERTIFIERS_FOLDER, panel_of
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
 from qd.run.settings import SearchCfg, find_policy, suffix_of
@@ -97,6 +98,28 @@ class OpenedRun:
                 same = is_same(policy, str(self.robot.policy_file))
             return "" if same else label_suffix(policy)
         return suffix_of(cfg, policy, self.robot)
+
+    def certifiers(self) -> dict[str, str]:
+        """Files of the controllers that crossed its failing elites, as far as they are at hand, by their names.
+
+        They are of the robot's panel, of the run, or beside a published run.
+        """
+        faults, folder = self.archive.faults, self.folder
+        if faults is None:
+            return {}
+        names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
+        own = [*sorted((folder / CERTIFIERS_FOLDER).glob("*.pt")), folder.parent / f"{folder.name}.pt"]
+        files = [*panel_of(self.robot).values(), *map(str, own)]
+        return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
+
+    def certifier(self, number: int) -> str | None:
+        """Name of the one of :meth:`certifiers` that crosses an elite most often; None if none has a certificate."""
+        faults = self.archive.faults
+        if faults is None or not self.archive.certified[number]:
+            return None
+        rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
+        rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
+        return max((name for name in self.certifiers() if rate_of[name] > 0.0), key=rate_of.__getitem__, default=None)
 
     def output(self, stem: str, policy: str | None = None) -> Path:
         """Where a file about a terrain goes, without its ending: into the run, or for a published one under runs/."""
