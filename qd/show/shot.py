@@ -18,7 +18,7 @@ from sim.files.intervals import rate_words
 from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import ControllerSpec
 from sim.recording.recorder import Recording
-from sim.recording.renderer import Camera, Renderer
+from sim.recording.renderer import Camera, Ghost, Renderer
 
 WIDTH, VIEW_HEIGHT, PANEL_HEIGHT = 1280, 480, 240
 """Pixels of a film; the panel stands below the view."""
@@ -109,9 +109,9 @@ def frames_of(shot: Shot, renderer: Renderer, cameras: Sequence[Camera], fps: in
     others = [recording.qpos(0, k) for k in shot.ghosts]
     picture = np.zeros(0, np.uint8)
     for frame in shown_frames(shot, fps):
-        ghosts = [other[min(frame, len(other) - 1)] for other in others]
-        force = recording.foot_force[0, shot.episode, frame]
-        view = renderer.render(poses[frame], cameras[frame], ghosts=ghosts, foot_force=force)
+        ghosts = [Ghost(other[min(frame, len(other) - 1)]) for other in others]
+        marks = {name: getattr(recording, name)[0, shot.episode, frame] for name in ("touching", "foot_force")}
+        view = renderer.render(poses[frame], cameras[frame], ghosts=ghosts, **marks)
         time_s = frame * recording.dt
         lettered = _lettered(view, lines, f"{time_s:.1f} s")
         picture = np.concatenate([lettered, panel.at(time_s, poses[frame, :3])])

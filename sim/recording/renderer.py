@@ -6,21 +6,24 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.recording.scene import scene_model
+from sim.recording.scene import FOOT_TOUCH, OTHER_EPISODE, TOUCH, Color, scene_model
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
 
 _MAX_GEOMS = 4000
-_GHOST_OPACITY, _GHOST_PALENESS = 0.25, 0.6
+_GHOST_OPACITY = 0.4
+_NAME_HEIGHT = 0.55  # over the base, in standing heights of the robot
+_LEAST_LETTERS = 14  # [pixels]
 _ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
@@ -41,6 +44,16 @@ class Camera:
     """Direction of view in the horizontal plane, from x toward y [deg]."""
     elevation: float = -22.0
     """Of the view over the horizon [deg]; negative looks down."""
+
+
+class Ghost(NamedTuple):
+    """Another robot in a picture: translucent, of one colour."""
+
+    qpos: NDArray[np.floating]
+    """MuJoCo's joint coordinates, shape (7 + num_joints,)."""
+    color: Color = OTHER_EPISODE
+    name: str = ""
+    """Written over it."""
 
 
 def open_context(width: int, height: int) -> Any:
@@ -80,8 +93,10 @@ class Renderer:
         self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg, ground=ground)
         self._context = open_context(width, height)
         self._robot = robot
-        geom = _mj.mjtObj.mjOBJ_GEOM.value
-        self._feet = [_mj.mj_name2id(self.model, geom, name) for name in robot.foot_geoms]
+        kind = _mj.mjtObj.mjOBJ_GEOM.value
+        geoms = {name: _mj.mj_name2id(self.model, kind, name) for name in robot.geom_names}
+        self._feet = [geoms[name] for name in robot.foot_geoms]
+        self._columns = {index: column for column, index in enumerate(geoms.values())}
         self._data = [_mj.MjData(self.model)]
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
@@ -107,7 +122,8 @@ class Renderer:
         qpos: NDArray[np.floating],
         camera: Camera,
         *,
-        ghosts: Sequence[NDArray[np.floating]] = (),
+        ghosts: Sequence[Ghost | tuple[NDArray[np.floating], Color]] = (),
+        touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
         paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float, float]]] = (),
     ) -> NDArray[np.uint8]:
@@ -116,7 +132,9 @@ class Renderer:
         Args:
             qpos: MuJoCo's joint coordinates, shape (7 + num_joints,).
             camera: Where from.
-            ghosts: Poses of others, shown translucent.
+            ghosts: Other robots: :class:`Ghost`, or its first fields.
+            touching: Whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do are
+                yellow, base and limbs magenta.
             foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
             paths: Ways, each by its points [m], shape (num_points, 3), and its colour, RGBA 0 to 1.
 
@@ -131,8 +149,11 @@ class Renderer:
         self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
         everything = _mj.mjtCatBit.mjCAT_ALL.value
         _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
-        for number, pose in enumerate(ghosts, 1):
-            self._add_ghost(self._posed(number, pose))
+        if touching is not None:
+            self._color_touching(touching)
+        others = [ghost if isinstance(ghost, Ghost) else Ghost(*ghost) for ghost in ghosts]
+        for number, ghost in enumerate(others, 1):
+            self._add_ghost(number, ghost)
         if foot_force is not None:
             for index, force in zip(self._feet, foot_force, strict=True):
                 if index >= 0:
@@ -141,7 +162,7 @@ class Renderer:
             self._add_path(points, np.array(color, np.float32))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
-        return self._image[::-1].copy()  # OpenGL's lowest row is first
+        return self._named(self._image[::-1], others)  # OpenGL's lowest row is first
 
     def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
         while len(self._data) <= number:
@@ -153,14 +174,39 @@ class Renderer:
         _mj.mj_camlight(self.model, data)
         return data
 
-    def _add_ghost(self, data: Any) -> None:
-        first = self._scene.ngeom
+    def _color_touching(self, touching: NDArray[np.bool_]) -> None:
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            column = self._columns.get(geom.objid) if geom.objtype == _mj.mjtObj.mjOBJ_GEOM.value else None
+            if column is not None and touching[column]:
+                geom.rgba[:3] = FOOT_TOUCH if geom.objid in self._feet else TOUCH
+                geom.matid = -1
+
+    def _add_ghost(self, number: int, ghost: Ghost) -> None:
+        data, first = self._posed(number, ghost.qpos), self._scene.ngeom
         moving = _mj.mjtCatBit.mjCAT_DYNAMIC.value
         _mj.mjv_addGeoms(self.model, data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
-            geom.rgba[:3] += _GHOST_PALENESS * (1.0 - geom.rgba[:3])
-            geom.rgba[3] = _GHOST_OPACITY
-            geom.transparent = 1
+            geom.rgba[:] = *ghost.color, _GHOST_OPACITY
+            geom.matid, geom.transparent = -1, 1
+
+    def _named(self, picture: NDArray[np.uint8], ghosts: Sequence[Ghost]) -> NDArray[np.uint8]:
+        """The picture with the ghosts' names over them."""
+        image = Image.fromarray(picture)
+        draw, height = ImageDraw.Draw(image), self._rectangle.height
+        camera = self._scene.camera[0]  # that of one eye, at most a few centimetres from the middle of both
+        for ghost in ghosts:
+            over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
+            away = np.asarray(ghost.qpos[:3], np.float64) + np.array(over) - camera.pos
+            depth = float(away @ camera.forward)
+            if not ghost.name or depth <= camera.frustum_near:
+                continue
+            pixels = 0.5 * height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
+            right, up = away @ np.cross(camera.forward, camera.up), away @ camera.up
+            place = 0.5 * self._rectangle.width + pixels * right, 0.5 * height - pixels * up
+            color = tuple(round(150.0 * share) for share in ghost.color)
+            font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
+            draw.text(place, ghost.name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
+        return np.array(image)
 
     def _add_path(self, points: NDArray[np.floating], color: NDArray[np.float32]) -> None:
         for begin, end in itertools.pairwise(np.asarray(points, dtype=np.float64)):
@@ -175,9 +221,14 @@ class Renderer:
         self._add_connector(_mj.mjtGeom.mjGEOM_ARROW.value, _ARROW_WIDTH, foot, tip, color)
 
     def _add_connector(self, kind: int, width: float, begin: Any, end: Any, color: NDArray[np.float32]) -> None:
+        if (geom := self._add_geom(kind, np.zeros(3), color)) is not None:
+            _mj.mjv_connector(geom, kind, width, begin, end)
+
+    def _add_geom(self, kind: int, place: NDArray[np.float64], color: NDArray[np.float32]) -> Any:
+        """A new geom of the picture; None if there are too many."""
         if self._scene.ngeom >= self._scene.maxgeom:
-            return
+            return None
         geom = self._scene.geoms[self._scene.ngeom]
-        _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-        _mj.mjv_connector(geom, kind, width, begin, end)
+        _mj.mjv_initGeom(geom, kind, np.zeros(3), place, np.eye(3).ravel(), color)
         self._scene.ngeom += 1
+        return geom

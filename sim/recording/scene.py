@@ -19,13 +19,20 @@ from sim.terrain import SPACING
 
 _mj: Any = mujoco  # its types are not written down
 
+Color = tuple[float, float, float]
+"""RGB, 0 to 1."""
+TOUCH, FOOT_TOUCH = (0.84, 0.09, 0.48), (1.0, 0.84, 0.04)
+"""Of base and limbs, and of feet, while they touch."""
+OTHER_CONTROLLER, OTHER_EPISODE = (0.05, 0.62, 0.55), (0.88, 0.89, 0.90)
+"""Of ghosts: another controller's crossing, and another episode of the same one."""
+
 MARGIN_NODES = 40
 """Edge height shown on each side: a crossing may leave the terrain by 2 m."""
 _GROUND = "faultline_ground"
 _PIXELS = 4  # of the paint a cell, along each side
 _LOW, _LEVEL, _HIGH = (np.array(color) for color in ((0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)))
 _LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
-_COLORS = {"base": (0.20, 0.22, 0.25, 1.0), "limb": (0.42, 0.45, 0.50, 1.0), "foot": (0.90, 0.35, 0.13, 1.0)}
+_COLORS = {"base": (0.20, 0.22, 0.25, 1.0), "limb": (0.42, 0.45, 0.50, 1.0), "foot": (0.30, 0.32, 0.36, 1.0)}
 _SHADOWED = 3.0  # half side of the square about the robot that shadows fall in [m]
 _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
 _BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]

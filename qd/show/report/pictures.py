@@ -11,7 +11,7 @@ from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.maps.picture import tinted
-from sim.recording.renderer import Camera, Renderer
+from sim.recording.renderer import Camera, Ghost, Renderer
 from sim.recording.scene import height_colors
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
@@ -83,7 +83,8 @@ def rendered(crossed: Crossed, robot: RobotCfg, scales: dict[str, float]) -> byt
         pixels = renderer.render(
             poses[-1],
             _camera(poses[-1, :3], robot.default_base_height),
-            ghosts=[poses[frame] for frame in before if frame >= 0],
+            ghosts=[Ghost(poses[frame]) for frame in before if frame >= 0],
+            touching=recording.touching[0, episode, len(poses) - 1],
             paths=_ways(crossed),
         )
     content = io.BytesIO()

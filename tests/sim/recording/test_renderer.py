@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim.mujoco_c.model import surface_heights
-from sim.recording.renderer import Camera, Renderer, open_context
+from sim.recording.renderer import Camera, Ghost, Renderer, open_context
 from sim.recording.scene import MARGIN_NODES, ground_paint, scene_model
 from sim.robots.find import get_robot
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -103,23 +103,30 @@ def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
     assert abs(rows.mean() - row) < 2 and abs(columns.min() - left) < 4 and abs(columns.max() - right) < 4
 
 
-def test_ghosts_are_paler_and_forces_are_arrows(opengl, anymal, ground):
+def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
     side = Camera(target=(2.0, 4.0, 0.5), distance=4.0, azimuth=90.0, elevation=-10.0)
     pose = standing(anymal, 2.0, 4.0, 0.0)
-    force = np.zeros((4, 3))
-    force[0, 2] = 900.0
+    green = Ghost(standing(anymal, 3.2, 4.0, 0.0), (0.0, 1.0, 0.0), "C-G")
+    force, base, foot = np.zeros((4, 3)), np.zeros(13, bool), np.zeros(13, bool)
+    force[0, 2], base[0], foot[-4:] = 900.0, True, True
     with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
-        alone = renderer.render(pose, side).astype(int)
-        joined = renderer.render(pose, side, ghosts=[standing(anymal, 3.2, 4.0, 0.0)]).astype(int)
-        again = renderer.render(pose, side).astype(int)
-        pushed = renderer.render(pose, side, foot_force=force).astype(int)
+        pictures = [
+            renderer.render(pose, side, **marks).astype(int)
+            for marks in ({}, {"ghosts": [green]}, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
+        ]
+    alone, joined, pushed, hit, stepping, again = pictures
     np.testing.assert_array_equal(alone, again)  # what was added to a picture stays in it
-    changed = np.abs(joined - alone).sum(axis=2) > 6
-    dark = alone.sum(axis=2) < 200
-    assert changed.sum() > 500 and dark.sum() > 500
-    assert (joined[changed].sum(axis=1) > 200).mean() > 0.9  # seen through, not as dark as the robot
-    red = [((picture[..., 0] > 100) & (picture[..., 1:].max(axis=2) < 60)).sum() for picture in (alone, pushed)]
-    assert red[1] > red[0] + 20
+
+    def pixels(picture, strong, weak):
+        return (picture[..., strong].min(axis=-1) - picture[..., weak].max(axis=-1) > 60).sum()
+
+    for picture, strong, weak in (
+        (joined, [1], [0, 2]),
+        (pushed, [0], [1, 2]),
+        (hit, [0], [1]),
+        (stepping, [0, 1], [2]),
+    ):
+        assert pixels(picture, strong, weak) > pixels(alone, strong, weak) + 40
 
 
 @pytest.mark.parametrize("kind", KINDS)
