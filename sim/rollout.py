@@ -18,13 +18,11 @@ from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.bank import TerrainBank
-from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, make_start_ranges, make_task
+from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
 from sim.ground import GroundMaps
 from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.policy.runner import Memory, PolicyRunner
-from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.simulation import Simulation, SolverCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
@@ -188,6 +186,8 @@ class Rollout:
             ) from error
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
+        from sim.simulation import Simulation  # Newton takes seconds to load: only what simulates loads it
+
         bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
@@ -218,8 +218,10 @@ class Rollout:
         self._task = make_task(self.cfg, robot)
         self._episode = self._stepped = make_episodes(num_envs)
         self._latches = [(self._task, self._episode)]
-        self._reward: Reward | None = None
+        self._reward = None
         if self.cfg.reward:
+            from sim.reward import Reward
+
             # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
             io = {"command": self._command, "action": self._last_action}

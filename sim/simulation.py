@@ -1,7 +1,6 @@
 """Parallel robots on height grids: one world each, terrain contact of our own, Newton's MuJoCo solver."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 import newton
@@ -15,47 +14,13 @@ from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
 from sim.bank import TerrainBank
+from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.solver import dynamics_of, use_own_solver
 
-GROUND_FRICTION = 0.3
-"""Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
-_RESOLVED_DT = 0.001
-_RESOLVED_TIME_CONSTANT_S = 0.003
-
 use_own_solver()
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolverCfg:
-    """Options of the physics solver, chosen by measurement.
-
-    The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that the integrator
-    ``implicitfast`` takes with steps of 0.005 s. At MuJoCo's default of 0.02 s feet that land hard sink in by more than
-    their radius. Friction cones are elliptic: a pyramid gives way at 0.7 of the friction across its axes, and robots
-    fail on slopes that would hold them (docs/simulation.md).
-    """
-
-    iterations: int = 5
-    """Newton iterations a step at most. Caps of 3 to 50 give the same rates (results/bench/options-*.json), but with 4
-    the forces of a hard landing are off by up to 2 % of its impulse (tests/sim/robots/test_standing.py notices)."""
-    ls_iterations: int = 10
-    """Line-search iterations at most."""
-    time_constant_s: float | None = None
-    """Contact time constant [s] at critical damping; that of the robot's file if None."""
-
-
-def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
-    """Robot and solver with contact resolved: steps of 1 ms and contacts of 3 ms, against which a search's are judged.
-
-    Four times the steps: about five times the time.
-    """
-    steps = round(robot.control_dt / _RESOLVED_DT)
-    return replace(robot, physics_dt=_RESOLVED_DT, decimation=steps), SolverCfg(
-        time_constant_s=_RESOLVED_TIME_CONSTANT_S
-    )
 
 
 class Simulation:

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
 from qd.workers.shards import join_results
+from sim.crossing import SolverCfg, resolved
 from sim.device import resolve_device as resolve_warp_device
 from sim.files.records import provenance
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
-from sim.simulation import SolverCfg, resolved
 from sim.spaces.registry import load_space
 
 _MIN_ROWS = 4  # fewest robots of a simulation: one more process costs more than fewer of them gain
@@ -88,7 +88,7 @@ class EvaluatorCfg:
     space: str = "super_gaussian"
     """Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it."""
     resolved: bool = False
-    """Whether contact is resolved (:func:`sim.simulation.resolved`), which takes five times as long."""
+    """Whether contact is resolved (:func:`sim.crossing.resolved`), which takes five times as long."""
 
     @property
     def num_workers(self) -> int:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from results.make.common import parse
+from sim.crossing import SolverCfg, resolved
 from sim.rates import agreement
 from sim.rollout import Rollout, RolloutResult
-from sim.simulation import SolverCfg, resolved
 from sim.spaces.registry import SUPER_GAUSSIAN
 
 ITERATIONS = (3, 4, 5, 6, 8, 50)

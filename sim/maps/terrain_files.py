@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sim.crossing import GROUND_FRICTION
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
-from sim.simulation import GROUND_FRICTION
 from sim.terrain import SPACING
 
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)

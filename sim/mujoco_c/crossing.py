@@ -26,7 +26,8 @@ from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank, terrains_of
-from sim.crossing import CrossingCfg, make_start_ranges
+from sim.crossing import CrossingCfg, SolverCfg, make_start_ranges
+from sim.crossing import resolved as with_contact_resolved
 from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
     Array,
@@ -40,10 +41,7 @@ from sim.mujoco_c.model import (
 )
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
-from sim.robots.model import build_robot
 from sim.robots.robot import RobotCfg
-from sim.simulation import SolverCfg
-from sim.simulation import resolved as with_contact_resolved
 from sim.spaces.base import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
@@ -68,6 +66,8 @@ class PlainCrossings:
 @lru_cache(maxsize=8)
 def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
     """Mass centre of the base in its frame [m]."""
+    from sim.robots.model import build_robot  # Newton takes seconds to load
+
     x, y, z = build_robot(robot).body_com[0]
     return float(x), float(y), float(z)
 
@@ -255,7 +255,7 @@ def cross_terrains(
         space: What genes mean.
         num_episodes: Episodes a terrain; the first of them begin as a rollout's do, which may have fewer.
         processes: How many at once.
-        resolved: Whether contact is resolved (:func:`sim.simulation.resolved`), else the search's settings hold.
+        resolved: Whether contact is resolved (:func:`sim.crossing.resolved`), else the search's settings hold.
         device: Warp device that makes the terrains and draws the starts.
         progress: Called with the number of episodes that were just crossed.
 

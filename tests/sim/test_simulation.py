@@ -7,9 +7,10 @@ import pytest
 import warp as wp
 
 from sim.bank import TerrainBank
+from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import resolve_device
 from sim.mujoco_c.model import to_mujoco
-from sim.simulation import GROUND_FRICTION, Simulation, SolverCfg
+from sim.simulation import Simulation
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.scenes import GAINS, Stepper, lying, positions, put, velocities
 

@@ -9,7 +9,7 @@ import torch
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from sim.crossing import CrossingCfg
+from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import (
     crossing_model,
@@ -22,7 +22,6 @@ from sim.mujoco_c.model import (
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.simulation import GROUND_FRICTION, SolverCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
