@@ -19,20 +19,20 @@ class Command(NamedTuple):
 
 
 COMMANDS: dict[str, dict[str, Command]] = {
-    "Find what breaks a controller": {
+    "First": {
         "archive": Command("qd.commands:Archive", "search the terrains on which a controller fails"),
-        "judge": Command("qd.commands:Judge", "which elites of an archive are faults of its controller"),
+        "view": Command("qd.show.commands:View", "look at them in the browser"),
+        "report": Command("qd.show.commands:Report", "one page about them"),
+        "film": Command("qd.show.commands:Film", "film the robot on one of them, or on a map of your own"),
+        "judge": Command("qd.commands:Judge", "which of them are faults of the controller"),
+        "export": Command("qd.show.commands:Export", "as files, faults as a pack, a controller as ONNX"),
+    },
+    "Find and measure more": {
         "minimise": Command("qd.commands:Minimise", "which parts of a failing terrain it takes to fail"),
-        "evaluate": Command("qd.commands:Evaluate", "rates of controllers, or the paper's tables"),
+        "evaluate": Command("qd.commands:Evaluate", "rates of controllers, of one or compared"),
         "dose": Command("qd.commands:Dose", "which real obstacle at which size stops a controller"),
         "cross": Command("qd.show.commands:Cross", "cross a height map of your own"),
-    },
-    "Look at it": {
         "replay": Command("qd.show.commands:Replay", "one elite again: numbers, and paths over its terrain"),
-        "view": Command("qd.show.commands:View", "an archive in the browser"),
-        "report": Command("qd.show.commands:Report", "one page about a run"),
-        "film": Command("qd.show.commands:Film", "film the robot on an elite or on a map of your own"),
-        "export": Command("qd.show.commands:Export", "elites as files, faults as a pack, a controller as ONNX"),
     },
     "Train": {
         "train": Command("train.commands:Train", "train a base controller from scratch"),
@@ -44,7 +44,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "calibrate": Command("qd.commands:Calibrate", "measure the penalty scales of a robot"),
     },
 }
-"""What can be done, by what it is for."""
+"""What can be done, by what it is for; first the six that a newcomer needs."""
 
 API = {
     "search": "qd.search",
@@ -71,28 +71,32 @@ def __getattr__(name: str) -> Any:
 _BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
-def _usage() -> str:
-    lines = ["usage: faultline COMMAND [OPTIONS]", "", "Find the terrains that break a legged robot's controller.", ""]
+def _print_usage() -> None:
+    from sim.files.command import say
+
+    say("usage: faultline COMMAND [OPTIONS]\n\nFind the terrains that break a legged robot's controller.\n")
     for title, group in COMMANDS.items():
-        lines += [f"{title}:", *(f"  {name:<16}{command.summary}" for name, command in group.items()), ""]
-    lines.append("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
-    return "\n".join(lines)
+        say((f"{title}:", "bold"))
+        for name, command in group.items():
+            say((f"  {name:<12}", "cyan"), command.summary)
+        print()
+    say("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command that a command line names; returns its exit status, 2 if there is none of that name."""
+    from sim.files.command import run_command, say
+
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help", "help"):
-        print(_usage())
+        _print_usage()
         return 0
     if name not in _BY_NAME:
         near = difflib.get_close_matches(name, _BY_NAME, n=1)
         meant = f"did you mean {near[0]}?" if near else "faultline --help lists them"
-        print(f"error: there is no command '{name}': {meant}", file=sys.stderr)
+        say(("error:", "bold red"), f" there is no command '{name}': {meant}", error=True)
         return 2
     module, _, cls = _BY_NAME[name].where.partition(":")
-    from sim.files.command import run_command
-
     return run_command(getattr(importlib.import_module(module), cls), rest, name=name)
 
 

@@ -12,7 +12,7 @@ from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.judge import fresh_values
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
-from qd.run.progress import ProgressBar, clock, describe_search
+from qd.run.progress import SearchBar, clock, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
 from qd.show.figures import summary, write_figures
@@ -93,7 +93,7 @@ def search(
             try:
                 with open_evaluator(evaluator) as pipeline:
                     run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
-                    with ProgressBar(cfg.iterations, done) as bar:
+                    with SearchBar(cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name)
@@ -116,7 +116,7 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str) -> 
 
 
 def _run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: ProgressBar
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: SearchBar
 ) -> None:
     """Runs the iterations that are left, and saves each.
 

@@ -1,17 +1,21 @@
-"""What a search says: what it will do, how long that should take, and how far it is."""
+"""What a search says: what it will do, and how far it is; and the bar of all work that takes time."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from tqdm import tqdm
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
 
 from qd.run.settings import SearchCfg
 from qd.workers.invalid import WARNED_SHARE, reason_words
 
-_FORMAT = "{percentage:3.0f}%|{bar:12}| {desc} [{elapsed}, ETA {remaining}]"
+_CELLS = 10  # of the bar
+_PLAIN_EVERY_S = 30.0
 
 
 def clock(seconds: float) -> str:
@@ -26,55 +30,88 @@ def describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers:
     left = cfg.iterations - done
     return (
         f"{path}: {left:,} of {cfg.iterations:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
-        f"{cfg.replicas} episodes of {cfg.robot} with the {cfg.policy} controller on {cfg.space}\n"
-        f"  {left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
+        f"{cfg.replicas} episodes of {cfg.robot} with the {cfg.policy} controller on {cfg.space}; in all "
+        f"{left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
         f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
     )
 
 
+class Bar:
+    """How far work is, on stderr: one line of a terminal, with the time left first; elsewhere a line every 30 s.
+
+    Args:
+        text: What is done.
+        total: Position at which all is done.
+        done: Position at which this work begins.
+    """
+
+    def __init__(self, text: str, total: float = 1.0, done: float = 0.0) -> None:
+        self._text, self._total, self._first, self._position = text, total, done, done
+        self._began = self._moved = self._written = time.monotonic()
+        console = Console(stderr=True, highlight=False)
+        self._live = None
+        if console.is_terminal and not console.is_dumb_terminal:
+            self._live = Live(
+                get_renderable=self._line, console=console, refresh_per_second=2, redirect_stdout=sys.stdout.isatty()
+            )
+
+    def __enter__(self) -> Self:
+        if self._live:
+            self._live.start(refresh=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    def move_to(self, position: float, text: str | None = None) -> None:
+        """Moves to a position; the text stays if there is no other."""
+        self._position, self._moved = position, time.monotonic()
+        self._text = self._text if text is None else text
+        if self._live is None and self._moved - self._written >= _PLAIN_EVERY_S:
+            self._written = self._moved
+            print(self._line().plain, file=sys.stderr, flush=True)
+
+    def _line(self) -> Text:
+        """Time left, share, bar and text; what does not fit is cut off at the end."""
+        share, left = self._position / self._total, "..."
+        if self._position > self._first:
+            rate = (self._position - self._first) / max(self._moved - self._began, 1e-9)
+            since = time.monotonic() - self._moved
+            left = f"{clock(max(0.0, (self._total - self._position) / rate - since))} left"
+        filled = round(_CELLS * share)
+        return Text.assemble(
+            (f"{left:>11}", "bold"), f" {share:4.0%} ", ("━" * filled, "cyan"), ("─" * (_CELLS - filled), "dim"),
+            f" {self._text}", no_wrap=True, overflow="ellipsis",
+        )  # fmt: skip
+
+
 @contextmanager
-def share_bar(what: str) -> Iterator[Callable[[float], None]]:
+def share_bar(text: str) -> Iterator[Callable[[float], None]]:
     """A bar over one piece of work; yields a function that moves it to the share that is done."""
-    with tqdm(total=1.0, desc=what, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT) as bar:
-
-        def move_to(share: float) -> None:
-            bar.update(share - bar.n)
-
-        yield move_to
+    with Bar(text) as bar:
+        yield bar.move_to
 
 
-class ProgressBar(tqdm):
-    """A bar over iterations, some of them done before, that moves within them; closes on leaving its context."""
+class SearchBar(Bar):
+    """A bar over the iterations of a search, some of them done before, that moves within them."""
 
     def __init__(self, iterations: int, done: int) -> None:
-        self._iterations, self._first = iterations, done
-        super().__init__(
-            total=iterations, initial=done, file=sys.stderr, dynamic_ncols=True, mininterval=0.5, bar_format=_FORMAT
-        )
-        self._describe(done, "compiling and evaluating")
+        super().__init__(f"iteration {done + 1}/{iterations}: compiling and evaluating", iterations, done)
 
     def within(self, iteration: int, part: int = 0, parts: int = 1) -> Callable[[float], None]:
         """A function that moves the bar to a share of an iteration, counted from 1, or of one of its equal parts."""
-        return lambda share: self._move_to(iteration - 1 + (part + share) / parts)
+        return lambda share: self.move_to(iteration - 1 + (part + share) / parts)
 
     def show(self, row: dict[str, Any], workers: object = None) -> None:
         """Shows where the search stands after an iteration, and how its workers fare if there are any."""
-        self._move_to(row["iteration"])
-        if row["iteration"] == self._first + 1:
-            left = (self._iterations - row["iteration"]) * row["wall_s"]
-            self.write(f"First iteration: {row['wall_s']:.1f} s; about {clock(left)} to go.", file=sys.stderr)
-        invalid = row["invalid_episodes"] / row["episodes"]
+        iteration, invalid = row["iteration"], row["invalid_episodes"] / row["episodes"]
         why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
-        self._describe(
-            row["iteration"],
-            f"{row['elites']} elites ({row['reachable_coverage']:.1%} of reachable), QD {row['qd_score']:.0f}, "
-            f"mean fitness {row['mean_fitness']:.2f}, {row['episodes_per_s']:.1f} episodes/s"
+        self.move_to(
+            iteration,
+            f"iteration {min(iteration + 1, self._total)}/{self._total}: {row['elites']:,} elites, "
+            + (f"{invalid:.0%} invalid ({why}), " if why else "")
+            + f"{row['episodes_per_s']:.0f} episodes/s"
             + (f" by {workers}" if workers else "")
-            + (f", {invalid:.0%} invalid ({why})" if why else ""),
+            + f", mean fitness {row['mean_fitness']:.2f}",
         )
-
-    def _describe(self, done: int, state: str) -> None:
-        self.set_description_str(f"iteration {min(done + 1, self._iterations)}/{self._iterations}: {state}")
-
-    def _move_to(self, position: float) -> None:
-        self.update(position - self.n)

@@ -8,7 +8,6 @@ stopped goes on when it is run again.
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, replace
@@ -17,7 +16,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
@@ -33,6 +31,7 @@ from qd.workers.evaluator import (
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import write_atomically
+from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
 from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
@@ -258,10 +257,14 @@ class Crossings:
         parts = list(stored.read(terrains, seeds)) if stored else []
         done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in parts)])
         missing = np.setdiff1d(np.arange(len(terrains)), done)
-        for numbers, result in self._cross_missing(cfg, how, terrains, seeds, missing, label, at_most):
-            if stored:
-                stored.write(terrains[numbers], seeds[numbers], result)
-            parts.append((numbers, result))
+        try:
+            for numbers, result in self._cross_missing(cfg, how, terrains, seeds, missing, label, at_most):
+                if stored:
+                    stored.write(terrains[numbers], seeds[numbers], result)
+                parts.append((numbers, result))
+        except KeyboardInterrupt:
+            kept = "; what was crossed is kept, and the same command goes on" if stored else ""
+            raise Interrupted(f"Stopped{kept}.") from None
         result = _in_order(parts)
         report_invalid(result, label or policy, all_ok=invalid_ok)
         return result
@@ -322,13 +325,13 @@ class Crossings:
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
         processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, PlainCrossings]]()
-        with tqdm(desc=label, total=len(missing) * cfg.num_replicas, unit="episode", file=sys.stderr) as bar:
+        with share_bar(label) as progress:
             crossings = cross_terrains(
                 self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
                 num_episodes=cfg.num_replicas, device=cfg.device, processes=processes, resolved=True,
-                progress=bar.update,
             )  # fmt: skip
             for count, crossed in enumerate(crossings, 1):
+                progress(count / len(missing))
                 done.append(crossed)
                 if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
                     numbers, episodes = zip(*done, strict=True)

@@ -5,8 +5,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tqdm import tqdm
-
 from kernels.episode import Invalidity
 from sim.files.command import UserError
 from sim.rollout import RolloutResult
@@ -75,4 +73,4 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
         refuse_all_invalid(result)
     words = invalid_words(invalid_reasons(result), result.invalid.size)
     if words is not None:
-        tqdm.write(f"{label}: {words}", file=sys.stderr)
+        print(f"{label}: {words}", file=sys.stderr)

@@ -20,7 +20,6 @@ from typing import Any
 import ray
 from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
-from tqdm import tqdm
 
 from qd.workers.evaluator import EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
 from qd.workers.process import Crosser, EvaluatorError
@@ -251,7 +250,7 @@ class RayWorkers(Pipeline):
         what = f"{len(shard.terrains)} terrains"
         if shard.tries >= _MOST_TRIES:
             raise EvaluatorError(f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
-        tqdm.write(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
+        print(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
         self._waiting.appendleft(shard)
 
 

@@ -5,21 +5,26 @@ module loads quickly; what takes seconds to import (torch, warp, newton, pyribs)
 """
 
 import contextlib
+import inspect
 import io
 import os
+import re
 import shlex
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, takewhile
 from pathlib import Path
+from shutil import get_terminal_size
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.settings import PositiveInt, check
@@ -126,27 +131,88 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     except (ValueError, OSError, FloatingPointError, UserError) as error:
         if debugging():
             raise
-        print(f"error: {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", file=sys.stderr)
+        say(("error:", "bold red"), f" {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", error=True)
         return error.status if isinstance(error, UserError) else 2
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
 
 
+def say(*parts: str | tuple[str, str], error: bool = False) -> None:
+    """Prints parts of a text, some with a style of rich, which a terminal shows; a terminal breaks lines at words.
+
+    Args:
+        parts: Texts, or pairs of text and style.
+        error: Whether it goes to stderr.
+    """
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=error, highlight=False)
+    console.print(Text.assemble(*parts), soft_wrap=not console.is_terminal)
+
+
 def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
     """The command with its flags; what tyro says of wrong ones in a box is an error of one line."""
+    if {"-h", "--help"} & {*argv}:
+        print(_wrapped(inspect.getdoc(cls) or ""), end="\n\n")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            return tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **defaults)
+            return tyro.cli(
+                cls, prog=f"faultline {name}", args=list(argv), description="", registry=_plain_help(),
+                config=(tyro.conf.DisallowNone,), **defaults,
+            )  # fmt: skip
     except SystemExit as stop:
         if not stop.code:  # it was asked for help
             raise
         lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in said.getvalue().splitlines()]
         _title, *words = [line for line in lines if line.strip("-")]
-        is_help = (line.startswith(("Argument helptext", "For full helptext")) for line in words)
-        end = next((place for place, found in enumerate(is_help) if found), len(words))
-        raise UserError(f"{' '.join(words[:end]).rstrip('.')}; `faultline {name} --help` tells all flags") from None
+        text = " ".join(takewhile(lambda line: not line.startswith("For full helptext"), words))
+        what, _, help_line = text.partition(" Argument helptext: ")
+        if form := re.match(r"(--\S+) (\{.*?\}|\S+)", help_line):
+            flag = form[1]
+            given = "".join(f", got {value}" for value in [_values(argv, flag)] if value)
+            what = f"{flag} must be {form[2].strip('{}').replace('|', ' or ')}{given}"
+        raise UserError(f"{what.rstrip('.')}; `faultline {name} --help` tells all flags") from None
+
+
+def _wrapped(text: str) -> str:
+    """Paragraphs that fit the terminal."""
+    width = max(40, get_terminal_size().columns)
+    return "\n\n".join(textwrap.fill(paragraph, width) for paragraph in text.split("\n\n"))
+
+
+def _plain_help() -> ConstructorRegistry:
+    """What makes the help of flags plain: no default where it is nothing, and lines broken by the terminal alone."""
+    registry, asked = ConstructorRegistry(), list[StructTypeInfo]()
+    hint = tyro.conf.arg(help_behavior_hint=lambda text: "" if text in ("", "None") else f"(default: {text})")
+
+    @registry.struct_rule
+    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
+        if asked:  # tyro's own rules answer
+            return None
+        asked.append(info)
+        spec = ConstructorRegistry.get_struct_spec(info)
+        asked.clear()
+        if not isinstance(spec, StructConstructorSpec):
+            return None
+
+        def helptext(get: Any) -> Callable[[], str | None]:
+            return lambda: " ".join(str((get() if callable(get) else get) or "").split()) or None
+
+        fields = [
+            replace(field, type=Annotated[field.type, hint], helptext=helptext(field.helptext)) for field in spec.fields
+        ]
+        return replace(spec, fields=tuple(fields))
+
+    return registry
+
+
+def _values(argv: Sequence[str], flag: str) -> str:
+    """What a flag is given: the words up to the next one."""
+    after = argv[argv.index(flag) + 1 :] if flag in argv else [peek(argv, flag) or ""]
+    return shlex.join(takewhile(lambda word: not word.startswith("--"), after))
 
 
 def peek(argv: Sequence[str], flag: str) -> str | None:

@@ -18,8 +18,8 @@ from train.ppo.learner import Iteration, Learner
 _ROWS = 100  # over a whole training
 _ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
 _HEADER = (
-    f"{'iteration':>12} {'env-steps':>10} {'steps/s':>9} {'collect':>8} {'learn':>8} {'reward':>7} {'length':>7} "
-    f"{'falls':>6} {'goal':>6} {'v err':>6} {'w err':>6} {'level':>6} {'std':>5} {'rate':>8} {'ETA':>7}"
+    f"{'left':>8} {'iteration':>10} {'steps/s':>8} {'reward':>7} {'length':>7} {'falls':>6} {'goal':>6} {'v err':>6} "
+    f"{'level':>6} {'std':>5}"
 )
 
 
@@ -130,11 +130,9 @@ class Progress:
         forms = {"reward": ".2f", "length_s": ".1f", "fall_rate": ".3f", "goal_rate": ".3f"}
         reward, length, falls, goals = (value_words(row[name], None, form) for name, form in forms.items())
         print(
-            f"{row['iteration']:>6}/{self._iterations:<5} {row['env_steps'] / 1e6:>9.2f}M "
-            f"{row['env_steps_per_s']:>9,.0f} {row['collection_s'] * 1e3:>6.0f}ms {row['learning_s'] * 1e3:>6.0f}ms "
-            f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} "
-            f"{row['yaw_rate_error']:>6.3f} {row['level']:>6.2f} {row['noise_std']:>5.2f} "
-            f"{row['learning_rate']:>8.1e} {clock(left_s):>7}",
+            f"{clock(left_s):>8} {row['iteration']:>5}/{self._iterations:<4} {row['env_steps_per_s']:>8,.0f} "
+            f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} {row['level']:>6.2f} "
+            f"{row['noise_std']:>5.2f}",
             flush=True,
         )
         if row["ends"]["invalid"] or row["overflows"]:
