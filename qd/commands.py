@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
+
+from msgspec import Meta
 
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, command_line, peek
@@ -255,11 +257,18 @@ class Evaluate(ControllerFlags, WorkerFlags):
     --policies, --archive, --independent, --sets or --part the command makes tables: any controllers on the same
     hand-crafted, hard-random and generated terrains, with rewards, penalties and intervals. With --pack it says which
     terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the same command goes on.
+
+    For continuous integration: `--pack anymal --fail-under .9` exits with status 1 if the goal rate may be lower.
+    `--policies old=A new=B --archive RUN` says which elites of RUN fail newly and which are crossed newly, and exits
+    with status 1 on a regression: the 95 % interval of the goal rate's difference, new minus old, lies below 0. Elites
+    that one of the two was trained on are left out.
     """
 
     pack: str | None = None
     """Pack of faults that the controller is tested on: a folder that `faultline export` made, or anymal or cassie for
     the published one. --terrains takes the first of it; all on CUDA."""
+    fail_under: Annotated[float, Meta(ge=0, le=1)] | None = None
+    """With --pack: exit with status 1 if the lower end of the 95 % interval of the goal rate is below this."""
     policies: tuple[str, ...] = ()
     """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped. The
     others are compared with the first. base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind;
@@ -289,10 +298,10 @@ class Evaluate(ControllerFlags, WorkerFlags):
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
     validation validation.json. A figure of tables is written beside it as .png."""
 
-    def execute(self) -> None:
-        """Evaluates."""
-        from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
-        from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, read_pack
+    def execute(self) -> int:
+        """Evaluates; returns 1 if a controller is too bad."""
+        from qd.evaluate.evaluate import SetsCfg, compare, evaluate_rates, evaluate_tables
+        from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
         from qd.workers.evaluator import Compute
         from sim.files.command import split_words
         from sim.policy.spec import controllers_of
@@ -307,22 +316,34 @@ class Evaluate(ControllerFlags, WorkerFlags):
             folder = pack_folder(self.pack)
             pack = read_pack(folder)
             robot = robot_of(pack.content, self.robot, folder / PACK_FILE, flag="pack")
-            evaluate_pack(pack, robot, self.policy or str(robot.policy_file), compute=compute, out=self.out, **size)
-            return
+            policy = self.policy or str(robot.policy_file)
+            report = evaluate_pack(pack, robot, policy, compute=compute, out=self.out, **size)
+            return int(self.fail_under is not None and not passes(report, self.fail_under))
+        if self.fail_under is not None:
+            raise ValueError("--fail-under goes with --pack: give the pack too")
         robot = get_robot(self.robot)
         if not makes_tables:
             policy = self.policy or str(robot.policy_file)
             evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
-            return
+            return 0
         if self.policy is not None:
             raise ValueError(
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
+        controllers = controllers_of(self.policies, robot)
+        if {*controllers} == {"old", "new"} and self.archive is not None:
+            if self.sets or self.independent or self.part != "test":
+                raise ValueError("old and new are compared on --archive: leave --sets, --independent and --part out")
+            report = compare(
+                robot, **controllers, archive_path=self.archive, compute=compute, space=self.space, out=self.out, **size
+            )
+            return int(report["regression"])
         cfg = SetsCfg(
             names=tuple(split_words(self.sets)), archive=self.archive, independent=self.independent, space=self.space,
             part=self.part, **size,
         )  # fmt: skip
-        evaluate_tables(robot, controllers_of(self.policies, robot), cfg, compute=compute, out=self.out)
+        evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
+        return 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from qd.archive import ARCHIVE_FILE, Archive
 from qd.evaluate.figures import draw_tables
-from qd.evaluate.marks import check_untrained
+from qd.evaluate.marks import check_untrained, marks_of, recorded_marks
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     HELD_OUT,
@@ -19,11 +19,12 @@ from qd.evaluate.sets import (
     make_sets,
     paper_terrains,
     plain_set,
+    random_elites,
     read_elites,
     read_independent,
     split_elites,
 )
-from qd.evaluate.show import show_rates, show_tables
+from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Controller, Tables, check_seeds, make_tables
 from qd.run.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
@@ -202,6 +203,65 @@ def evaluate_tables(
         return {**origin, **robot_identity(robot), **about, **tables}
 
     return publish(out, make, show_tables, draw=lambda tables: as_png(draw_tables(tables)))
+
+
+def compare(
+    robot: RobotCfg,
+    old: str,
+    new: str,
+    archive_path: Path,
+    *,
+    compute: Compute,
+    space: str | None = None,
+    terrains: int | None = None,
+    episodes: int | None = None,
+    seed: int = 0,
+    out: Path | None = None,
+    open_evaluator: OpenEvaluator = open_evaluator,
+) -> dict[str, Any]:
+    """Compares a new controller with an old one on elites of an archive that neither was trained on.
+
+    Both have the same episodes. It is a *regression* if the 95 % interval of the difference of the mean goal rates, new
+    minus old, lies wholly below 0: terrain by terrain, bootstrap over families. A terrain that newly fails alone is
+    none, since among hundreds some do by chance.
+
+    Returns:
+        The tables of the set ``elites`` (:func:`qd.evaluate.tables.make_tables`), with ``regression`` behind them. They
+        are printed and written; without ``out`` the file lies under runs/.
+    """
+    full = (paper_terrains(robot.name), EPISODES)
+    terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=_SMALL)
+    controllers = {"old": old, "new": new}
+    check_seeds(controllers)
+    for policy in controllers.values():
+        check_policy(policy, robot, compute.device)
+    archive = read_elites(archive_path, robot, space)
+    trained_on = recorded_marks(old) | recorded_marks(new)
+    is_new = ~np.isin(marks_of(archive.genes), [*trained_on])
+    elites = random_elites("elites", archive, terrains, seed, is_new)
+    assert elites.families is not None
+    if (families := len(np.unique(elites.families))) < 2:
+        raise ValueError(
+            f"archive must have elites of 2 families or more that neither controller was trained on, got {len(elites)} "
+            f"of {families} in {archive_path}: give another"
+        )
+
+    def make() -> dict[str, Any]:
+        tables = evaluate(
+            controllers, {"elites": elites}, robot=robot, compute=compute, episodes=episodes, seed=seed,
+            cache=crossings_folder(robot), open_evaluator=open_evaluator,
+        )  # fmt: skip
+        limits = tables["differences"]["elites"]["old -> new"]["gain"]["goal"]["interval"]
+        return {
+            **origin_of(compute.device, seed, compute.workers),
+            **robot_identity(robot),
+            "archive": _about(archive_path, archive),
+            "archive_sha256": _file_sha256(archive_path),
+            **tables,
+            "regression": limits is not None and limits[1] < 0.0,
+        }
+
+    return publish(out or RUNS / f"{robot.name}-compared.json", make, show_comparison)
 
 
 def _about_archives(cfg: SetsCfg, archive: Archive | None, independent: Archive | None) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from qd.run.directory import RESULTS, RUNS
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, read_json, write_atomically
-from sim.files.command import publish
+from sim.files.command import publish, say
 from sim.files.intervals import wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
@@ -134,6 +134,15 @@ def evaluate_pack(
         }
 
     return publish(out or RUNS / f"{controller}-pack.json", measure, show_pack_test)
+
+
+def passes(report: dict[str, Any], least: float) -> bool:
+    """Whether the lower end of the goal rate's interval of :func:`evaluate_pack` is at least so high; prints both."""
+    limits = report["rates"]["goal_interval"]
+    low = limits[0] if limits else 0.0  # of one family nothing is known of the spread
+    word, style = ("passes", "bold green") if low >= least else ("fails", "bold red")
+    say((word, style), f": at least {low:.3f} of the robots reach the goal (95 %), asked for {least:.3f}")
+    return low >= least
 
 
 def make_pack(

@@ -37,9 +37,9 @@ MIN_ELITES = 5
 _OTHER_TERRAINS = 300  # of a robot that the paper does not have
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
-_KEYS = {"test": 20250604, "validation": 20250606}  # with the set's number and the seed, the entropy of a set
+_KEYS = {"test": 20250604, "validation": 20250606}  # with place of name and seed, the entropy of a set
 _SPLIT_KEY = 20250605
-_NUMBERS = {"hand_crafted": 0, "hard_random": 1, "flat": 2, "generated": 3, "pack": 4, INDEPENDENT: 5, "dose": 6}
+_NAMES = ("hand_crafted", "hard_random", "flat", "generated", "pack", INDEPENDENT, "dose", "elites")
 _BANK = 50  # height maps that are compared at once
 
 
@@ -185,7 +185,7 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
 
 def set_rng(name: str, seed: int, part: Part = "test") -> np.random.Generator:
     """Random numbers of a set, shared with no other use of ``seed`` in the project."""
-    return np.random.default_rng([_KEYS[part], _NUMBERS[name], seed])
+    return np.random.default_rng([_KEYS[part], _NAMES.index(name), seed])
 
 
 def _episode_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint32]:
@@ -223,12 +223,15 @@ def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") 
     return _set_of_elites("generated", archive, held_out[:count], seeds[:count])
 
 
-def independent_set(archive: Archive, count: int, seed: int) -> TerrainSet:
-    """Elites that nobody was trained on: ``count`` of them, or all; ``seed`` draws them and their episodes."""
-    rng = set_rng(INDEPENDENT, seed)
+def random_elites(
+    name: str, archive: Archive, count: int, seed: int, allowed: NDArray[np.bool_] | None = None
+) -> TerrainSet:
+    """``count`` elites of an archive, or all, of those ``allowed``, shape (N,); ``seed`` draws them and episodes."""
+    rng = set_rng(name, seed)
     rows = _in_order_of_genes(archive)[rng.permutation(len(archive))]
     seeds = _episode_seeds(rng, len(archive))
-    return _set_of_elites(INDEPENDENT, archive, rows[:count], seeds[:count])
+    chosen = slice(None) if allowed is None else allowed[rows]
+    return _set_of_elites(name, archive, rows[chosen][:count], seeds[chosen][:count])
 
 
 def _set_of_elites(name: str, archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
@@ -320,5 +323,5 @@ def make_sets(
             distance = nearest_distance(whole.terrains, training_genes, space_of(archive))
             sets["generated_far"] = far_third(whole, distance)
     if independent is not None and INDEPENDENT in names:
-        sets[INDEPENDENT] = independent_set(independent, count, seed)
+        sets[INDEPENDENT] = random_elites(INDEPENDENT, independent, count, seed)
     return {name: sets[name] for name in SETS if name in names}

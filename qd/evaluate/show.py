@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from qd.evaluate.labels import CERTIFIED, MEASURES, SETS
+from sim.files.command import say
 from sim.files.intervals import value_words
 
 _WIDTH = 160  # of tables in a file
@@ -131,6 +132,21 @@ def _show_differences(differences: dict[str, Any]) -> None:
     if rows:
         title = "terrains on which under half of the episodes reach the goal; in brackets beyond chance"
         show_table(title, ("", "mended", "newly broken", "still failing", "of", "gain of the goal rate"), rows)
+
+
+def show_comparison(report: dict[str, Any]) -> None:
+    """Prints what became of elites from an old controller to a new one."""
+    change = report["differences"]["elites"]["old -> new"]
+    for name in ("old", "new"):
+        goal = value_words(report["goal"]["elites"][name], report["intervals"]["goal"]["elites"][name])
+        say(f"{name}: {goal} of the robots reach the goal")
+    for fate, words, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
+        count, numbers = change[fate]["count"], ", ".join(map(str, change[fate]["terrains"]))
+        which = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
+        say((f"{count} of {change['compared']} elites {words}", style if count else ""), which)
+    gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+    verdict = ("a regression", "bold red") if report["regression"] else ("no regression", "bold green")
+    say(f"new - old: {gain}, 95 % interval over families: ", verdict)
 
 
 def show_pack(report: dict[str, Any]) -> None:

@@ -5,12 +5,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qd.archive import write_archive
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
-from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables, sizes_for
+from qd.evaluate.evaluate import SetsCfg, compare, evaluate_rates, evaluate_tables, sizes_for
 from qd.evaluate.labels import SETS
 from qd.evaluate.sets import split_elites
 from qd.workers.evaluator import Compute
@@ -77,6 +78,31 @@ def test_settings_are_chosen_on_terrains_that_are_not_reported(anymal, archive):
     assert (report["part"], report["terrains"]["generated"]) == ("validation", 2)
 
 
+def test_a_new_controller_is_compared_with_the_old_one_on_elites_that_neither_was_trained_on(
+    anymal, archive, tmp_path, capsys
+):
+    elites = make_archive(30)
+    new = str(write_trained(tmp_path, elites.genes[:20]))
+    # Of ten elites left, by the sign of the first gene: what old crosses of these, new does not, and new all others.
+    crosser = Crosser(lambda policy, genes: (genes[:, 0] > 0) != (policy == new))
+    given = {"compute": CPU, "terrains": 99, "episodes": 4, "open_evaluator": crosser.open}
+    report = compare(anymal, STAND, new, archive, **given)
+    assert json.loads(Path("runs/anymal-compared.json").read_text()) == json.loads(json.dumps(report))
+    was_crossed = 20 + np.flatnonzero(elites.genes[20:, 0] > 0)
+    change = report["differences"]["elites"]["old -> new"]
+    assert (change["compared"], change["newly_broken"]["terrains"]) == (10, was_crossed.tolist())
+    assert set(change["mended"]["terrains"]) == {*range(20, 30)} - {*was_crossed}
+    # Six gain, four lose. None of 4 episodes is at most .49 (Wilson), all are at least .51: beyond chance.
+    assert change["gain"]["goal"]["mean"] == pytest.approx(0.2) and not report["regression"]
+    assert "4 of 10 elites newly failed, 4 of them" in capsys.readouterr().out
+    given["open_evaluator"] = Crosser(lambda policy, genes: [policy == STAND] * 30).open
+    worse = compare(anymal, STAND, STRETCH, archive, seed=1, **given)
+    assert worse["regression"] and worse["goal"]["elites"] == {"old": 1.0, "new": 0.0}
+    trained_on_all = str(write_trained(tmp_path, elites.genes))
+    with pytest.raises(ValueError, match="archive"):
+        compare(anymal, STAND, trained_on_all, archive, **given)
+
+
 @pytest.mark.parametrize("where", ["test", "validation", "independent"])
 def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive, tmp_path, where):
     other = make_archive(9, seed=1)
@@ -121,6 +147,8 @@ def test_sizes():
         (["--policies", "C-G=shipped", "C-G@1=shipped"], "C-G@1"),
         (["--policy", "x.pt", "--sets", "hard_random"], "--policies"),
         (["--pack", "anymal", "--policies", "a=shipped"], "--pack"),
+        (["--fail-under", "0.9"], "--fail-under"),
+        (["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--sets", "hard_random"], "--sets"),
     ],
 )
 def test_errors_come_before_any_work_in_one_line(archive, flags, field, monkeypatch, capsys):
@@ -141,3 +169,7 @@ def test_the_command_hands_its_flags_on(archive, monkeypatch):
     assert (robot.name, list(controllers), cfg.names, cfg.seed) == ("anymal", ["base"], ("hard_random", "generated"), 3)
     assert run_command(Evaluate, ["--space", "course", "--robot", "cassie", "--device", "cpu"], name="evaluate") == 0
     assert given["args"][0].name == "cassie" and given["space"] == "course"
+    for regression in (False, True):
+        monkeypatch.setattr(evaluation, "compare", lambda *_, given=regression, **named: {"regression": given})
+        flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--device", "cpu"]
+        assert run_command(Evaluate, flags, name="evaluate") == int(regression)

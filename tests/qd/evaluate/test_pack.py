@@ -16,6 +16,7 @@ from qd.evaluate.pack import (
     evaluate_pack,
     make_pack,
     pack_folder,
+    passes,
     rates_by_group,
     rates_over_all,
     read_pack,
@@ -221,3 +222,13 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     assert not crosser.opened[0].reward and not crosser.opened[0].resolved
     whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **given)
     assert whole["rates"]["terrains"] == 3
+
+
+@pytest.mark.parametrize(("least", "status"), [(0.25, 0), (0.26, 1)])
+def test_ci_fails_where_the_goal_rate_may_be_lower(pack, monkeypatch, capsys, least, status):
+    rates = {"rates": {"goal_rate": 0.5, "goal_interval": [0.25, 0.75]}}
+    monkeypatch.setattr("qd.evaluate.pack.evaluate_pack", lambda *_, **named: rates)
+    flags = ["--pack", "pack", "--device", "cpu", "--fail-under", str(least)]
+    assert run_command(Evaluate, flags, name="evaluate") == status
+    assert "0.250" in (out := capsys.readouterr().out) and f"{least:.3f}" in out
+    assert not passes({"rates": {"goal_interval": None}}, 0.1)  # one family says nothing of its spread

@@ -12,10 +12,10 @@ from qd.evaluate.labels import SETS
 from qd.evaluate.sets import (
     far_third,
     generated_set,
-    independent_set,
     make_sets,
     nearest_distance,
     plain_set,
+    random_elites,
     read_independent,
     set_rng,
     split_elites,
@@ -76,7 +76,7 @@ def test_sets_are_what_they_were():
     archive = make_archive(60)
     generated = generated_set(archive, 2, 0)
     assert generated.numbers.tolist() == [10, 38] and generated.seeds.tolist() == [1519996775, 4170185451]
-    independent = independent_set(archive, 2, 0)
+    independent = random_elites("generated_independent", archive, 2, 0)
     assert independent.numbers.tolist() == [48, 42] and independent.seeds.tolist() == [2023635066, 1145927465]
 
 
@@ -125,7 +125,7 @@ def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
     small = make_archive(10)
     assert generated_set(small, 300, 0).families.tolist() == [0, 1]
     alike = replace(small, genes=np.repeat(small.genes[:2], 5, axis=0))
-    assert np.unique(independent_set(alike, 9, 0).families).tolist() == [0, 1]
+    assert np.unique(random_elites("elites", alike, 9, 0).families).tolist() == [0, 1]
 
 
 def test_elites_carry_the_certificates_of_their_rows():
