@@ -38,10 +38,10 @@ def test_pages_are_short_and_readme_leads_to_each():
 
 @pytest.mark.parametrize("line", sorted({line for page in PAGES for line in pages.commands_of(page)}))
 def test_commands_are_taken(line):
-    program, word, *flags = pages.run_by_make(shlex.split(line)) if line.startswith("make") else shlex.split(line)
-    if program.endswith("faultline") and "--help" not in (word, *flags):
-        module, _, name = COMMANDS[word].where.partition(":")
-        tyro.cli(getattr(importlib.import_module(module), name), args=flags)
+    program, *flags = pages.run_by_make(shlex.split(line)) if line.startswith("make") else shlex.split(line)
+    if program.endswith("faultline") and "--help" not in flags:
+        module, _, name = COMMANDS[flags[0]].where.partition(":")
+        tyro.cli(getattr(importlib.import_module(module), name), args=flags[1:])
 
 
 @pytest.mark.parametrize("page", PAGES)
