@@ -46,7 +46,7 @@ def super_gaussian(bump: Bump, x: float, y: float) -> float:
     offset = wp.vec2(x, y) - bump.centre
     u = wp.abs(wp.dot(bump.across, offset))
     v = wp.abs(wp.dot(bump.along, offset))
-    if u > bump.reach[0] or v > bump.reach[1]:
+    if bump.height == 0.0 or u > bump.reach[0] or v > bump.reach[1]:
         return 0.0
     return bump.height * wp.exp(-wp.pow(u, bump.power[0]) - wp.pow(v, bump.power[1]))
 

@@ -229,7 +229,7 @@ _SHAPES = {
     **dict.fromkeys((*_TEXTS, "intervals", "collision_bit", "iterations"), ""),
     **dict.fromkeys(("penalties", "scales"), "P"),
     **dict.fromkeys(_CERTIFIERS, "C"),
-    "genes": "NG", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
+    "genes": "NG", "end_position": "N2", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
     **dict.fromkeys(("resolved_outcomes", "mujoco_c_outcomes"), "N4"),
     **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
 }  # fmt: skip
@@ -271,7 +271,10 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _OPTIONAL or name in stored]
         fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
         fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
-        arrays = read_arrays(file, [*names, *fresh_names, *fault_names])
+        expected = [*names, *fresh_names, *fault_names]
+        unknown = {name for name in expected if name.endswith("end_position")} - stored
+        arrays = read_arrays(file, [name for name in expected if name not in unknown])
+        arrays |= dict.fromkeys(unknown, np.full((arrays["fitness"].size, 2), np.nan, np.float32))
         _check_shapes(arrays)
         fresh = {name.removeprefix(_PREFIX): arrays[name] for name in fresh_names}
         faults = {name: _as_field(name, arrays[name]) for name in fault_names}
@@ -295,7 +298,7 @@ def _as_field(name: str, array: NDArray[Any]) -> Any:
 
 def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
     """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
-    sizes = {"4": len(OUTCOMES), "P": arrays["penalties"].size, "N": arrays["fitness"].size}
+    sizes = {"2": 2, "4": len(OUTCOMES), "P": arrays["penalties"].size, "N": arrays["fitness"].size}
     sizes |= {"G": arrays["genes"].shape[-1], "C": arrays["certifiers"].size if "certifiers" in arrays else 0}
     for name, array in arrays.items():
         expected = tuple(sizes[letter] for letter in _SHAPES.get(name.removeprefix(_PREFIX), "N"))

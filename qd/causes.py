@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.bank import terrains_of
+from kernels.ground import FIRM
+from sim.bank import heights_of, terrains_of
 from sim.crossing import CrossingCfg
 from sim.ground import PATCHES, patches_at
 from sim.spaces.base import TerrainSpace
+from sim.spaces.ground import OnGround
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 LEAST_HEIGHT = 0.03
@@ -24,6 +26,15 @@ SHORT = 1.0
 NARROW = 0.5
 """A part that falls to half of its height nearer than this beside the way ends there [m]."""
 
+HALF_WIDTH = 0.35
+"""Half the width of a stance, where the robot is not known [m]; the shipped robots have 0.4 m and 0.3 m."""
+SLIPPERY, SOFT = "slippery ground", "soft ground"
+UNCLEAR = "unclear"
+"""The cause where no part of the terrain lies where robots end."""
+
+_BEHIND, _AHEAD, _BESIDE = 1.0, 1.5, 0.5  # of the place where robots end, what may have stopped them there [m]
+_BESIDE_THE_WAY = "beside the way"
+_COARSE = 2  # nodes; parts are compared at 0.1 m
 _NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
 _FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is met first counts
 
@@ -84,8 +95,15 @@ class Effects:
         """The shape of a part; of one that changes the ground and no height on the way, its kind alone."""
         if not self.patches[part].any() or on_the_way(self.heights[part], half_width) >= LEAST_HEIGHT:
             return shape_of(self.heights[part], half_width)
-        kind = "slippery ground" if self.slippery[part].any() else "soft ground"
+        kind = SLIPPERY if self.slippery[part].any() else SOFT
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
+
+
+def commonest_words(cause: str) -> str:
+    """That most terrains stop the robot by a cause: ``ridges are the commonest cause``."""
+    if cause in (SLIPPERY, SOFT):
+        return f"{cause} is the commonest cause"
+    return f"{cause}{'es' if cause.endswith('ch') else 's'} are the commonest cause"
 
 
 def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
@@ -104,6 +122,61 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainS
         slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],
         soft=nothing if ground is None else ground.time_constant_s[0] != ground.time_constant_s[1:],
     )
+
+
+def causes_at(
+    genes: NDArray[np.float32], ends: NDArray[np.floating], space: TerrainSpace, half_width: float = HALF_WIDTH
+) -> list[str]:
+    """What stops robots that end at a place of each terrain, in a word or two as :attr:`Shape.kind`.
+
+    It is the part which, alone on flat ground, has the largest difference of heights from 1 m behind that place to
+    1.5 m ahead of it. Where none has :data:`LEAST_HEIGHT` it is slippery or soft ground, or :data:`UNCLEAR`.
+
+    Args:
+        genes: Shape (N, num_genes).
+        ends: World-local x and y of the places [m], shape (N, 2); NaN where they are not known.
+        space: What the genes mean.
+        half_width: Half the width of the robot's stance [m].
+    """
+    return [_cause_at(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
+
+
+def _cause_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace, half_width: float) -> str:
+    if not np.isfinite(end).all():
+        return UNCLEAR
+    raised = space.inner if isinstance(space, OnGround) else space
+    row = genes[None, : raised.num_genes]
+    parts = range(len(raised.parts(row[0])))
+    alone = [raised.without(row, [other for other in parts if other != part]) for part in parts] or [row]
+    every = _COARSE if space.any_spacing else 1
+    fields = heights_of(np.concatenate(alone), raised, every=every)
+    heights = [np.ptp(field[_around(end, every * SPACING, field.shape)]) for field in fields]
+    part = int(np.argmax(heights))
+    if heights[part] >= LEAST_HEIGHT:
+        field = fields[part] if every == 1 else heights_of(alone[part], raised)[0]
+        at_end = np.roll(field, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
+        kinds = (shape_of(heights, half_width).kind for heights in (field, at_end))  # robots may leave the straight way
+        return next((kind for kind in kinds if kind != _BESIDE_THE_WAY), UNCLEAR)
+    return _ground_at(genes, end, space) if space.ground else UNCLEAR
+
+
+def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of the nodes near a place, or nearest to it at the edge."""
+    (x, y), (last_row, last_column) = end.tolist(), np.array(shape) - 1
+    rows = np.clip(np.rint(np.array([y - _BESIDE, y + _BESIDE]) / spacing), 0, last_row).astype(int)
+    columns = np.clip(np.rint(np.array([x - _BEHIND, x + _AHEAD]) / spacing), 0, last_column).astype(int)
+    return slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
+
+
+def _ground_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
+    """What the ground at a place is like if it is unlike other ground."""
+    ground, (x, y) = terrains_of(genes[None], space)[1], end.tolist()
+    assert ground is not None
+    row = patches_at(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
+    column = patches_at(x, SPACING * (NUM_COLS - 1), PATCHES[1])
+    if ground.friction[0, row, column] < 1.0:
+        return SLIPPERY
+    return SOFT if ground.time_constant_s[0, row, column] != FIRM else UNCLEAR
 
 
 def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
@@ -144,7 +217,7 @@ def _kind_of(shape: dict[str, float]) -> str:
     """The kind of a shape by the limits above; docs/faults.md has them as a table."""
     raised = shape["height_m"] > 0.0
     if abs(shape["height_m"]) < LEAST_HEIGHT:
-        return "beside the way"
+        return _BESIDE_THE_WAY
     if shape["slope_deg"] < GENTLE:
         return "gentle hill" if raised else "gentle hollow"
     if shape["length_m"] <= SHORT:

@@ -64,6 +64,8 @@ class Evaluation:
     """Share of episodes that reached the goal, shape (T,)."""
     fallen_rate: NDArray[np.float64]
     """Share of episodes that ended tilted by more than 60 degrees, shape (T,)."""
+    end_position: NDArray[np.float32]
+    """Where the typical episode ended (:func:`typical_ends`), world-local x and y [m], shape (T, 2)."""
     invalid_episodes: NDArray[np.int64]
     """Episodes left out, shape (T,)."""
     episodes: NDArray[np.int64]
@@ -119,7 +121,7 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
         cfg: Penalties, their scales and the weights.
 
     Returns:
-        The evaluation. An invalid terrain has fitness -20, equal ratios and otherwise zeros, never NaN.
+        The evaluation. An invalid terrain has fitness -20, equal ratios, no end position (NaN) and otherwise zeros.
     """
     penalties = _scaled_penalties(result, cfg)
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
@@ -137,9 +139,34 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
         collision_rate=collision_rate,
         goal_rate=_rate(result.reached_goal, counted),
         fallen_rate=_rate(result.fallen, counted),
+        end_position=typical_ends(result, counted),
         invalid_episodes=invalid.sum(axis=1),
         episodes=np.full(len(invalid), invalid.shape[1]),
     )
+
+
+def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Where the typical episode of each terrain ended: the median, by coordinate, of those that ended alike.
+
+    Those are the episodes at the goal where at least half reach it. Else they are those that ended in the commonest of
+    the other ways, which are a base collision, the end of the time, and leaving the terrain.
+
+    Args:
+        result: Episodes of T terrains x R replicas.
+        counted: Which of them count, shape (T, R).
+
+    Returns:
+        World-local x and y [m], shape (T, 2); NaN where no episode counts.
+    """
+    ends = np.full((len(counted), 2), np.nan, np.float32)
+    for row in np.flatnonzero(counted.any(axis=1)).tolist():
+        outcome, arrived = result.outcome[row], result.reached_goal[row]
+        failed = counted[row] & ~arrived
+        alike = counted[row] & arrived
+        if failed.sum() > alike.sum():
+            alike = failed & (outcome == np.bincount(outcome[failed]).argmax())
+        ends[row] = np.median(result.final_position[row, alike, :2], axis=0)
+    return ends
 
 
 def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.float64]:

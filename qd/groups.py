@@ -1,11 +1,12 @@
 """The elites of an archive by what is known best of each, in groups and in orders to show them in.
 
 Elites are grouped in two ways. Families: terrains that are much alike, so that they are not independent of each other.
-Modes: failing elites on which the controller struggles in the same way and whose crossings end in the same way.
+Causes: failing elites on which a part of the same kind stops the robot, such as a ridge.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,13 @@ from scipy.spatial.distance import pdist, squareform
 from sklearn.metrics import silhouette_score
 
 from qd.archive import Archive
+from qd.causes import HALF_WIDTH, UNCLEAR, causes_at, commonest_words
+from qd.faults import count_faults
 from qd.fitness import FAILING_GOAL_RATE
+from qd.minima import MinimalTerrains
 from sim.bank import heights_of
+from sim.crossing import CrossingCfg
+from sim.robots.shipped import ROBOTS
 from sim.spaces.base import TerrainSpace
 
 VERDICTS = ("", "failing", "confirmed", "certified", "fault")
@@ -37,7 +43,7 @@ _MEANS = ("goal_rate", "collision_rate", "other_rate", "fallen_rate", "fitness")
 _MIN_ELITES = 10  # of fewer a silhouette says nothing
 
 ORDERS = {
-    "modes": "each way of failing once first",
+    "cause": "faults first, one a cause",
     "fault": "faults first",
     "goal_rate": "goal rate, the lowest first",
     "collision_rate": "base collision, the most first",
@@ -89,6 +95,8 @@ class Elites:
     """Share that ended in a base collision, shape (N,)."""
     fallen_rate: NDArray[np.float64]
     """Share that ended tilted by more than 60 degrees, shape (N,)."""
+    end_position: NDArray[np.float32]
+    """Where the typical episode ended [m], shape (N, 2); NaN where that is not known."""
     reproduced: NDArray[np.bool_]
     """Whether fresh episodes landed in its cell or a neighbour; True where there are none; shape (N,)."""
     verdict: NDArray[np.int64]
@@ -125,6 +133,15 @@ class Elites:
         """Episodes of the elite in a row that a rate counts."""
         return round(float(getattr(self, rate)[place]) * int(self.counted[place]))
 
+    def ending(self, row: int) -> tuple[str, str]:
+        """How most robots that fail an elite end, in words, and the name of the rate that counts them."""
+        if self.collision_rate[row] >= self.other_rate[row]:
+            most_fall = 2 * self.fallen_rate[row] > self.collision_rate[row]
+            return "topples" if most_fall else "hits the ground", "collision_rate"
+        place, limits = self.end_position[row], (CrossingCfg.lower, CrossingCfg.upper)
+        is_out = (place <= limits[0]).any() or (place >= limits[1]).any()
+        return "leaves the terrain" if is_out else "gets stuck", "other_rate"
+
     def by_severity(self) -> NDArray[np.int64]:
         """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
 
@@ -139,7 +156,7 @@ class Elites:
 
 
 _FROM_FRESH = ("cell", "fitness", "ratios", "penalty_mean", "penalty_std", "episodes", "invalid_episodes", "goal_rate",
-               "collision_rate", "fallen_rate")  # fmt: skip
+               "collision_rate", "fallen_rate", "end_position")  # fmt: skip
 
 
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
@@ -305,60 +322,123 @@ def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArr
 
 @dataclass(frozen=True, kw_only=True)
 class Ranking:
-    """N elites, their failure modes and their families, in orders to show them in."""
+    """N elites, why they stop the robot, and their families, in orders to show them in."""
 
     elites: Elites
-    modes: Modes
-    """Groups of those that fail, by how the robot struggles."""
+    causes: tuple[str, ...]
+    """What stops the robot on each, such as ``ridge``: the cause of its minimal terrain, or where there is none of the
+    place where its typical episode ends (:func:`qd.causes.causes_at`). Empty of an elite that does not fail."""
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
 
-    def order(self, by: str = "modes") -> NDArray[np.int64]:
+    def name(self, row: int) -> str:
+        """An elite by its own cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""
+        elites = self.elites
+        if not elites.failing[row]:
+            return f"crossed, {elites.hits('goal_rate', row)} of {elites.counted[row]}"
+        ending, rate = elites.ending(row)
+        return f"{self.causes[row]}: {ending}, {elites.hits(rate, row)} of {elites.counted[row]}"
+
+    def by_cause(self) -> dict[str, NDArray[np.int64]]:
+        """Rows of the failing elites by cause, within each the worst first; the commonest first, the unclear last."""
+        rows: dict[str, list[int]] = {}
+        for row in self.elites.by_severity().tolist():
+            if self.causes[row]:
+                rows.setdefault(self.causes[row], []).append(row)
+        commonest = sorted(rows, key=lambda cause: (cause == UNCLEAR, -len(rows[cause])))
+        return {cause: np.array(rows[cause], np.int64) for cause in commonest}
+
+    def order(self, by: str = "cause") -> NDArray[np.int64]:
         """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
 
-        ``modes`` begins with the worst terrain of each mode that has one on which the controller fails, no two of one
-        family where that can be had. The worst failing terrain of each other family follows, then the rest.
+        ``cause`` begins with the worst terrain of each cause, no two of one family where that can be had: faults first,
+        then the commonest cause. The worst failing terrain of each other family follows, then the rest.
         """
         severity = self.elites.by_severity()
         if by == "fault":
             return severity
-        if by == "modes":
+        if by == "cause":
             return self._leading(severity)
         values = self.families if by == "family" else np.asarray(getattr(self.elites, by))
         sign = 1 if by in ("family", "goal_rate") else -1
         return severity[np.argsort(sign * values[severity], kind="stable")]
 
     def _leading(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
-        failing = severity[self.elites.failing[severity]].tolist()
-        labels, families = self.modes.labels.tolist(), self.families.tolist()
+        families = self.families.tolist()
         leading: dict[int, int] = {}  # families by row
-        for mode in dict.fromkeys(labels[row] for row in failing):
-            of_mode = [row for row in failing if labels[row] == mode]
-            leader = next((row for row in of_mode if families[row] not in leading.values()), of_mode[0])
+        for rows in self.by_cause().values():
+            leader = next((row for row in rows.tolist() if families[row] not in leading.values()), int(rows[0]))
             leading[leader] = families[leader]
-        for row in failing:
+        leading = dict(sorted(leading.items(), key=lambda pair: -int(self.elites.verdict[pair[0]])))
+        for row in severity[self.elites.failing[severity]].tolist():
             if families[row] not in leading.values():
                 leading[row] = families[row]
-        return np.array([*leading, *np.setdiff1d(severity, [*leading], assume_unique=True)], dtype=np.int64)
+        return np.array([*leading, *severity[~np.isin(severity, [*leading])]], dtype=np.int64)
+
+    def worst(self, count: int) -> list[int]:
+        """Numbers of the first terrains of the order ``cause``."""
+        return self.elites.numbers[self.order()[:count]].tolist()
+
+    def leaders(self) -> list[int]:
+        """Numbers of the terrains that stand for a cause, one of each."""
+        return self.worst(len(self.by_cause()))
+
+    @cached_property
+    def modes(self) -> Modes:
+        """Groups of those that fail, by how the robot struggles."""
+        return failure_modes(self.elites)
 
     def mode_of(self, place: int) -> Mode | None:
         """The mode of the elite in a row; None if it does not fail."""
         number = int(self.modes.labels[place])
         return self.modes.modes[number - 1] if number else None
 
-    def leaders(self) -> list[int]:
-        """Numbers of the terrains that stand for a way of failing, one for each mode in which terrains fail."""
-        return self.worst(len(np.unique(self.modes.labels[self.elites.failing])))
 
-    def worst(self, count: int) -> list[int]:
-        """Numbers of the first terrains of the order ``modes``."""
-        return self.elites.numbers[self.order()[:count]].tolist()
+def rank(
+    archive: Archive, space: TerrainSpace, minima: MinimalTerrains | None = None, *, judged: bool = False
+) -> Ranking:
+    """The ranking of an archive that has elites.
 
-
-def rank(archive: Archive, space: TerrainSpace, *, judged: bool = False) -> Ranking:
-    """The ranking of an archive that has elites; ``judged`` leaves out those whose fresh episodes are invalid."""
+    Args:
+        archive: The elites.
+        space: What their genes mean.
+        minima: Their minimal terrains, which say best what the cause is.
+        judged: Whether elites whose fresh episodes are invalid are left out.
+    """
     elites = elites_of(archive, judged=judged)
     families = families_of(archive.genes[elites.numbers], space)
     by_worst = [*dict.fromkeys(families[elites.by_severity()].tolist())]
     numbers = 1 + np.argsort(by_worst)[families]
-    return Ranking(elites=elites, modes=failure_modes(elites), families=numbers)
+    return Ranking(elites=elites, causes=_causes_of(elites, archive, space, minima), families=numbers)
+
+
+def _causes_of(
+    elites: Elites, archive: Archive, space: TerrainSpace, minima: MinimalTerrains | None
+) -> tuple[str, ...]:
+    entries = [] if minima is None else minima.numbers["elites"]
+    of_minimal = {entry["elite"]: entry["cause"]["kind"] for entry in entries if entry["cause"]}
+    causes = [of_minimal.get(number, UNCLEAR) for number in elites.numbers.tolist()]
+    left = [row for row in np.flatnonzero(elites.failing).tolist() if causes[row] == UNCLEAR]
+    half_width = ROBOTS[archive.robot].footprint[1] if archive.robot in ROBOTS else HALF_WIDTH
+    at_ends = causes_at(archive.genes[elites.numbers[left]], elites.end_position[left], space, half_width)
+    for row, cause in zip(left, at_ends, strict=True):
+        causes[row] = cause
+    return tuple(cause if failing else "" for cause, failing in zip(causes, elites.failing.tolist(), strict=True))
+
+
+def summary_of(ranking: Ranking, archive: Archive) -> str:
+    """What a search says of the controller, in one plain sentence."""
+    elites, by_cause = ranking.elites, ranking.by_cause()
+    failing = int(elites.failing.sum())
+    terrains = f"{len(elites):,} terrain{'s' * (len(elites) != 1)}"
+    if not failing:
+        return f"The robot crosses {'all ' * (len(elites) > 1)}{terrains}"
+    words = [f"{failing:,} of {terrains} {'stops' if failing == 1 else 'stop'} the robot"]
+    commonest = next(iter(by_cause))
+    if commonest != UNCLEAR:
+        words.append(commonest_words(commonest))
+    if archive.faults is not None and archive.faults.certifiers:
+        faults = count_faults(archive)
+        count = int(archive.certified.sum()) if faults is None else faults
+        words.append(f"another controller of this robot crosses {f'{count:,}' if count else 'none of them'}")
+    return "; ".join(words)

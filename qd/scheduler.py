@@ -226,7 +226,7 @@ class Scheduler:
 _RATES = ("collision_rate", "goal_rate", "fallen_rate")
 _COUNTS = ("invalid_episodes", "episodes", "iteration")
 _BY_RATIO = ("ratios", "penalty_mean", "penalty_std")
-_FIELDS = ("genes", *_BY_RATIO, *_RATES, *_COUNTS)
+_FIELDS = ("genes", *_BY_RATIO, *_RATES, *_COUNTS, "end_position")
 
 
 def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:
@@ -235,6 +235,7 @@ def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, 
         **dict.fromkeys(_BY_RATIO, ((cells.num_ratios,), np.float64)),
         **dict.fromkeys(_RATES, ((), np.float64)),
         **dict.fromkeys(_COUNTS, ((), np.int64)),
+        "end_position": ((2,), np.float32),
     }
     return GridArchive(
         solution_dim=num_genes,

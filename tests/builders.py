@@ -53,6 +53,7 @@ def small_archive(num_elites: int = 3) -> Archive:
         collision_rate=rows,
         goal_rate=rows,
         fallen_rate=rows,
+        end_position=np.column_stack([6.0 + rows, 4.0 - rows]).astype(np.float32),
         invalid_episodes=np.zeros(num_elites, int),
         episodes=np.full(num_elites, 4),
         iteration=np.arange(num_elites) + 1,

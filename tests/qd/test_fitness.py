@@ -1,6 +1,9 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
+from kernels.episode import Outcome
 from qd.descriptors import Cells
 from qd.fitness import FitnessCfg, evaluation_of
 from tests.qd.stand_in import make_result
@@ -63,7 +66,23 @@ def test_more_than_a_quarter_of_invalid_episodes_make_a_terrain_invalid(num_inva
     assert evaluation.ratios[0] == pytest.approx([0.25, 0.75] if valid else [0.5, 0.5])
     assert evaluation.collision_rate.tolist() == [1.0 if valid else 0.0]
     assert evaluation.invalid_episodes.tolist() == [num_invalid]
-    assert all(np.isfinite(value).all() for value in vars(evaluation).values())
+    assert np.isfinite(evaluation.end_position).all() == valid
+    assert all(np.isfinite(value).all() for name, value in vars(evaluation).items() if name != "end_position")
+
+
+def test_the_typical_episode_ends_where_the_commonest_ending_of_a_failed_terrain_does():
+    outcomes = np.array([
+        [Outcome.GOAL] * 2 + [Outcome.TIME_OUT] * 2 + [Outcome.BASE_COLLISION] * 1,  # 2 of 5 arrive: it is failed
+        [Outcome.GOAL] * 3 + [Outcome.TIME_OUT] * 2,
+        [Outcome.TIME_OUT] * 2 + [Outcome.BASE_COLLISION] * 2 + [Outcome.INVALID],  # of two as common a collision
+        [Outcome.INVALID] * 2 + [Outcome.OUT] * 3,  # 2 of 5 are more than a quarter
+    ])  # fmt: skip
+    x = np.array([[14, 14.2, 6, 7, 9], [14, 14.2, 14.4, 7, 9], [6, 6, 8, 9, 50], [1, 1, 1, 1, 1]])
+    result = make_result(np.ones((4, 5, 2)), invalid=outcomes == Outcome.INVALID)
+    places = np.stack([x, 4 - x / 10, x], axis=2).astype(np.float32)
+    result = dataclasses.replace(result, outcome=outcomes.astype(np.uint8), final_position=places)
+    ends = evaluation_of(result, CELLS, CFG).end_position
+    np.testing.assert_allclose(ends, [[6.5, 3.35], [14.2, 2.58], [8.5, 3.15], [np.nan, np.nan]], rtol=1e-6)
 
 
 def test_collision_bit_needs_one_collision_in_a_valid_episode():

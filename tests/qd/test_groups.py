@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from kernels.super_gaussian import LOWER, UPPER
+from qd.archive import FaultCounts
 from qd.groups import (
     KIN_M,
     MAX_MODES,
@@ -15,7 +17,9 @@ from qd.groups import (
     find_modes,
     rank,
     rms_distances,
+    summary_of,
 )
+from qd.minimise import MinimalTerrains
 from sim.bank import heights_of
 from sim.files.records import robot_digest
 from sim.robots.find import get_robot
@@ -41,6 +45,12 @@ def grouped_archive(sizes=(6, 9, 5)):
         cell=np.arange(len(kinds)) % archive.cells.num_cells,
     )
     return archive, kinds
+
+
+def bump(*, x, sigma_x, height, y=4.0):
+    """Genes of a bump as broad as can be across the way."""
+    values = np.array([x, y, sigma_x, 3.0, 4.0, 4.0, 0.0, height])
+    return (2.0 * (values - LOWER) / (UPPER - LOWER) - 1.0).astype(np.float32)
 
 
 def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid():
@@ -131,17 +141,79 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
     assert elites.by_severity().tolist() == [4, 3, 2, 1, 0]
 
 
-def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():
-    archive, kinds = grouped_archive()  # 6 stuck, 9 collided, 5 across
+def minima_of(causes):
+    """Minimal terrains with causes of some kinds, by number of the elite."""
+    entries = [{"elite": number, "cause": cause and {"kind": cause}} for number, cause in causes.items()]
+    return MinimalTerrains(numbers={"elites": entries}, genes={})
+
+
+def ranked(ends=(np.nan, np.nan)):
+    """Six elites, worse from the first to the fifth, of which the third is a fault; the last is crossed."""
+    archive = dataclasses.replace(
+        small_archive(6),
+        goal_rate=np.array([0.25, 0.0, 0.0, 0.0, 0.0, 0.75]),
+        collision_rate=np.array([0.0, 0.5, 0.75, 0.75, 1.0, 0.25]),
+        fallen_rate=np.array([0.0, 0.0, 0.25, 0.75, 1.0, 0.0]),
+        end_position=np.full((6, 2), ends, np.float32),
+    )
+    fresh = fresh_values(archive)
+    faults = FaultCounts.none_of(6)
+    crossed = np.array([[0, 20, 0, 0], [20, 0, 0, 0]])[[0, 0, 1, 0, 0, 0]][:, None]
+    faults = dataclasses.replace(
+        faults, resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",), certifier_sha256=("a" * 64,),
+        certifier_outcomes=crossed, certifier_resolved_outcomes=crossed,
+    )  # fmt: skip
+    archive = dataclasses.replace(archive, fresh=fresh, faults=faults)
+    causes = {0: "ridge", 1: "drop", 2: "ridge", 3: "ridge", 4: None, 5: "ridge"}
+    return rank(archive, SUPER_GAUSSIAN, minima_of(causes)), archive
+
+
+def test_an_elite_is_named_by_its_own_cause_and_ending():
+    ranking, _ = ranked()
+    assert ranking.causes == ("ridge", "drop", "ridge", "ridge", "unclear", "")
+    assert [ranking.name(row) for row in range(6)] == [
+        "ridge: gets stuck, 30 of 40",
+        "drop: hits the ground, 20 of 40",  # of two endings as common the collision
+        "ridge: hits the ground, 30 of 40",  # a third of those that collide have fallen
+        "ridge: topples, 30 of 40",
+        "unclear: topples, 40 of 40",
+        "crossed, 30 of 40",
+    ]
+    outside, _ = ranked((9.0, 10.01))
+    assert outside.name(0) == "ridge: leaves the terrain, 30 of 40"
+
+
+def test_causes_are_by_number_and_the_unclear_last():
+    ranking, archive = ranked()
+    by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
+    assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
+    words = "5 of 6 terrains stop the robot; ridges are the commonest cause; another controller of this robot crosses 1"
+    assert summary_of(ranking, archive) == words
+    alone = dataclasses.replace(archive, faults=None, fresh=None)
+    assert summary_of(rank(alone, SUPER_GAUSSIAN), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
+    crossed = dataclasses.replace(alone, goal_rate=np.ones(6))
+    assert summary_of(rank(crossed, SUPER_GAUSSIAN), crossed) == "The robot crosses all 6 terrains"
+
+
+def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
+    ridge, wall = bump(x=6.0, sigma_x=0.5, height=0.25), bump(x=10.0, sigma_x=1.5, height=-0.25)
+    genes = np.concatenate([ridge, wall, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 6])[None].repeat(3, axis=0)
+    ends = np.array([[5.2, 4.0], [8.3, 4.0], [2.0, 4.0]], np.float32)
+    archive = dataclasses.replace(small_archive(3), genes=genes, goal_rate=np.zeros(3), end_position=ends)
+    assert rank(archive, SUPER_GAUSSIAN).causes == ("ridge", "drop", "unclear")
+
+
+def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families():
+    archive, _ = grouped_archive()  # 6 stuck, 9 collided, 5 across
     genes = archive.genes.copy()
     genes[7] = genes[0] = genes[6]  # two collided and one stuck are the same terrain
     goal_rate = archive.goal_rate.copy()
     goal_rate[8:15], goal_rate[0:6] = 0.05, np.linspace(0.01, 0.06, 6)
-    ranking = rank(dataclasses.replace(archive, genes=genes, goal_rate=goal_rate), SUPER_GAUSSIAN)
+    archive = dataclasses.replace(archive, genes=genes, goal_rate=goal_rate)
+    ranking = rank(archive, SUPER_GAUSSIAN, minima_of({n: "drop" if n < 6 else "ridge" for n in range(15)}))
     order = ranking.order()
     assert sorted(order.tolist()) == list(range(20))
-    assert ranking.leaders() == [6, 1] and ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6
-    assert kinds[order[:2]].tolist() == [1, 0]
+    assert ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6
     assert ranking.families[[0, 6, 7]].tolist() == [1, 1, 1]
     by_worst = ranking.families[ranking.order("fault")].tolist()
     assert [*dict.fromkeys(by_worst)] == [*range(1, 1 + len(set(by_worst)))]
@@ -149,6 +221,7 @@ def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():
     assert len(set(ranking.families[order[:count]])) == count  # other families come first
     assert set(order[15:].tolist()) == set(range(15, 20))
     assert ranking.order("fault").tolist()[:2] == [6, 7]
+    assert ranked()[0].order().tolist()[:3] == [2, 1, 4]  # a fault is the worst ridge, and comes before other causes
     families = ranking.families[ranking.order("family")]
     assert families.tolist() == sorted(families) and families[0] == families[1] == 1
     for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
@@ -159,7 +232,7 @@ def test_the_first_are_one_of_each_way_of_failing_and_of_different_families():
 def test_without_failing_elites_nothing_leads():
     archive = dataclasses.replace(small_archive(4), goal_rate=np.ones(4))
     ranking = rank(archive, SUPER_GAUSSIAN)
-    assert ranking.leaders() == [] and sorted(ranking.worst(4)) == [0, 1, 2, 3]
+    assert ranking.by_cause() == {} and sorted(ranking.worst(4)) == [0, 1, 2, 3]
 
 
 def test_a_distance_is_the_root_of_the_mean_square():

@@ -41,7 +41,7 @@ def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
     columns = np.full((len(cell), 6), 1 / 6)
     return Evaluation(
         fitness=np.asarray(fitness, dtype=float), ratios=columns, cell=cell, penalty_mean=columns, penalty_std=columns,
-        collision_rate=rates, goal_rate=rates, fallen_rate=rates,
+        collision_rate=rates, goal_rate=rates, fallen_rate=rates, end_position=np.zeros((len(cell), 2), np.float32),
         invalid_episodes=np.zeros(len(cell), int) if invalid is None else np.asarray(invalid),
         episodes=np.full(len(cell), 4),
     )  # fmt: skip

@@ -37,6 +37,7 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
         collision_rate=rates,
         goal_rate=rates,
         fallen_rate=rates,
+        end_position=np.full((num_elites, 2), 6.0, np.float32),
         invalid_episodes=counts,
         episodes=counts + 4,
         iteration=counts + 1,

@@ -47,7 +47,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     figures = sorted(path.name for path in (out.parent / "report-figures").iterdir())
     assert len(figures) == len(page.resources)
     assert {"curves.png", "archive.png", "spread.png", "modes.png", "elite-0.png"} <= set(figures)
-    assert sum(name.startswith("failing-") for name in figures) == 2
+    assert sum(name.startswith("failing-") for name in figures) == 6
     for name in figures:
         assert matplotlib.image.imread(out.parent / "report-figures" / name).std() > 0.01  # something is drawn
     assert len(crossed) == len(set(crossed)) == sum(name.startswith("elite-") for name in figures)
@@ -86,7 +86,7 @@ def test_the_lead_counts_the_ways_in_which_the_controller_breaks(reported, run):
     assert "15 of 20 elites, in 2 ways." in first and "gets stuck (6, marked by yaw-rate error)" in first
     assert re.search("15 of 20 failure modes.* 2 cells .* 3 ", first)
     assert "OpenGL" in text  # without it terrains are shown from above
-    assert len(list(out.with_name("report-figures").glob("failing-*.jpg"))) == 2
+    assert len(list(out.with_name("report-figures").glob("failing-*.jpg"))) == 6
 
 
 def test_what_is_put_into_a_page_is_escaped():
