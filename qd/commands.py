@@ -139,7 +139,8 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
     stages: tuple[Literal["fresh", "resolved", "others", "mujoco_c"], ...] = ("fresh", "resolved", "others")
     """What to do, in this order."""
     certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, results/<robot>/panel/*.pt and RUN/certifiers/*.pt."""
+    """The other controllers, each NAME=FILE; if left out, RUN/certifiers/*.pt and the robot's panel:
+    sim/robots/<robot>/panel/*.pt, of a robot of your own <robot>/panel/*.pt beside its settings."""
     seed: NonNegativeInt | None = None
     """Seed of the fresh episodes; the search's if left out."""
 

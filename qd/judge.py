@@ -30,7 +30,6 @@ from qd.groups import families_of
 from qd.run.directory import (
     CONFIG_FILE,
     METRICS_FILE,
-    RESULTS,
     SUMMARY_FILE,
     RunDirectory,
     check_space,
@@ -56,8 +55,6 @@ CROSSINGS_FOLDER = "crossings"
 """Folder of a run that keeps what was crossed to judge it."""
 CERTIFIERS_FOLDER = "certifiers"
 """Folder of a run that holds its own certifiers, such as its specialist, ``<name>.pt``."""
-PANEL_FOLDER = "panel"
-"""Folder of a robot's results that holds its fixed certifiers, ``<name>.pt``."""
 
 _BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
 _MOST_IN_MUJOCO_C = 100  # failing elites
@@ -180,7 +177,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
 
 def panel_of(robot: RobotCfg) -> dict[str, str]:
     """The robot's fixed certifiers by name."""
-    return {file.stem: str(file) for file in sorted((RESULTS / robot.name / PANEL_FOLDER).glob("*.pt"))}
+    return {file.stem: str(file) for file in sorted(robot.panel.glob("*.pt"))}
 
 
 def certifiers_of(search: Search) -> dict[str, str]:

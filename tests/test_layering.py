@@ -1,6 +1,8 @@
 """The shape of the house: which room may import what, and how long a file may be."""
 
 import ast
+import subprocess
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -140,3 +142,16 @@ def test_an_offender_is_caught(path, source):
 )
 def test_what_is_allowed_passes(path, source):
     assert offences_of(Path(path), source) == []
+
+
+def test_a_wheel_has_every_file_of_the_rooms():
+    rules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    packages = {path.parent.relative_to(ROOT) for room in ROOMS for path in (ROOT / room).rglob("__init__.py")}
+    packed = {path.relative_to(ROOT).as_posix() for package in packages for path in (ROOT / package).glob("*.py")}
+    for package, patterns in rules.items():
+        folders = packages if package == "*" else [Path(*package.split("."))]
+        for folder in folders:
+            packed |= {p.relative_to(ROOT).as_posix() for rule in patterns for p in (ROOT / folder).glob(rule)}
+    tracked = subprocess.run(["git", "ls-files", *ROOMS], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert [file for file in tracked.splitlines() if file not in packed] == []
+    assert all((ROOT / room / "py.typed").exists() for room in ROOMS)

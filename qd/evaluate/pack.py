@@ -26,7 +26,7 @@ from qd.fitness import FAILING_GOAL_RATE
 from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
 from qd.judge import certifiers_of, find_search
 from qd.minimise import read_minimal
-from qd.run.directory import RESULTS, RUNS
+from qd.run.directory import RUNS
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, read_json, write_atomically
@@ -37,13 +37,12 @@ from sim.files.records import identity
 from sim.policy.spec import about_controllers, crosser_name, is_same
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 PACK_FILE, TERRAINS_FILE = "pack.json", "pack.npz"
-PACK_FOLDER = "pack"
-"""Of a robot's published results."""
 HEIGHT_UNIT_M = 1e-3
 """Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
 NEAR_GOAL_RATE = 0.75
@@ -418,12 +417,15 @@ def write_terrains(folder: Path, heights: NDArray[np.float32], genes: NDArray[np
 
 
 def pack_folder(named: str) -> Path:
-    """The folder of a pack: the one named, or the published one of a robot that is."""
-    published = RESULTS / named / PACK_FOLDER
-    for folder in (Path(named), published):
-        if (folder / PACK_FILE).is_file():
-            return folder
-    raise FileNotFoundError(f"no pack at {named} or {published}: `faultline export --pack` makes one")
+    """The folder of a pack: the one named, or the published one of a shipped robot of that name."""
+    folder = Path(named)
+    if named in ROBOTS and not (folder / PACK_FILE).is_file():
+        folder = ROBOTS[named].pack
+    if not (folder / PACK_FILE).is_file():
+        raise FileNotFoundError(
+            f"no pack at {folder}: give its folder, or one of {', '.join(ROBOTS)}; `faultline export --pack` makes one"
+        )
+    return folder
 
 
 def read_pack(folder: Path) -> Pack:

@@ -57,8 +57,9 @@ def find_run(
     if newest is not None:
         runs.insert(len(runs) if published == "first" else 0, newest)
     if not runs:
+        places = f"{RUNS}/" if published == "never" else f"{RUNS}/ or in {folder} (a clone of the project has it)"
         raise FileNotFoundError(
-            f"no archive of {robot.name} under {RUNS}/: search one with `faultline archive`, or name a run"
+            f"no archive of {robot.name} under {places}: search one with `faultline archive`, or name a run"
         )
     return runs[0]
 

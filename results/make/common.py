@@ -103,23 +103,24 @@ class Script:
         return content
 
 
-def parse(doc: str | None, argv: Sequence[str] | None, file: str) -> Script:
+def parse(doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results") -> Script:
     """Reads the flags that every script has.
 
     Args:
         doc: Says what the script does.
         argv: Words of the command line; those of the process if None.
-        file: Name of the file written, in ``results/<robot>``.
+        file: Name of the file written, in ``<published>/<robot>``.
+        published: Folder of what is published.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robot", default="anymal")
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--small", action="store_true", help="a trial of a minute or so; it publishes nothing")
-    parser.add_argument("--out", type=Path, help=f"file to write; results/<robot>/{file} if left out")
+    parser.add_argument("--out", type=Path, help=f"file to write; {published}/<robot>/{file} if left out")
     args = parser.parse_args(argv)
     robot = get_robot(args.robot)
-    folder = Path("runs/make/small" if args.small else "results") / robot.name
+    folder = Path("runs/make/small" if args.small else published) / robot.name
     return Script(
         robot=robot,
         device=resolve_device(args.device),

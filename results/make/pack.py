@@ -1,4 +1,4 @@
-"""The published pack, results/<robot>/pack: 100 certified terrains, and how often controllers cross them."""
+"""The published pack, sim/robots/<robot>/pack: 100 certified terrains, and how often controllers cross them."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from results.make.common import parse, published_controllers
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Chooses the terrains and lets the published controllers cross them."""
-    script = parse(__doc__, argv, "pack/pack.json")
+    script = parse(__doc__, argv, "pack/pack.json", published="sim/robots")
     size, episodes = (2, 2) if script.small else (100, 20)
     make_pack(
         script.run_of_archive(), published_controllers(script), compute=script.compute, size=size, episodes=episodes,

@@ -136,6 +136,16 @@ class RobotCfg:
         """The penalty scales measured with that controller (``faultline calibrate``)."""
         return self.home / f"{self.name}.scales.json"
 
+    @property
+    def panel(self) -> Path:
+        """Folder of the fixed controllers that certify its faults (``faultline judge``), ``<name>.pt``."""
+        return self.home / self.name / "panel"
+
+    @property
+    def pack(self) -> Path:
+        """Folder of its published pack (``faultline evaluate --pack``)."""
+        return self.home / self.name / "pack"
+
     def role_of(self, geom: str) -> int:
         """Role bits of a geom (:mod:`kernels.penalties`)."""
         from kernels.penalties import BASE, FOOT, LIMB  # with Warp too

@@ -18,6 +18,8 @@ from qd.workers.evaluator import Compute
 from sim.mujoco_c.crossing import PlainCrossings
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
 from tests.qd.robots import Robots
@@ -192,7 +194,7 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
     first = judged(path)
-    copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), f"{RESULTS}/anymal/S.pt"
+    copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), str(ROBOTS["anymal"].panel / "S.pt")
     both = judged(path, stages=("others",), certifiers={"specialist": str(copy)})
     assert both.faults.certifiers == ("C-G", "specialist")
     for column in (0, 1):
@@ -215,12 +217,12 @@ def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_re
 
 
 def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_controller(path, tmp_path, monkeypatch):
-    monkeypatch.setattr(judging, "RESULTS", tmp_path)
-    for folder, names in ((tmp_path / "anymal/panel", ("S",)), (path / "certifiers", ("C-G",))):
-        folder.mkdir(parents=True)
+    panel, of_run = tmp_path / "panel", path / "certifiers"
+    for folder, file in ((panel, ROBOTS["anymal"].panel / "S.pt"), (of_run, OTHER["C-G"])):
+        folder.mkdir()
         shutil.copy(SHIPPED, folder / "base.pt")
-        for name in names:
-            shutil.copy(f"{RESULTS}/anymal/{name}.pt", folder)
+        shutil.copy(file, folder)
+    monkeypatch.setattr(RobotCfg, "panel", panel)
     assert judged(path, certifiers=None).faults.certifiers == ("S", "C-G")
 
 

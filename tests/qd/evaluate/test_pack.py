@@ -29,6 +29,7 @@ from qd.minimise import minimise
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.files.records import identity
+from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.qd.evaluate.made import Crosser
 from tests.qd.searches import found_and_fresh, without_figures
@@ -126,7 +127,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [about["name"] for about in few["terrains"]] == [about["name"] for about in content["terrains"][:3]]
     np.testing.assert_array_equal(read_pack(Path("pack")).heights, heights[:3])
-    assert list(make({}, size=1)["controllers"]) == ["base"]  # no results here
+    assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
 
 
 @pytest.fixture
@@ -161,11 +162,9 @@ def test_a_pack_is_read_as_it_was_written(pack):
     np.testing.assert_array_equal(stored.heights, round_heights(pack))
     assert np.abs(stored.heights - pack).max() <= HEIGHT_UNIT_M / 2 + 1e-6
     assert stored.genes[:, 0].tolist() == pytest.approx([0.03, 0.07, 0.09])
-    Path("results/anymal").mkdir(parents=True)
-    Path("pack").rename("results/anymal/pack")
-    assert pack_folder("anymal") == Path("results/anymal/pack")
-    with pytest.raises(FileNotFoundError, match="cassie"):
-        pack_folder("cassie")
+    assert pack_folder("anymal") == ROBOTS["anymal"].pack and len(read_pack(pack_folder("cassie"))) == 100
+    with pytest.raises(FileNotFoundError, match="dog"):
+        pack_folder("dog")
 
 
 @pytest.mark.parametrize("damage", ["json", "npz", "other", "key"])
