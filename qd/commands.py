@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from msgspec import Meta
 
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, command_line, peek
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
@@ -83,7 +83,7 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.judge import find_search, judge
         from qd.run.directory import free_path
         from qd.run.settings import preset
-        from qd.search import search
+        from qd.search import say_what_stops_the_robot, search
         from qd.workers.evaluator import Compute
         from sim.robots.find import get_robot
         from sim.spaces.registry import load_space
@@ -114,12 +114,10 @@ class Archive(ControllerFlags, WorkerFlags):
             scheduler=replace(self.scheduler, method=self.method or self.scheduler.method),
         )
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
-        search(cfg, path, compute, robot=robot, policy=policy)
-        if cfg.preset == "small":
-            again = command_line("judge", run=path, robot=self.robot, policy=self.policy, space=self.space)
-            print(f"Preset small judges nothing: `{again}` says which elites are faults.")
-        else:
-            judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
+        archive = search(cfg, path, compute, robot=robot, policy=policy)
+        if cfg.preset != "small":
+            archive = judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
+        say_what_stops_the_robot(path, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,13 +146,15 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
         """Judges the run."""
         from qd.judge import judge
         from qd.run.directory import find_run
+        from qd.search import say_what_stops_the_robot
         from qd.workers.evaluator import Compute
         from sim.policy.spec import controllers_of
         from sim.robots.find import get_robot
 
         robot = get_robot(self.robot)
-        judge(
-            find_run(robot, self.run, published="never"),
+        run = find_run(robot, self.run, published="never")
+        archive = judge(
+            run,
             compute=Compute.resolve(self.device, self.workers, self.num_envs),
             stages=self.stages,
             certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
@@ -163,6 +163,7 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
             space=self.space,
             seed=self.seed,
         )
+        say_what_stops_the_robot(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from qd.archive import Archive, read_archive
 from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
+from qd.groups import rank, summary_of
 from qd.judge import fresh_values
+from qd.minima import read_minimal
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import SearchBar, clock, describe_search
 from qd.run.settings import SearchCfg
@@ -29,7 +31,7 @@ from qd.workers.evaluator import (
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
-from sim.files.command import Interrupted, command_line
+from sim.files.command import Interrupted, command_line, say
 from sim.policy.spec import ControllerSpec, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -86,7 +88,7 @@ def search(
             scheduler, metrics = Scheduler.from_state(saved[0]), saved[1]
         scheduler.compute_on(compute.device)
         done = len(metrics)
-        print(describe_search(cfg, path, done, compute.device, evaluator.num_workers), flush=True)
+        say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
         if note := robot.scaled_by_another(policy):
             print(note)
         if done < cfg.iterations:
@@ -211,6 +213,34 @@ def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive
     )
 
 
+def say_what_stops_the_robot(
+    run: Path, archive: Archive, *, robot: str | None = None, policy: str | None = None, space: str | None = None
+) -> None:
+    """Prints the last lines of a search or a judging: what stops the robot, the worst terrain, and what comes next.
+
+    Args:
+        run: Directory of the search.
+        archive: What it found.
+        robot: The robot, if the command line names it; so are the next two.
+        policy: The controller.
+        space: The terrain space.
+    """
+    if not len(archive):
+        return
+    ranking = rank(archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive))
+    say((summary_of(ranking, archive), "bold"), "." if archive.fresh else ", as found, not crossed again.")
+    number = ranking.worst(1)[0]
+    if ranking.elites.failing.any():
+        say(f"Worst: elite {number}, {ranking.name(ranking.elites.place_of(number))}.")
+    flags = {"run": run, "robot": robot, "space": space}
+    view = command_line("view", **flags, policies=[f"searched={policy}"] if policy else [])
+    report = command_line("report", **flags, policy=policy)
+    replay = command_line("replay", **flags, elite=number, policy=policy)
+    say("Next: ", (view, "cyan"), ", ", (report, "cyan"), " or ", (replay, "cyan"))
+    if archive.fresh is None:
+        say((command_line("judge", **flags, policy=policy), "cyan"), " says which of them are faults.")
+
+
 def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:
     """The archive of a run's file where it is this one, judged or not, and its numbers lie beside it."""
     try:
@@ -230,7 +260,7 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
     gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
     numbers = summary(archive, metrics, gpus=gpus, origin=origin)
     write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
-    print(
+    say(
         f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
         f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
         f"in {clock(numbers['wall_s'])}"

@@ -147,10 +147,22 @@ def test_a_controller_may_move_but_not_change(capsys):
     assert archive("--resume", "a", *MORE, "3") == 0
 
 
-def test_the_command_that_comes_next_can_be_typed(capsys):
+def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(capsys):
     fine = f"{__name__}:fine_policy"
     assert archive(*TINY, "--policy", fine, "--run-dir", "a b") == 0
-    assert f"`faultline judge --run 'a b' --policy {fine}`" in capsys.readouterr().out
+    *_, summary, worst, following, judging = capsys.readouterr().out.splitlines()
+    found = read_archive(Path("a b"))
+    count = int((found.goal_rate < 0.5).sum())
+    assert count and summary.startswith(f"{count} of {len(found)} terrains stop")
+    assert summary.endswith("as found, not crossed again.")
+    number = int(worst.split()[2].rstrip(","))
+    assert found.goal_rate[number] == found.goal_rate.min()
+    run = "--run 'a b'"
+    assert following == (
+        f"Next: faultline view {run} --policies searched={fine}, faultline report {run} --policy {fine} or "
+        f"faultline replay {run} --elite {number} --policy {fine}"
+    )
+    assert judging.startswith(f"faultline judge {run} --policy {fine} ")
 
 
 def test_code_runs_only_if_the_command_line_names_it(capsys):
