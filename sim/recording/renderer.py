@@ -17,6 +17,7 @@ from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.recording.scene import FOOT_TOUCH, OTHER_EPISODE, TOUCH, Color, scene_model
 from sim.robots.robot import RobotCfg
+from sim.robots.skeleton import touches_of
 
 _mj: Any = mujoco  # its types are not written down
 
@@ -96,7 +97,7 @@ class Renderer:
         kind = _mj.mjtObj.mjOBJ_GEOM.value
         geoms = {name: _mj.mj_name2id(self.model, kind, name) for name in robot.geom_names}
         self._feet = [geoms[name] for name in robot.foot_geoms]
-        self._columns = {index: column for column, index in enumerate(geoms.values())}
+        self._touches, self._first_foot = touches_of(self.model, robot), len(geoms) - len(robot.foot_geoms)
         self._data = [_mj.MjData(self.model)]
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
@@ -176,9 +177,9 @@ class Renderer:
 
     def _color_touching(self, touching: NDArray[np.bool_]) -> None:
         for geom in self._scene.geoms[: self._scene.ngeom]:
-            column = self._columns.get(geom.objid) if geom.objtype == _mj.mjtObj.mjOBJ_GEOM.value else None
-            if column is not None and touching[column]:
-                geom.rgba[:3] = FOOT_TOUCH if geom.objid in self._feet else TOUCH
+            columns = self._touches.get(geom.objid, ()) if geom.objtype == _mj.mjtObj.mjOBJ_GEOM.value else ()
+            if touching[list(columns)].any():
+                geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
                 geom.matid = -1
 
     def _add_ghost(self, number: int, ghost: Ghost) -> None:

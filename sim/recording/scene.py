@@ -32,10 +32,8 @@ _GROUND = "faultline_ground"
 _PIXELS = 4  # of the paint a cell, along each side
 _LOW, _LEVEL, _HIGH = (np.array(color) for color in ((0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)))
 _LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
-_COLORS = {"base": (0.20, 0.22, 0.25, 1.0), "limb": (0.42, 0.45, 0.50, 1.0), "foot": (0.30, 0.32, 0.36, 1.0)}
 _SHADOWED = 3.0  # half side of the square about the robot that shadows fall in [m]
 _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
-_BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
 
 
 def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -79,8 +77,6 @@ def scene_model(
     spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
-    if not len(spec.meshes):
-        _dress(spec, robot)
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
     _add_goal(spec, heights, cfg or CrossingCfg())
@@ -146,30 +142,3 @@ def _add_light(spec: Any) -> None:
     headlight = spec.visual.headlight
     headlight.ambient, headlight.diffuse, headlight.specular = [0.42] * 3, [0.22] * 3, [0.0] * 3
     spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 0
-
-
-def _dress(spec: Any, robot: RobotCfg) -> None:
-    """Colours by role and bones from joint to joint, for a robot whose file has only shapes to collide with."""
-    roles = {"base": robot.base_geoms, "limb": robot.limb_geoms, "foot": robot.foot_geoms}
-    sizes = []
-    for role, names in roles.items():
-        for name in names:
-            if (geom := spec.geom(name)) is None:
-                continue  # a shape that its file does not name
-            geom.rgba = list(_COLORS[role])
-            sizes += [float(geom.size[0])] if role != "base" else []
-    radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE
-    for body in spec.bodies:
-        if body.parent is None or body.parent.name == "world":
-            continue
-        _add_bone(body.parent, body.pos, radius)
-        for geom in body.geoms:
-            if geom.name in robot.foot_geoms:
-                _add_bone(body, geom.pos, radius)
-
-
-def _add_bone(body: Any, end: Any, radius: float) -> None:
-    if np.linalg.norm(end) > radius:
-        limits = [0.0, 0.0, 0.0, *map(float, end)]
-        kind = {"type": _mj.mjtGeom.mjGEOM_CAPSULE, "group": 0, "mass": 0.0, "contype": 0, "conaffinity": 0}
-        body.add_geom(fromto=limits, size=[radius, 0.0, 0.0], rgba=list(_COLORS["limb"]), **kind)

@@ -13,7 +13,7 @@ from qd.show.recordings import Recordings, on_elite
 from qd.show.view.address import ask_query, read_address
 from qd.show.view.common import Common
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import first_view_of, shapes_of
+from qd.show.view.scene import first_view_of, shapes_of, sky
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
@@ -53,7 +53,8 @@ class App:
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
-        self.page.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
+        self.page.scene.set_background_image(sky())
         self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
         # Viser calls this in a thread, which may wait for the browser to answer.
         self.page.on_client_connect(lambda client: self.post(self.open, client, ask_query(client)))

@@ -3,6 +3,8 @@
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -10,7 +12,6 @@ from numpy.typing import NDArray
 from sim.ground import GroundMaps
 from sim.maps.picture import tinted
 from sim.recording.scene import height_colors
-from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Geom, Skeleton
 from sim.terrain import SPACING
 
@@ -18,10 +19,24 @@ Color = tuple[int, int, int]
 
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
-_BASE, _LIMB, _FOOT, _BONE = (112, 124, 146), (150, 160, 176), (230, 92, 34), (182, 188, 198)
-_BONE_RADIUS = 0.35  # of the median radius of the robot's limbs and feet
 _SEGMENTS = 20  # round a capsule
-_TOUCH_MARGIN = 0.01  # by which a coloured shape is longer than the one under it [m]
+_CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """Shapes of one body that show the same touch, in its frame."""
+
+    body: int
+    touches: tuple[int, ...]
+    """Columns of ``robot.geom_names``."""
+    mesh: trimesh.Trimesh
+
+
+def in_bytes(color: tuple[float, float, float]) -> Color:
+    """A colour of 0 to 1 in 0 to 255."""
+    red, green, blue = (round(255.0 * share) for share in color)
+    return red, green, blue
 
 
 def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -54,26 +69,26 @@ def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
     """Triangles with a colour (sRGB) a vertex, or one of all."""
     colors = np.broadcast_to(in_linear_light(colors), (len(vertices), 3))
-    return _joined([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)])
+    return joined([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)])
 
 
-def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """All in one, with normals that round the edges."""
+def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """All in one."""
     mesh = trimesh.util.concatenate(meshes)
     assert isinstance(mesh, trimesh.Trimesh)
     _ = mesh.vertex_normals  # computed now, an export has them
     return mesh
 
 
-def geom_mesh(geom: Geom, color: Color) -> trimesh.Trimesh:
-    """A shape in its body's frame."""
+def geom_mesh(geom: Geom) -> trimesh.Trimesh:
+    """A shape in its body's frame and its colour."""
     if geom.vertices is not None and geom.faces is not None:
         shape = trimesh.Trimesh(geom.vertices, geom.faces, process=False)
     else:
-        shape = _primitive(geom.kind, geom.size)
+        shape = trimesh.graph.smooth_shade(_primitive(geom.kind, geom.size), angle=_CREASE)
     transform = trimesh.transformations.quaternion_matrix(geom.quaternion)  # w x y z too
     transform[:3, 3] = geom.position
-    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.array(color))
+    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.rint(255.0 * np.array(geom.color)))
 
 
 def _primitive(kind: str, size: NDArray[np.float64]) -> trimesh.Trimesh:
@@ -94,7 +109,7 @@ def arrow_mesh() -> trimesh.Trimesh:
     """An arrow along z, 1 m long when it is not scaled."""
     shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
     head = trimesh.creation.cone(radius=0.05, height=0.25, sections=_SEGMENTS)
-    return _joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
+    return joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
 
 
 def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
@@ -121,39 +136,9 @@ def path_mesh(points: NDArray[np.floating], radius: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def touch_mesh(geom: Geom) -> trimesh.Trimesh:
-    """A shape in its body's frame, a little larger, to be shown over it."""
-    mesh = geom_mesh(geom, (255, 255, 255))
-    middle = mesh.bounds.mean(axis=0)
-    mesh.vertices = middle + (mesh.vertices - middle) * (1.0 + _TOUCH_MARGIN / np.maximum(mesh.extents, _TOUCH_MARGIN))
-    return mesh
-
-
-def body_meshes(skeleton: Skeleton, robot: RobotCfg) -> list[trimesh.Trimesh | None]:
-    """Each body's shapes in its own frame, coloured by role; None for a body without shapes.
-
-    A robot whose file has only shapes that collide gets bones from joint to joint and to its feet, or its parts would
-    hang in the air.
-    """
-    parts: list[list[trimesh.Trimesh]] = [[] for _ in skeleton.body_names]
+def robot_parts(skeleton: Skeleton) -> list[Part]:
+    """All that is to be seen of a robot."""
+    groups = dict[tuple[int, tuple[int, ...]], list[trimesh.Trimesh]]()
     for geom in skeleton.geoms:
-        color = _FOOT if geom.name in robot.foot_geoms else _BASE if geom.name in robot.base_geoms else _LIMB
-        parts[geom.body].append(geom_mesh(geom, color))
-    if not any(geom.kind == "mesh" for geom in skeleton.geoms):
-        limbs = [geom for geom in skeleton.geoms if geom.name in (*robot.limb_geoms, *robot.foot_geoms)]
-        radius = _BONE_RADIUS * float(np.median([geom.size[0] for geom in limbs]))
-        ends = [(parent, skeleton.offsets[child]) for child, parent in enumerate(skeleton.parents) if parent >= 0]
-        ends += [(geom.body, geom.position) for geom in limbs if geom.name in robot.foot_geoms]
-        for body, end in ends:
-            parts[body].append(_bone(end, radius))
-    return [_joined(meshes) if meshes else None for meshes in parts]
-
-
-def _bone(end: NDArray[np.float64], radius: float) -> trimesh.Trimesh:
-    """From its body's origin to a point."""
-    length = float(np.linalg.norm(end))
-    shape = trimesh.creation.capsule(height=length, radius=radius, count=(8, 8))
-    direction = end / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-    transform = np.asarray(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction), dtype=np.float64)
-    transform[:3, 3] = 0.5 * end
-    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.array(_BONE))
+        groups.setdefault((geom.body, geom.touches), []).append(geom_mesh(geom))
+    return [Part(body=body, touches=touches, mesh=joined(parts)) for (body, touches), parts in groups.items()]

@@ -9,20 +9,32 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import Color, arrow_mesh, arrow_pose, body_meshes, path_mesh, terrain_mesh, touch_mesh
+from qd.show.view.meshes import (
+    Color,
+    Part,
+    arrow_mesh,
+    arrow_pose,
+    in_bytes,
+    joined,
+    path_mesh,
+    robot_parts,
+    terrain_mesh,
+)
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
+from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
 
-TOUCH_COLOR, FOOT_TOUCH_COLOR = (214, 22, 122), (255, 214, 10)
+TOUCH_COLOR, FOOT_TOUCH_COLOR = in_bytes(TOUCH), in_bytes(FOOT_TOUCH)
 """Of base and limbs, and of feet, while they touch."""
 FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
-GHOST_COLOR = (0, 114, 178)
+GHOST_COLOR = in_bytes(OTHER_CONTROLLER)
 """Of the second robot, which is translucent."""
 _START_COLOR, _GOAL_COLOR = (240, 200, 60), (0, 158, 115)
+_SKY = np.array([[140, 178, 214], [232, 238, 243]])  # above and below
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
 PHONE = 576
@@ -32,6 +44,7 @@ _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _DISC_HEIGHT, _DISC_RADIUS = 0.03, 0.15  # at the start, where a post would stand in the robot
 _GHOST_OPACITY = 0.4
+_GHOST_NAME_HEIGHT = 0.35  # over its base [m]
 _NAME_HEIGHT = 0.12  # of a foot's name over it [m]
 
 Points = NDArray[np.floating]
@@ -55,22 +68,29 @@ def first_view_of(width: int, height: int) -> View:
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
 
 
+def sky() -> NDArray[np.uint8]:
+    """What is behind all: blue above, pale below, shape (256, 1, 3)."""
+    share = np.linspace(0.0, 1.0, 256)[:, None, None]
+    return np.rint((1.0 - share) * _SKY[0] + share * _SKY[1]).astype(np.uint8)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
     """What all tabs show of the robot, in the frames of its bodies."""
 
-    bodies: list[trimesh.Trimesh | None]
-    touches: list[tuple[str, int, trimesh.Trimesh]]
-    """Name, body and shape of each geom whose touch may be recorded."""
+    parts: list[Part]
+    num_bodies: int
     feet: tuple[str, ...]
-    """Their names."""
+    """Names of the feet, which are the last geoms of the robot."""
+    num_others: int
+    """Geoms before the feet."""
 
 
 def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
     """The shapes of a robot."""
-    geoms = [skeleton.geom(name) for name in robot.geom_names]
-    touches = [(geom.name, geom.body, touch_mesh(geom)) for geom in geoms]
-    return Shapes(bodies=body_meshes(skeleton, robot), touches=touches, feet=robot.foot_geoms)
+    num_others = len(robot.geom_names) - len(robot.foot_geoms)
+    bodies = len(skeleton.body_names)
+    return Shapes(parts=robot_parts(skeleton), num_bodies=bodies, feet=robot.foot_geoms, num_others=num_others)
 
 
 class Scene:
@@ -79,17 +99,18 @@ class Scene:
     def __init__(self, client: viser.ClientHandle, shapes: Shapes) -> None:
         self._client, self._shapes, self._cfg = client, shapes, CrossingCfg()
         scene = client.scene
-        self.robot = scene.add_frame("/robot", show_axes=False, visible=False)
-        self.bodies = [
-            None if mesh is None else scene.add_mesh_trimesh(f"/robot/{k}", mesh, receive_shadow=False)
-            for k, mesh in enumerate(shapes.bodies)
-        ]
-        self.touches = {
-            name: self._add_mesh(f"/robot/touch/{name}", mesh, FOOT_TOUCH_COLOR if name in shapes.feet else TOUCH_COLOR)
-            for name, _, mesh in shapes.touches
-        }
-        self.ghost = scene.add_frame("/ghost", show_axes=False, visible=False)
-        self.ghost_bodies: list[Any] = []  # its bodies, from when there is one
+        self.robot, self.bodies = self._add_bodies("/robot")
+        self.parts: list[Any] = []
+        self.touched: list[Any] = []
+        """What the parts are while they touch; a part and this one are never seen together."""
+        for k, part in enumerate(shapes.parts):
+            name = f"/robot/{part.body}/{k}"
+            self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
+            color = FOOT_TOUCH_COLOR if max(part.touches, default=0) >= shapes.num_others else TOUCH_COLOR
+            self.touched.append(self._add_mesh(f"{name}/touched", part.mesh, color, cast_shadow=True))
+        self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
+        self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
+        self._ghost_parts: list[Any] = []  # from when there is a ghost
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
         self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
@@ -103,13 +124,19 @@ class Scene:
         self.show_forces, self.show_names = True, False
         """Whether forces on the feet, and the names of the feet, are shown."""
 
+    def _add_bodies(self, name: str) -> tuple[Any, list[Any]]:
+        """A frame that is not visible yet, and a frame in it for each body of the robot."""
+        add = self._client.scene.add_frame
+        whole = add(name, show_axes=False, visible=False)
+        return whole, [add(f"{name}/{k}", show_axes=False) for k in range(self._shapes.num_bodies)]
+
     def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
         """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), and friction and softness."""
         start, goal, scene = self._cfg.start, self._cfg.goal, self._client.scene
         with self._client.atomic():
             self.hide_crossing()
             mesh = terrain_mesh(heights, ground)
-            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=False)
+            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False)
             for name, (x, y), color, height, radius, (back, up) in (
                 ("start", start, _START_COLOR, _DISC_HEIGHT, _DISC_RADIUS, (0.9, 0.15)),
                 ("goal", goal, _GOAL_COLOR, _POST_HEIGHT, _POST_RADIUS, (0.0, 1.35)),
@@ -135,7 +162,7 @@ class Scene:
         self.robot.visible = False
         self.hide_ghost()
         self._followed = None
-        for handle in (*self.touches.values(), *self.forces, self._command, *self._names):
+        for handle in (*self.forces, self._command, *self._names):
             handle.visible = False
         self._drop_paths()
 
@@ -176,14 +203,12 @@ class Scene:
         positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
             self.robot.visible = True
-            for k, handle in enumerate(self.bodies):
-                if handle is not None:
-                    _place(handle, positions[k], quaternions[k])
-            for k, (name, body, _) in enumerate(self._shapes.touches):
-                handle = self.touches[name]
-                handle.visible = crossing.touching is not None and bool(crossing.touching[frame, k])
-                if handle.visible:
-                    _place(handle, positions[body], quaternions[body])
+            for handle, position, quaternion in zip(self.bodies, positions, quaternions, strict=True):
+                _place(handle, position, quaternion)
+            touching = crossing.touching
+            for part, alone, touched in zip(self._shapes.parts, self.parts, self.touched, strict=True):
+                touched.visible = touching is not None and bool(touching[frame, list(part.touches)].any())
+                alone.visible = not touched.visible
             _set_arrow(self._command, crossing.command[frame], shown=True)
             for handle, name, arrow in zip(self.forces, self._names, crossing.forces[frame], strict=True):
                 _set_arrow(handle, arrow, shown=self.show_forces)
@@ -191,29 +216,34 @@ class Scene:
                 name.position = tuple(arrow[0] + np.array([0.0, 0.0, _NAME_HEIGHT]))
         self._go_along(positions[0])
 
-    def show_ghost(self, crossing: Crossing, frame: int) -> None:
-        """Put a second, translucent robot where it is at a frame of its own crossing."""
+    def show_ghost(self, crossing: Crossing, frame: int, name: str = "") -> None:
+        """Put a second, translucent robot where it is at a frame of its own crossing, with a name over it."""
+        positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
-            if not self.ghost_bodies:
-                self.ghost_bodies = [
-                    None if mesh is None else self._add_mesh(f"/ghost/{k}", mesh, GHOST_COLOR, opacity=_GHOST_OPACITY)
-                    for k, mesh in enumerate(self._shapes.bodies)
-                ]
+            if not self._ghost_parts:
+                for body in range(self._shapes.num_bodies):
+                    meshes = [part.mesh for part in self._shapes.parts if part.body == body]
+                    if meshes:
+                        mesh = self._add_mesh(f"/ghost/{body}/all", joined(meshes), GHOST_COLOR, opacity=_GHOST_OPACITY)
+                        mesh.visible = True
+                        self._ghost_parts.append(mesh)
             self.ghost.visible = True
-            for k, handle in enumerate(self.ghost_bodies):
-                if handle is not None:
-                    handle.visible = True
-                    _place(handle, crossing.positions[frame, k], crossing.quaternions[frame, k])
+            for handle, position, quaternion in zip(self.ghost_bodies, positions, quaternions, strict=True):
+                _place(handle, position, quaternion)
+            self._ghost_name.text, self._ghost_name.visible = name, bool(name)
+            self._ghost_name.position = tuple(positions[0] + np.array([0.0, 0.0, _GHOST_NAME_HEIGHT]))
 
     def hide_ghost(self) -> None:
         """Show the robot alone."""
         self.ghost.visible = False
 
-    def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, *, opacity: float | None = None) -> Any:
+    def _add_mesh(
+        self, name: str, mesh: trimesh.Trimesh, color: Color, *, opacity: float | None = None, cast_shadow: bool = False
+    ) -> Any:
         """A shape of one colour, not visible yet."""
         return self._client.scene.add_mesh_simple(
             name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, opacity=opacity, visible=False,
-            cast_shadow=False, receive_shadow=False,
+            cast_shadow=cast_shadow, receive_shadow=False,
         )  # fmt: skip
 
     def _go_along(self, base: Points) -> None:

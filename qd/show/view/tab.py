@@ -442,7 +442,7 @@ class Tab:
         if self.crossing is not None:
             self.scene.show_frame(self.crossing, self.clock.frame(self.crossing.dt, self.crossing.num_frames))
             if (ghost := self.ghost.crossing) is not None:
-                self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames))
+                self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames), self.ghost.name or "")
 
     def _show_moment(self) -> None:
         crossing, curves = self.crossing, self._curves
