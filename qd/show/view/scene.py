@@ -33,7 +33,7 @@ TOUCH_COLOR, FOOT_TOUCH_COLOR = in_bytes(TOUCH), in_bytes(FOOT_TOUCH)
 FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
 GHOST_COLOR = in_bytes(OTHER_CONTROLLER)
 """Of the second robot, which is translucent."""
-_START_COLOR, _GOAL_COLOR = (240, 200, 60), (0, 158, 115)
+_START_COLOR, _GOAL_COLOR, _WAY_COLOR = (255, 255, 255), (0, 158, 115), (240, 200, 60)
 _SKY = np.array([[140, 178, 214], [232, 238, 243]])  # above and below
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
@@ -42,7 +42,7 @@ PHONE = 576
 _PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
-_DISC_HEIGHT, _DISC_RADIUS = 0.03, 0.15  # at the start, where a post would stand in the robot
+_START_RADIUS, _DISC_HEIGHT, _DISC_OPACITY = 0.25, 0.02, 0.5
 _GHOST_OPACITY = 0.4
 _GHOST_NAME_HEIGHT = 0.35  # over its base [m]
 _NAME_HEIGHT = 0.12  # of a foot's name over it [m]
@@ -107,7 +107,7 @@ class Scene:
             name = f"/robot/{part.body}/{k}"
             self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
             color = FOOT_TOUCH_COLOR if max(part.touches, default=0) >= shapes.num_others else TOUCH_COLOR
-            self.touched.append(self._add_mesh(f"{name}/touched", part.mesh, color, cast_shadow=True))
+            self.touched.append(self._add_mesh(f"{name}-touched", part.mesh, color, cast_shadow=True))
         self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
         self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
         self._ghost_parts: list[Any] = []  # from when there is a ghost
@@ -136,15 +136,16 @@ class Scene:
         with self._client.atomic():
             self.hide_crossing()
             mesh = terrain_mesh(heights, ground)
-            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False)
-            for name, (x, y), color, height, radius, (back, up) in (
-                ("start", start, _START_COLOR, _DISC_HEIGHT, _DISC_RADIUS, (0.9, 0.15)),
-                ("goal", goal, _GOAL_COLOR, _POST_HEIGHT, _POST_RADIUS, (0.0, 1.35)),
-            ):
-                z = float(_heights_at(heights, np.array([[x, y]]))[0])
-                middle = (x, y, z + 0.5 * height)
-                scene.add_cylinder(f"/{name}/post", radius=radius, height=height, color=color, position=middle)
-                scene.add_label(f"/{name}/label", name, position=(x - back, y, z + up))
+            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=0.45)
+            low, high = _heights_at(heights, np.array([start, goal])).tolist()
+            disc: Any = {"height": _DISC_HEIGHT, "opacity": _DISC_OPACITY, "cast_shadow": False}
+            scene.add_cylinder("/start/disc", _START_RADIUS, color=_START_COLOR, position=(*start, low), **disc)
+            before = (start[0] - _START_RADIUS, start[1], low)
+            scene.add_label("/start/label", "start", position=before, anchor="top-center")
+            scene.add_cylinder("/goal/disc", self._cfg.goal_radius, color=_GOAL_COLOR, position=(*goal, high), **disc)
+            middle, top = ((*goal, high + share * _POST_HEIGHT) for share in (0.5, 1.0))
+            scene.add_cylinder("/goal/post", _POST_RADIUS, _POST_HEIGHT, _GOAL_COLOR, position=middle)
+            scene.add_label("/goal/label", "goal", position=top, anchor="bottom-center")
             self._draw_way(heights)
 
     def _draw_way(self, heights: Points) -> None:
@@ -155,7 +156,7 @@ class Scene:
         places = start + share[:, None] * (goal - start)
         points = np.column_stack([places, _heights_at(heights, places) + _WAY_LIFT])
         segments = np.stack([points[:-1], points[1:]], axis=1)[::2]
-        self._client.scene.add_line_segments("/way/line", segments, colors=_START_COLOR, thickness=0.02)
+        self._client.scene.add_line_segments("/way/line", segments, colors=_WAY_COLOR, thickness=0.02)
 
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
