@@ -1,7 +1,7 @@
 """The command ``faultline``, and its functions for Python; only what a command or a function needs is loaded.
 
 ``faultline.search``, ``judge``, ``cross``, ``evaluate`` and ``finetune`` do what the commands of these names do;
-docs/search.md shows them in twenty lines.
+docs/searching.md shows them in twenty lines.
 """
 
 import difflib

@@ -81,7 +81,7 @@ class SolverCfg:
     The contact time constant stands in the robot's file: 0.01 s at critical damping, the stiffest that the integrator
     ``implicitfast`` takes with steps of 0.005 s. At MuJoCo's default of 0.02 s feet that land hard sink in by more than
     their radius. Friction cones are elliptic: a pyramid gives way at 0.7 of the friction across its axes, and robots
-    fail on slopes that would hold them (docs/simulation.md).
+    fail on slopes that would hold them (docs/results.md).
     """
 
     iterations: int = 5

@@ -19,7 +19,7 @@ _SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundMaps:
-    """Friction and softness of the patches of T terrains; docs/spaces.md says what the numbers do."""
+    """Friction and softness of the patches of T terrains; docs/terrains.md says what the numbers do."""
 
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""

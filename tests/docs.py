@@ -1,21 +1,32 @@
 """What README and the pages of docs/ say that can be held to the project: commands, code, links, numbers."""
 
+import importlib
 import json
 import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Sequence
+import tomllib
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 ROOT = Path(__file__).parents[1]
 PAGES = {str(path.relative_to(ROOT)): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
-"""The pages by name, such as ``docs/search.md``."""
-_PROGRAMS = ("faultline", "make")
+"""The pages by name, such as ``docs/faults.md``."""
+_NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)(?!\w)")
+_NO_PROSE = (r"^```.*?^```$", r"^\|.*?$", r"<!--.*?-->", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+")
+_KINDS = (
+    r"arXiv \d+\.\d+",
+    r"Python 3\.\d+",
+    "95 %",
+    r"Apache-2\.0",
+    r"exit status is \d+",
+    r"seed \d",
+    r"\d GB of disk",
+)
+"""Numbers that no file has: of papers and versions, the level of all intervals, exit statuses."""
 
 
 def text_of(page: str) -> str:
@@ -32,16 +43,11 @@ def code_of(page: str, language: str = "") -> list[str]:
 def commands_of(page: str) -> list[str]:
     """Command lines in the code blocks of a page that call ``faultline`` or ``make``, through torchrun too."""
     lines = []
-    for line in "\n".join(code_of(page)).splitlines():
-        try:
-            words = shlex.split(line, comments=True)
-        except ValueError:  # a drawing
-            continue
-        while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
-            words.pop(0)
-        if words and words[0].endswith("torchrun"):
+    for line in "\n".join(code_of(page)).replace("&&", "\n").replace(".venv/bin/", "").splitlines():
+        words = [word for word in shlex.split(line, comments=True) if not re.fullmatch(r"[A-Z]+_[A-Z_]+=.*", word)]
+        if words and words[0] == "torchrun":
             words = words[words.index("-m") + 1 :]
-        if words and words[0] in _PROGRAMS:
+        if words and words[0] in ("faultline", "make"):
             lines.append(shlex.join(words))
     return lines
 
@@ -52,76 +58,71 @@ def run_by_make(words: Sequence[str]) -> list[str]:
     ``make`` runs without the environment: one that runs the tests would hand on its own flags.
     """
     done = subprocess.run(
-        [*words, "--dry-run"], env={"PATH": os.environ["PATH"]}, cwd=ROOT, capture_output=True, text=True, check=True,
-        timeout=60,
-    )  # fmt: skip
+        [*words, "--dry-run"], env={"PATH": os.environ["PATH"]}, cwd=ROOT, capture_output=True, text=True, check=True
+    )
     return shlex.split(done.stdout.splitlines()[-1])
 
 
+def prose_of(page: str) -> str:
+    """A page without code, tables, comments and the targets of links, each white space as one blank."""
+    text = text_of(page)
+    for pattern in _NO_PROSE:
+        text = re.sub(pattern, " ", text, flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"\s+", " ", text)
+
+
 class Number(NamedTuple):
-    """A number of a page with what it must be."""
+    """A number in a text of a page, and the source and expression that say what it is."""
 
     page: str
-    file: str
     text: str
+    number: str
+    source: str
     expression: str
-    found: bool
-    """Whether it stands in the block above its comment, after the number before it."""
-
-    def __str__(self) -> str:
-        return f"{self.page}: {self.text} = {self.expression} of {self.file}"
 
     @property
     def value(self) -> float:
-        """What the file says."""
-        content = _content(self.file)
-        names = {"this": content, "abs": abs, "len": len, "max": np.max, "round": round}
-        names |= {"sum": np.sum, "mean": np.mean, "median": np.median}
-        keys = content if isinstance(content, dict) else {}
-        return float(eval(self.expression, {"__builtins__": {}}, {**names, **keys}))
+        """What the source says."""
+        return float(eval(self.expression, {"__builtins__": {}}, {"len": len, "round": round, **_content(self.source)}))
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the file says the same, to as many digits as the text has."""
-        plain = self.text.replace(",", "")
-        return abs(self.value - float(plain)) <= 0.5 * 10.0 ** -len(plain.partition(".")[2]) + 1e-9
+    def is_rounded(self, value: float) -> bool:
+        """Whether the number is a value, to as many digits as it has."""
+        plain = self.number.replace(",", "")
+        return abs(value - float(plain)) <= 0.5 * 10.0 ** -len(plain.partition(".")[2]) + 1e-9
 
 
-def numbers_of(page: str) -> Iterator[Number]:
-    """Numbers of a page that say where they come from.
+def numbers() -> list[Number]:
+    """All of docs/numbers.toml."""
+    rows, pages = [], tomllib.loads((ROOT / "docs/numbers.toml").read_text(encoding="utf-8"))
+    for page, text, sources in ((page, *pair) for page, texts in pages.items() for pair in texts.items()):
+        parts = [part.split(": ", 1) for part in sources.split(" | ")]
+        expressions = [(source, expression) for source, several in parts for expression in several.split("; ")]
+        rows += [
+            Number(page, text, *row) for row in zip(_NUMBER.findall(text), *zip(*expressions, strict=True), strict=True)
+        ]
+    return rows
 
-    A comment after a block of text names a file and has entries ``number = expression``, each on a line or behind a
-    semicolon.
-    """
-    text = text_of(page)
-    comment = re.compile(r"^<!-- (results/\S+|sim/robots/\w+/\S+)\n(.*?)^-->$", re.MULTILINE | re.DOTALL)
-    for match in comment.finditer(re.sub(r"^```text.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)):
-        before = comment.sub("", match.string[: match.start()]).rstrip()
-        block, at = before.split("\n\n")[-1], 0
-        for entry in filter(None, (entry.strip() for entry in re.split(r"[;\n]", match[2]))):
-            number, _, expression = entry.partition(" = ")
-            place = re.compile(rf"(?<![\d.,]){re.escape(number)}(?!\d|[.,]\d)").search(block, at)
-            at = place.end() if place else at
-            yield Number(page, match[1], number, expression, place is not None)
+
+def unknown_numbers(page: str) -> list[str]:
+    """Numbers of a page's prose that docs/numbers.toml does not have, of no such kind, with the words about them."""
+    prose = prose_of(page)
+    known = {re.escape(row.text) for row in numbers() if row.page in (page, "constants")}
+    spans = [match.span() for pattern in (*known, *_KINDS) for match in re.finditer(pattern, prose)]
+    return [
+        prose[max(match.start() - 30, 0) : match.end() + 20]
+        for match in _NUMBER.finditer(prose)
+        if not any(start <= match.start() and match.end() <= end for start, end in spans)
+    ]
 
 
 class _Keys(dict):
     """A JSON object whose keys are attributes too."""
 
-    def __getattr__(self, name: str) -> Any:
-        try:
-            return self[name]
-        except KeyError:
-            raise AttributeError(name) from None
+    __getattr__ = dict.__getitem__
 
 
 @cache
-def _content(file: str) -> Any:
-    path = ROOT / file
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    text = path.read_text(encoding="utf-8")
-    if path.suffix == ".jsonl":
-        return [json.loads(line, object_hook=_Keys) for line in text.splitlines()]
-    return json.loads(text, object_hook=_Keys)
+def _content(source: str) -> dict[str, Any]:
+    if "/" not in source:
+        return vars(importlib.import_module(source))
+    return json.loads((ROOT / source).read_text(encoding="utf-8"), object_hook=_Keys)

@@ -23,7 +23,7 @@ class SchedulerCfg:
     (after DSAGE, Bhatt et al. 2022); `cma_mae` (Fontaine and Nikolaidis 2023); `cma_me` (Fontaine et al. 2020);
     `map_elites`, elites varied by iso+line (Vassiliades and Mouret 2018); `hard_random`, the paper's, every height at
     its limit; `uniform_random`. The last two learn nothing. Several are joined by a plus: emitters take them in turn,
-    and where there are fewer emitters, the first methods count. docs/comparison.md compares them."""
+    and where there are fewer emitters, the first methods count. docs/results.md compares them."""
     emitters: PositiveInt = 10
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: Annotated[int, Meta(ge=2)] = 20

@@ -1,11 +1,10 @@
-"""Writes the tables of docs/*.md from the JSON under results/.
+"""Writes the tables of README.md and docs/*.md from the JSON files of published numbers.
 
-A table stands between the lines `<!-- table: NAME ROBOT -->` and `<!-- table: end -->`; NAME is one of TABLES, and
-ROBOT is left out where a table is of none. With --check nothing is written: the exit status is 1 if a page says
-something else than the files.
+A table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`. NAME is a function of TABLES, with a robot
+behind it if the function takes one. With --check nothing is written: the exit status is 1 if a page says something
+else than the files.
 """
 
-import argparse
 import json
 import re
 import sys
@@ -14,283 +13,238 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate import paper
-from qd.evaluate.labels import CERTIFIED, SETS
+from qd.evaluate.labels import HELD_OUT, SETS
 from sim.files.intervals import value_words
 
-MARKED = re.compile(r"<!-- table: (?P<name>\w+)(?: (?P<robot>\w+))? -->\n.*?<!-- table: end -->", re.DOTALL)
+ROOT = Path(__file__).parents[2]
+ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}
+CONTROLLERS = ("base", "C-HC", "C-HR", "C-G", "hardened")
 NONE = "-"
-
-Json = Mapping[str, Any]
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
+MARKED = re.compile(r"<!-- table: (\w+)((?: \w+)?) -->\n.*?<!-- end -->", re.DOTALL)
+Column = str | Callable[[Any], str]
+"""A key of a row's object, or what makes a cell of the object."""
 
 
-def read(folder: Path, file: str) -> Json:
-    """A results file."""
-    return json.loads((folder / file).read_text(encoding="utf-8"))
+def read(file: str) -> Any:
+    """A file of numbers by its path in the project; empty where there is none."""
+    path = ROOT / file
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
-def count(value: float | None) -> str:
-    """A number without decimals."""
-    return NONE if value is None else f"{value:,.0f}"
+def of_robots(file: str) -> dict[str, Any]:
+    """A file of both robots by their names in words."""
+    return {words: read(file.format(robot)) for robot, words in ROBOTS.items()}
 
 
-def with_interval(numbers: Json, name: str, form: str = ".3f") -> str:
-    """A value and the interval that stands beside it."""
-    return value_words(numbers.get(name), numbers.get(f"{name}_interval"), form)
+def shown(key: str, form: str = ",.0f", factor: float = 1.0) -> Callable[[Any], str]:
+    """A cell: the number of a key, with its interval if that stands beside it; "-" where there is none."""
+
+    def cell(row: Any) -> str:
+        value, limits = row.get(key), row.get(f"{key}_interval")
+        return value_words(value and factor * value, limits and [factor * limit for limit in limits], form)
+
+    return cell
 
 
-def archive(folder: Path, robot: str) -> str:
-    """The archives beside the paper's, which stands at 1,000 iterations."""
-    theirs = paper.ARCHIVES.get(robot, {})
-    files = {name: folder / name / "archive.json" for name in ("archive", "archive_cma_mae")}
-    ours = [json.loads(file.read_text(encoding="utf-8")) for file in files.values() if file.exists()]
-    names = (
-        "iterations", "episodes", "elites", "elites_same_cell", "elites_reproduced", "corrected_elites", "families",
-        "failing", "confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families",
-        "with_collision", "qd_score", "corrected_qd_score",
-    )  # fmt: skip
-    published = {"iterations": 1000, "episodes": 4_000_000, **theirs}
-    rows = [
-        (name.replace("_", " "), *(count(row.get(name)) for row in ours), count(published.get(name))) for name in names
-    ]
-    shares = [f"{row['reachable_coverage']:.1%}" for row in ours]
-    share = f"{theirs['elites'] / ours[0]['reachable_cells']:.1%}" if theirs else NONE
-    fitness = f"about {theirs['fitness']}" if "fitness" in theirs else NONE
-    rows += [
-        ("share of the reachable cells", *shares, share),
-        ("mean fitness", *(f"{row['mean_fitness']:.1f}" for row in ours), fitness),
-        ("minutes", *(f"{row['wall_s'] / 60:.0f}" for row in ours), "about 480, two RTX 3070 Ti"),
-    ]
-    return table(("archive", *(row.get("method") or "ours" for row in ours), "paper (CMA-MAE)"), rows)
+def table(rows: Mapping[str, Any], columns: Mapping[str, Column], *, upright: bool = False) -> str:
+    """A Markdown table, an object a row, or a column if it is upright; a column without any number is left out."""
+    made = {name: shown(column) if isinstance(column, str) else column for name, column in columns.items()}
+    lines = [[name, *(cell(row) for cell in made.values())] for name, row in rows.items()]
+    used = [k for k in range(len(made) + 1) if any(line[k] != NONE for line in lines)]
+    lines = [[line[k] for k in used] for line in (["", *made], *lines)]
+    if upright:
+        lines = [list(line) for line in zip(*lines, strict=True)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], ["---"] * len(lines[0]), *lines[1:]))
 
 
-def controllers(folder: Path, robot: str) -> str:
-    """Rates and rewards of every kind of controller: the mean of its seeds where it has several."""
-    tables = read(folder, "tables.json")
-    theirs = paper.published(robot) or {}
-    rows = []
-    for name, label in SETS.items():
-        for controller in tables["goal"].get(name, {}):
-            if "@" in controller:
-                continue
-            cells = [_cell(tables, measure, name, controller) for measure in ("goal", "success", "reward")]
-            numbers = [theirs.get(measure, {}).get(name, {}).get(controller) for measure in ("success", "reward")]
-            beside = NONE if None in numbers else f"{numbers[0]:.3f}, {numbers[1]:.1f}"
-            rows.append((f"{label} ({tables['terrains'][name]})", controller, *cells, beside))
-        for controller in tables["certified_goal"].get(name, {}):
-            if "@" not in controller:
-                about = tables["certified"][name]
-                role = about["chosen_by"].get(controller)
-                known = f"{controller} ({role})" if role else controller
-                cells = [_cell(tables, measure, name, controller) for measure in CERTIFIED]
-                rows.append((f"{label}, certified ({about['terrains']})", known, *cells, NONE, NONE))
-    header = ("terrains", "controller", "goal (95 %)", "no base collision (95 %)", "reward (95 %)", "paper")
-    return table(header, rows)
+def rate(robot: str, measure: str, terrains: str, controller: str, *, short: bool = False) -> str:
+    """A mean over seeds where there are several, else over terrains, with its interval unless it shall be short."""
+    tables = read(f"results/{robot}/tables.json")
+    if controller == "hardened" and controller not in tables["goal"]["hand_crafted"]:
+        tables = read(f"results/{robot}/hardened.json")
+    seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
+    value = seeds.get("mean", tables[measure].get(terrains, {}).get(controller))
+    limits = seeds.get("interval", tables["intervals"][measure].get(terrains, {}).get(controller))
+    return value_words(value, None if short else limits, ".1f" if measure == "reward" else ".3f")
 
 
-def _cell(tables: Json, measure: str, name: str, controller: str) -> str:
-    """A mean with its interval over seeds where there are several, else over terrains."""
-    form = ".1f" if measure == "reward" else ".3f"
-    seeds = tables["over_seeds"].get(measure, {}).get(name, {}).get(controller)
-    if seeds is not None and seeds["mean"] is not None:
-        return f"{value_words(seeds['mean'], seeds['interval'], form)}, {len(seeds['values'])} seeds"
-    return value_words(tables[measure][name][controller], tables["intervals"][measure][name][controller], form)
-
-
-def kind_differences(folder: Path, robot: str) -> str:
-    """How much more often one kind of controller reaches the goal than another, over families and seeds."""
-    rows = [
-        (SETS[name], pair, value_words(row["goal"], row["interval"], "+.3f"))
-        for name, pairs in read(folder, "tables.json")["kind_differences"].items()
-        for pair, row in pairs.items()
-    ]
-    return table(("terrains", "controllers", "goal (95 %)"), rows)
-
-
-def distances(folder: Path, robot: str) -> str:
-    """How near the elites trained on are."""
-    rows = [
-        (SETS[name], f"{row['terrains']}", *(f"{100 * row[key]:.1f} cm" for key in ("median", "least", "largest")))
-        for name, row in read(folder, "distances.json")["nearest_m"].items()
-    ]
-    return table(("terrains", "number", "median", "least", "largest"), rows)
-
-
-def ablation(folder: Path, robot: str) -> str:
-    """Mean STD of the elites with and without it in the fitness."""
-    numbers = read(folder, "ablation.json")
-    columns = [
-        [value_words(*pair, ".2f") for pair in zip(numbers["mean_std"][name], numbers["intervals"][name], strict=True)]
-        for name in ("alpha_1", "alpha_0")
-    ]
-    rows = list(zip(map("{:,}".format, numbers["iterations"]), *columns, strict=True))
-    return table(("iteration", "mean STD, alpha 1 (95 %)", "mean STD, alpha 0 (95 %)"), rows)
-
-
-def search(folder: Path, robot: str) -> str:
-    """Methods of search, the one with the most failing elites first."""
-    methods = read(folder, "search.json")["methods"]
-    ranked = sorted(methods, key=lambda name: -(methods[name]["failing"] or 0.0))
-    names = ("elites", "corrected_elites", "failing", "confirmed", "faults_panel")
-    rows = [
-        (name, f"{methods[name]['seeds']}", count(methods[name]["episodes"]),
-         *(with_interval(methods[name], number, ".0f") for number in names))
-        for name in ranked
-    ]  # fmt: skip
-    return table(("method", "seeds", "episodes", *(name.replace("_", " ") for name in names)), rows)
-
-
-def agreement(folder: Path, robot: str) -> str:
-    """How far rates at the search's settings lie above those of other crossings."""
-    numbers = read(folder, "agreement.json")
-    words = {
-        "again": "the same settings again",
-        "resolved": "contact resolved",
-        "mujoco_c": "MuJoCo C",
-        "both_resolved": "contact resolved, against MuJoCo C",
+def archives() -> str:
+    """What the published searches found, beside the paper."""
+    found = {f"{words}{', cma_mae' * name.endswith('mae')}": read(f"results/{robot}/{name}/archive.json")
+             for robot, words in ROBOTS.items() for name in ("archive", "archive_cma_mae")}  # fmt: skip
+    found |= {f"{words}, the paper": {"episodes": 4e6, **paper.ARCHIVES[robot]} for robot, words in ROBOTS.items()}
+    columns = {
+        "episodes": "episodes",
+        "*elites*: terrains, each the hardest of its kind": "elites",
+        "... that fresh episodes put into the same cell or its neighbour": "elites_reproduced",
+        "*failing*: under half of the robots cross it in fresh episodes": "failing",
+        "*confirmed*: failing, also with finer physics": "confirmed",
+        "*faults*: confirmed, and another controller crosses it": "faults",
+        "... of them by the panel alone": "faults_panel",
+        "... by controllers that trained on no such terrain": "faults_unseen",
+        "minutes on one GPU": shown("wall_s", factor=1 / 60),
     }
-    rows = [
-        (f"{name.replace('_', '-')} ({numbers[name][way]['terrains']})", label,
-         *(with_interval(numbers[name][way], f"{kind}_bias", "+.3f") for kind in ("goal", "success")))
-        for name in ("hard_random", "elites")
-        for way, label in words.items()
-    ]  # fmt: skip
-    return table(("terrains", "crossed", "goal, bias (95 %)", "no base collision, bias (95 %)"), rows)
+    return table({name: numbers for name, numbers in found.items() if numbers}, columns, upright=True)
 
 
-def speed(folder: Path, robot: str) -> str:
-    """The search beside bare physics, and training."""
-    numbers = read(folder, "speed.json")
-    rows = [
-        ("seconds of the paper's iteration, median", f"{numbers['iteration_s_median']:.2f}"),
-        ("physics steps a second in it", count(numbers["world_steps_per_s"])),
-        ("... of contacts and solver alone, in the same motion", count(numbers["bare_world_steps_per_s"])),
-        ("... share", f"{numbers['bare_physics_ratio']:.2f}"),
-        ("... of robots that stand", count(numbers["bare_world_steps_per_s_standing"])),
-        ("a step on ground with friction and softness, over one without", f"{numbers['ground_step_ratio']:.3f}"),
-        ("training, 4,096 robots: environment steps a second", count(numbers["train_env_steps_per_s"])),
-        ("training, 8,192 robots", count(numbers["train_env_steps_per_s_8192"])),
-        ("training, two GPUs", count(numbers["train_env_steps_per_s_2gpu"])),
-        *((f"{row['num_envs']:,} robots: episodes a second", count(row["episodes_per_s"]))
-          for row in numbers["envs_curve"]),
-    ]  # fmt: skip
-    return table((numbers["device"], ""), rows)
+def archive_details() -> str:
+    """What else the published archives say."""
+    names = ("iterations", "invalid_episodes", "corrected_elites", "families", "fault_families", "with_collision",
+             "without_collision", "qd_score", "corrected_qd_score", "certified")  # fmt: skip
+    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
+    columns["share of the reachable cells"] = shown("reachable_coverage", ".1%")
+    return table(of_robots("results/{}/archive/archive.json"), columns, upright=True)
 
 
-def kernels(folder: Path, robot: str) -> str:
-    """Kernels against torch and the device's ceiling, by `make bench`; of the first GPU there is a file of."""
-    numbers = read(folder, "nvidia-h200.json")
-    rows = [
-        (row["kernel"], *(NONE if row[name] is None else f"{row[name]:.4f}" for name in
-         ("ours_ms", "torch_ms", "torch_compile_ms")), f"{row['speedup']:.0f}x", f"{row['ceiling_share']:.1%}",
-         row["bound_by"])
-        for row in numbers["rows"] if row["torch_ms"] is not None
-    ]  # fmt: skip
-    return table(("kernel", "ms", "eager torch", "compiled", "speed-up", "of the ceiling", "bound by"), rows)
+def training() -> str:
+    """Every controller in short: reaches the goal (no base collision)."""
+    rows = {f"{words}, {SETS[name]}": (robot, name)
+            for robot, words in ROBOTS.items() for name in SETS if name != HELD_OUT[1]}  # fmt: skip
+
+    def cell(controller: str) -> Callable[[Any], str]:
+        pair = ("goal", "success")
+        return lambda row: "{} ({})".format(*(rate(row[0], one, row[1], controller, short=True) for one in pair))
+
+    return table(rows, {controller: cell(controller) for controller in CONTROLLERS})
 
 
-def spaces(folder: Path, robot: str) -> str:
+def goals(robot: str, measure: str = "goal") -> str:
+    """Goal rates of every controller with 95 % intervals, and on the certified held-out terrains alone."""
+    tables = read(f"results/{robot}/tables.json")
+    rows = {f"{words} ({tables['terrains'][name]})": (measure, name) for name, words in SETS.items()}
+    certified = tables["certified"][HELD_OUT[0]]["terrains"]
+    rows[f"{SETS[HELD_OUT[0]]}, certified ({certified})"] = (f"certified_{measure}", HELD_OUT[0])
+    return table(rows, {one: lambda row, one=one: rate(robot, row[0], row[1], one) for one in CONTROLLERS})
+
+
+def collisions(robot: str) -> str:
+    """The same of episodes without a base collision."""
+    return goals(robot, "success")
+
+
+def beside_paper() -> str:
+    """No base collision and reward, and in brackets what the paper says of its controllers."""
+    rows = {f"{words}, {SETS[name]}": (robot, name)
+            for robot, words in ROBOTS.items() for name in ("hand_crafted", "hard_random", "generated")}  # fmt: skip
+
+    def cell(measure: str, controller: str, form: str) -> Callable[[Any], str]:
+        return lambda row: (f"{rate(row[0], measure, row[1], controller, short=True)} "
+                            f"({(paper.published(row[0]) or {})[measure][row[1]][controller]:{form}})")  # fmt: skip
+
+    kinds = {"no base collision": ("success", ".3f"), "reward": ("reward", ".1f")}
+    return table(rows, {f"{words}, {one}": cell(key, one, form)
+                        for words, (key, form) in kinds.items() for one in CONTROLLERS[1:4]})  # fmt: skip
+
+
+def methods(robot: str) -> str:
+    """Methods of search, means over seeds, the one with most failing elites first."""
+    rows = [(name.replace("mixed", "cma_mae+map_elites"), one) for file in ("search", "compare")
+            for name, one in read(f"results/{robot}/{file}.json").get("methods", {}).items()]  # fmt: skip
+    rows = sorted((row for row in rows if ":" not in row[0]), key=lambda row: (-row[1]["episodes"], -row[1]["failing"]))
+    names = ("seeds", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
+    named = {f"{name}, {one['episodes']:,.0f} episodes": one for name, one in rows}
+    return table(named, {name.replace("_", " "): name for name in names})
+
+
+def hardening() -> str:
+    """Rounds of hardening: what a search finds of each controller, and its goal rates."""
+    rows = {}
+    for robot, words in ROBOTS.items():
+        for seed, file in enumerate(("rounds", "rounds-1", "rounds-2")):
+            numbers = read(f"results/{robot}/{file}.json")
+            for one in numbers.get("rounds", ()):
+                goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
+                rows[f"{words}, seed {seed}: {one['controller']}"] = {**one, **goal}
+    columns: dict[str, Column] = {name: name for name in ("elites", "failing", "faults", "faults_panel")}
+    sets = {"hand_crafted": "hand-crafted", "hard_random": "hard-random", "search-0": "first archive"}
+    columns |= {f"goal, {words}": shown(name, ".3f") for name, words in sets.items()}
+    return table(rows, columns)
+
+
+def spaces() -> str:
     """Searches in different terrain spaces."""
-    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "certified", "faults_panel")
-    rows = [
-        (name, *(count(numbers.get(number)) for number in names))
-        for name, numbers in read(folder, "spaces.json")["spaces"].items()
-    ]
-    return table(("space", *(name.replace("_", " ") for name in names)), rows)
+    rows = {f"{words}, {one['space']}": one for words, numbers in of_robots("results/{}/spaces.json").items()
+            for one in numbers["spaces"].values()}  # fmt: skip
+    return table(rows, {name: name for name in ("episodes", "elites", "failing", "confirmed", "certified", "faults")})
 
 
-def scale(folder: Path, robot: str) -> str:
-    """More devices."""
-    rows = [
-        (f"{row['workers']}", count(row["episodes_per_s"]), f"{row['efficiency']:.3f}",
-         f"{row['paper_size_iteration_s']:.2f}", f"{row['speedup_paper_size']:.2f}")
-        for row in read(folder, "scale.json")["rows"]
-    ]  # fmt: skip
-    header = ("GPUs", "episodes a second", "of linear", "seconds of the paper's iteration", "times as fast as one")
-    return table(header, rows)
+def sizes() -> str:
+    """The size of an obstacle that half of the robots get over; in brackets the last one tried, if more do."""
+    columns, rows = {}, {}
+    for words, numbers in of_robots("results/{}/spaces.json").items():
+        last = {(row["element"], row["controller"]): row["value"] for row in numbers["dose"]}
+        for half in numbers["half"]:
+            name, tried = f"{words}: {half['controller']}", last[half["element"], half["controller"]]
+            obstacle = half["element"].replace("_", " ")
+            row = rows.setdefault(f"{obstacle}, {half['parameter']} {half['unit']}".strip(), {})
+            row[name] = f"({tried:g})" if half["value"] is None else f"{half['value']:.2f}"
+            columns[name] = lambda row, name=name: row.get(name, NONE)
+    return table(rows, columns)
 
 
-def solver_options(folder: Path, robot: str) -> str:
-    """Caps and capacities of the solver."""
-    rows = [
-        (f"{1e3 * row['physics_dt']:g} ms", f"{row['iterations']}", f"{row['njmax']}", f"{row['nconmax']}",
-         f"{row['wall_s']:.1f}", f"{row['goal_rate']:.4f}", f"{row['success_rate']:.4f}", f"{row['invalid']}")
-        for row in read(folder, "solver_options.json")["rows"]
-    ]  # fmt: skip
-    header = ("step", "iterations", "rows", "contacts", "seconds", "goal", "no base collision", "invalid")
-    return table(header, rows)
+def agreement() -> str:
+    """How far rates at the search's settings lie above those of other crossings of the same terrains."""
+    ways = {"again": "the same settings again", "resolved": "finer physics", "mujoco_c": "MuJoCo C",
+            "mujoco_c_resolved": "MuJoCo C, finer", "both_resolved": "both finer"}  # fmt: skip
+    rows = {f"{words}, {name.replace('_', '-')}: {label}": numbers[name][way]
+            for words, numbers in of_robots("results/{}/agreement.json").items()
+            for name in ("hard_random", "elites") for way, label in ways.items() if way in numbers[name]}  # fmt: skip
+    biases = {"goal rate": "goal_bias", "no base collision": "success_bias"}
+    return table(rows, {"terrains": "terrains", **{words: shown(key, "+.3f") for words, key in biases.items()}})
 
 
-def penalty_ratios(folder: Path, robot: str) -> str:
-    """How much more a crossing that misses the goal costs."""
-    rows = [
-        (name, value_words(row["ratio"], None, ".1f"))
-        for name, row in read(folder, "penalty_ratios.json")["penalties"].items()
-    ]
-    return table(("penalty", "missed the goal, over reached it"), rows)
+def minimal() -> str:
+    """Minimal terrains of the published archives."""
+    columns: dict[str, Column] = {"taken apart": "minimal", "bumps that a failure takes, median": "bumps_median"}
+    columns["margin [cm], median"] = shown("margin_m_median", ".1f", 100)
+    columns |= {"fail with finer physics too": "confirmed", "faults": "faults"}
+    columns["causes"] = lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:6])
+    return table(of_robots("results/{}/archive/minimal.json"), columns, upright=True)
 
 
-def rounds(folder: Path, robot: str) -> str:
-    """Rounds of hardening, and searches of the last controller beside searches of the base."""
-    numbers = read(folder, "rounds.json")
-    names = ("episodes", "elites", "corrected_elites", "failing", "faults", "faults_panel")
-    searches = [("the last again", row) for row in numbers.get("searches", ())]
-    searches += [("base again", row) for row in numbers.get("base_searches", ())]
-    rows = [
-        (controller, *(count(row.get(name)) for name in names))
-        for controller, row in [*((row["controller"], row) for row in numbers["rounds"]), *searches]
-    ]
-    return table(("controller", *(name.replace("_", " ") for name in names)), rows)
+def packs() -> str:
+    """Controllers on the published packs: goal rate, and failed terrains."""
+    files = of_robots("sim/robots/{}/pack/pack.json")
+    columns = {words: lambda name, rates=pack["rates"]: "{}; {} of {}".format(
+        value_words(rates[name]["goal_rate"], rates[name]["goal_interval"]), rates[name]["failing"],
+        rates[name]["terrains"]) for words, pack in files.items()}  # fmt: skip
+    return table({name: name for name in files["ANYmal C"]["rates"]}, columns)
 
 
-TABLES: dict[str, Callable[[Path, str], str]] = {
+ROBOT_TABLES = (goals, collisions, methods)
+TABLES: dict[str, Callable[..., str]] = {
     make.__name__: make
-    for make in (
-        archive, controllers, kind_differences, distances, ablation, search, agreement, speed, kernels, spaces, scale,
-        solver_options, penalty_ratios, rounds,
-    )
+    for make in (archives, archive_details, training, beside_paper, hardening, spaces, sizes, agreement, minimal,
+                 packs, *ROBOT_TABLES)
 }  # fmt: skip
 
 
-def with_tables(text: str, results: Path) -> str:
+def with_tables(text: str) -> str:
     """A page with its tables made anew."""
 
     def make(match: re.Match[str]) -> str:
-        name, robot = match["name"], match["robot"] or "bench"
+        name, robot = match[1], match[2].split()
         if name not in TABLES:
             raise ValueError(f"a table must be one of {', '.join(TABLES)}, got {name}")
-        try:
-            made = TABLES[name](results / robot, robot)
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"table {name} of {robot} lacks a number: {type(error).__name__}: {error}") from error
-        return f"{match[0].partition(chr(10))[0]}\n{made}\n<!-- table: end -->"
+        return f"{match[0].partition(chr(10))[0]}\n{TABLES[name](*robot)}\n<!-- end -->"
 
     return MARKED.sub(make, text)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Writes or checks all pages; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=Path("results"))
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
-    parser.add_argument("--check", action="store_true", help="write nothing")
-    args = parser.parse_args(argv)
     stale = []
-    for page in sorted(args.docs.glob("*.md")):
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         text = page.read_text(encoding="utf-8")
-        made = with_tables(text, args.results)
+        made = with_tables(text)
         if made != text:
-            stale.append(page)
-            if not args.check:
+            stale.append(page.name)
+            if "--check" not in argv:
                 page.write_text(made, encoding="utf-8")
-    for page in stale:
-        print(f"{page} {'says something else than the results' if args.check else 'is written anew'}")
-    return int(args.check and bool(stale))
+    for name in stale:
+        print(f"{name} {'says something else than the results' if '--check' in argv else 'is written anew'}")
+    return int("--check" in argv and bool(stale))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -27,7 +27,7 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
         return load_robot(Path(spec))
     raise ValueError(
         f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "
-        "(docs/own-robot.md)"
+        "(docs/robots.md)"
     )
 
 

@@ -27,7 +27,7 @@ def load_robot(path: Path) -> RobotCfg:
     robot: Any = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
-        raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/own-robot.md)")
+        raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
     if isinstance(robot.model_file, str):
         robot = replace(robot, model_file=Path(robot.model_file))
     mistakes = settings_problems(robot)

@@ -22,7 +22,7 @@ class OwnSpace(TerrainSpace):
 
     Args:
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
-        code: The user's object (docs/own-space.md): ``num_genes`` and ``rasterise(genes, x, y)``; optionally
+        code: The user's object (docs/terrains.md): ``num_genes`` and ``rasterise(genes, x, y)``; optionally
             ``hard_random(count, rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``,
             ``scaled(genes, scale)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``,
             ``sigma0``.
@@ -144,7 +144,7 @@ class OwnSpace(TerrainSpace):
             raise self._wrong(method, f"fails: {in_one_line(error)}") from error
 
     def _wrong(self, what: str, text: str) -> ValueError:
-        return ValueError(f"space '{self.name}': {what} {text}: docs/own-space.md")
+        return ValueError(f"space '{self.name}': {what} {text}: docs/terrains.md")
 
 
 def load_own(spec: str) -> OwnSpace:

@@ -39,8 +39,8 @@ SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "2", "--replicas"
 
 @pytest.fixture
 def project(tmp_path):
-    """The project with the penalty of docs/own-robot.md in its kernels, and a folder of the user's; its name."""
-    page = (ROOT / "docs" / "own-robot.md").read_text()
+    """The project with the penalty of docs/robots.md in its kernels, and a folder of the user's; its name."""
+    page = (ROOT / "docs" / "robots.md").read_text()
     function, name = re.findall(r"```python\n(@_penalty\ndef (\w+)\(.*?)```", page, re.DOTALL)[0]
     (tmp_path / "kernels").mkdir()
     for source in (ROOT / "kernels").glob("*.*"):

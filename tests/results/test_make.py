@@ -3,6 +3,7 @@
 import functools
 import importlib
 import json
+import re
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -99,19 +100,26 @@ def test_pages_say_what_the_files_say():
     assert docs.main(["--check"]) == 0
 
 
-def test_a_table_is_written_between_its_marks(tmp_path):
-    folder = tmp_path / "results" / "dog"
-    folder.mkdir(parents=True)
-    nearest = {"hard_random": {"terrains": 4, "median": 0.114, "least": 0.07, "largest": 0.2}}
-    (folder / "distances.json").write_text(json.dumps({"nearest_m": nearest}))
-    page = tmp_path / "page.md"
-    page.write_text("Before.\n<!-- table: distances dog -->\nold\n<!-- table: end -->\nBehind.\n")
-    words = ["--results", str(tmp_path / "results"), "--docs", str(tmp_path)]
-    assert docs.main([*words, "--check"]) == 1
-    assert docs.main(words) == 0 and docs.main([*words, "--check"]) == 0
-    lines = page.read_text().splitlines()
-    assert (len(lines), lines[0], lines[-1]) == (7, "Before.", "Behind.")
-    assert lines[4] == "| hard-random | 4 | 11.4 cm | 7.0 cm | 20.0 cm |"
-    page.write_text("<!-- table: distance dog -->\n<!-- table: end -->\n")
-    with pytest.raises(ValueError, match="distance"):
-        docs.main(words)
+def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text("Before.\n<!-- table: spaces -->\nold\n<!-- end -->\nBehind.\n")
+    counts = {"space": "course", "elites": 1234, "faults": None}
+    monkeypatch.setattr(docs, "ROOT", tmp_path)
+    monkeypatch.setattr(docs, "of_robots", lambda file: {"Dog": {"spaces": {"course": counts}}})
+    assert docs.main(["--check"]) == 1 and docs.main([]) == 0 and docs.main(["--check"]) == 0
+    lines = ["Before.", "<!-- table: spaces -->", "|  | elites |", "| --- | --- |", "| Dog, course | 1,234 |"]
+    assert (tmp_path / "README.md").read_text().splitlines() == [*lines, "<!-- end -->", "Behind."]
+    with pytest.raises(ValueError, match="absent"):
+        docs.with_tables("<!-- table: absent -->\n<!-- end -->")
+
+
+def test_a_cell_is_a_number_with_its_interval():
+    rows = {"a": {"share": 0.5, "share_interval": [0.2, 1.0]}, "b": {"share": 0.25}}
+    made = docs.table(rows, {"cm": docs.shown("share", ".1f", 100), "rate": docs.shown("share", ".2f")}, upright=True)
+    assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
+
+
+def test_results_name_no_path_of_the_machine_that_made_them():
+    files = [file for kind in ("*.json", "*.jsonl") for file in MAKE.parent.rglob(kind)]
+    place = re.compile(r"(?<![\w.])/(tmp|home|root|work|opt|mnt|usr)/")
+    assert files and [str(file) for file in files if place.search(file.read_text())] == []

@@ -1,6 +1,6 @@
 """A robot that the project does not ship: a dog of 13 kg with two joints a leg, as a user would bring it.
 
-:func:`write_dog` writes what docs/own-robot.md asks of a user: model, settings, and a scripted controller.
+:func:`write_dog` writes what docs/robots.md asks of a user: model, settings, and a scripted controller.
 """
 
 import struct
@@ -98,7 +98,7 @@ def urdf(*, trunk: str | None = None) -> str:
     return f'<robot name="dog">{"".join(parts)}\n</robot>\n'
 
 
-SETTINGS = '''"""The dog's settings, as docs/own-robot.md describes them."""
+SETTINGS = '''"""The dog's settings, as docs/robots.md describes them."""
 
 from sim.robots.robot import RobotCfg
 from sim.robots.training import TrainingCfg
