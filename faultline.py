@@ -1,6 +1,6 @@
 """The command ``faultline``, and its functions for Python; only what a command or a function needs is loaded.
 
-``faultline.search``, ``judge``, ``cross``, ``evaluate`` and ``finetune`` do what the commands of these names do;
+``faultline.search``, ``judge``, ``evaluate`` and ``finetune`` do what the commands of these names do, ``cross`` crosses;
 docs/searching.md shows them in twenty lines.
 """
 
@@ -23,7 +23,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "archive": Command("qd.commands:Archive", "search the terrains on which a controller fails"),
         "view": Command("qd.show.commands:View", "look at them in the browser"),
         "report": Command("qd.show.commands:Report", "one page about them"),
-        "film": Command("qd.show.commands:Film", "film the robot on one of them, or on a map of your own"),
+        "film": Command("qd.show.commands:Film", "film how the robot fails on one, or on a map of your own"),
         "judge": Command("qd.commands:Judge", "which of them are faults of the controller"),
         "export": Command("qd.show.commands:Export", "as files, faults as a pack, a controller as ONNX"),
     },
@@ -31,8 +31,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "minimise": Command("qd.commands:Minimise", "which parts of a failing terrain it takes to fail"),
         "evaluate": Command("qd.commands:Evaluate", "rates of controllers, of one or compared"),
         "dose": Command("qd.commands:Dose", "which real obstacle at which size stops a controller"),
-        "cross": Command("qd.show.commands:Cross", "cross a height map of your own"),
-        "replay": Command("qd.show.commands:Replay", "one elite again: numbers, and paths over its terrain"),
+        "replay": Command("qd.show.commands:Replay", "one elite, or a map of your own, again: numbers and paths"),
     },
     "Train": {
         "train": Command("train.commands:Train", "train a base controller from scratch"),

@@ -2,136 +2,102 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
-from qd.show.film_cfg import FilmCfg
 from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags
 from sim.files.settings import NonNegativeInt, PositiveInt
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mapped:
-    """How large and how high a height map is."""
+class Replay(ControllerFlags, DeviceFlag, EliteFlags):
+    """Cross terrains again: how often robots get over, what it costs them, and a figure with their paths.
 
+    Terrains are elites of a run, or minimal terrains, or a height map of your own. Elites are numbered by falling
+    fitness; after fresh episodes their corrected fitness counts. That is not the order in which the controller fails:
+    `faultline view` and `faultline report` list faults first.
+
+    A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, in
+    metres), or a grayscale .png of 8 or 16 bits seen from above (x to the right, y up) with the metres of a gray level.
+    Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of the
+    same name beside the .png, such as `faultline export` writes. Robots start near x = 2 m, y = 4 m and walk to
+    x = 14 m, y = 4 m. The middle of the map lies on the middle of what they cross, 16 m x 8 m. The rest of a larger map
+    is cut off. A smaller one goes on at the height of its edge. The map is resampled to 0.05 m: linearly, or by
+    weighted means where it is finer.
+    """
+
+    terrain: Path | None = None
+    """Instead of elites a height map of your own, an .npz or a .png; or a .recording.npz that stands beside a film, of
+    which nothing is crossed again."""
     size: tuple[float, float] | None = None
-    """Of the map along x and y [m], such as 16 8; its file's if left out."""
+    """Size of the map along x and y [m], such as 16 8; its file's if left out."""
     scale: float | None = None
     """Metres a gray level of the map; its file's if left out."""
     offset: float | None = None
     """Height of its gray level 0 [m]; its file's, or 0."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Replay(ControllerFlags, DeviceFlag, EliteFlags):
-    """Print one elite of an archive, or its minimal terrain, and draw the terrain with the robots' paths.
-
-    Elites are numbered by falling fitness; after fresh episodes their corrected fitness counts. That is not the order
-    in which the controller fails: `faultline view` and `faultline report` list faults first.
-    """
-
     replicas: PositiveInt = 20
     """Episodes to run."""
-    seed: NonNegativeInt = 0
-    """Seed of the fresh episodes."""
-    out: Path | None = None
-    """Figure to write, *.png; elite-<number>.png in the run, or of a published one in runs/<robot>-published; with
-    another controller elite-<number>-<its name>.png. Of a minimal terrain minimal-<number>..."""
-
-    def execute(self) -> None:
-        """Prints the numbers and writes the figure."""
-        from qd.show.elites import open_run
-        from qd.show.replay import replay
-        from qd.workers.evaluator import resolve_device
-
-        opened_run = open_run(self.robot, self.run, space=self.space)
-        replay(
-            opened_run, opened_run.terrain(self.elite, self.minimal), policy=self.policy, replicas=self.replicas,
-            seed=self.seed, device=resolve_device(self.device), out=self.out,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class Film(ControllerFlags, DeviceFlag, EliteFlags, Mapped):
-    """Film a robot on elites of an archive, or on a terrain of your own.
-
-    The episodes are those that `faultline replay` shows. Below the robot stand the map with all paths and what the
-    episode has cost so far, each penalty in multiples of its scale. Yellow arrows are contact forces of the feet, red
-    ones those beyond the robot's limit. The recording is stored beside the film, so that it can be filmed again
-    elsewhere. Without --out a film is elite-<number>.mp4 in the run, or of a published one in runs/<robot>-published;
-    with another controller elite-<number>-<its name>.mp4; of a minimal terrain minimal-<number>.mp4.
-    """
-
-    terrain: Path | None = None
-    """Instead of elites a height map of your own, an .npz or a .png (see `faultline cross --help`); or what was
-    recorded, a .recording.npz that stands beside a film."""
-    replicas: PositiveInt = 20
-    """Episodes to run."""
-    seed: NonNegativeInt = 0
-    """Seed of the episodes."""
-    out: Path | None = None
-    """File of the film, or with several elites their folder."""
-    look: FilmCfg = field(default_factory=FilmCfg)
-
-    def execute(self) -> None:
-        """Makes the films."""
-        from qd.show.cross import read_own_terrain
-        from qd.show.elites import open_run
-        from qd.show.film import RECORDING, film_elites, film_map, film_recording
-        from qd.workers.evaluator import resolve_device
-        from sim.robots.find import get_robot
-
-        if self.run is not None and self.terrain is not None:
-            raise ValueError("give one of --run and --terrain")
-        if self.terrain is not None and self.terrain.name.endswith(RECORDING):
-            film_recording(self.terrain, self.look, robot=self.robot, policy=self.policy, out=self.out)
-            return
-        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed, "out": self.out,
-                    "device": resolve_device(self.device)}  # fmt: skip
-        if self.terrain is not None:
-            terrain = read_own_terrain(self.terrain, self.size, self.scale, self.offset)
-            film_map(terrain, get_robot(self.robot or "anymal"), self.look, **crossing)
-            return
-        opened_run = open_run(self.robot, self.run, space=self.space)
-        film_elites(opened_run, opened_run.terrains(self.elite, self.minimal), self.look, **crossing)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cross(ControllerFlags, DeviceFlag, Mapped):
-    """Cross a height map of your own: how often does the controller get over, and what does it cost?
-
-    A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, floats
-    in metres), or a grayscale .png of 8 or 16 bits seen from above (x to the right, y up) with the metres of a gray
-    level. Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of
-    the same name beside the .png, such as `faultline export` writes.
-
-    Robots start near x = 2 m, y = 4 m and walk to x = 14 m, y = 4 m. The middle of the map lies on the middle of what
-    they cross, 16 m x 8 m. The rest of a larger map is cut off. A smaller one goes on at the height of its edge. The
-    map is resampled to 0.05 m: linearly, or by weighted means where it is finer.
-    """
-
-    terrain: Path
-    """The height map: an .npz or a .png."""
-    episodes: PositiveInt = 20
-    """Crossings."""
     seed: NonNegativeInt = 0
     """Draws their starts."""
     out: Path | None = None
-    """File for the numbers; runs/terrains/<map>-<robot>[-<controller>].json, where <map> is the path of the map with -
-    between its folders. The figure ...-paths.png is written beside it. Older files are replaced."""
+    """File to write: *.png of a figure, beside which its numbers are written as *.json, *.mp4 or *.gif of a film; with
+    several elites a folder. If left out elite-<number> or minimal-<number> in the run, of a published one in a folder
+    of its own in runs/, and of a map runs/terrains/<map>-<robot>; with another controller -<its name> is added."""
 
     def execute(self) -> None:
-        """Crosses the map, prints rates and costs, writes numbers and figure."""
-        from qd.show.cross import cross_map, read_own_terrain
+        """Prints the numbers, writes them and the figures."""
+        from qd.show.replay import replay
         from qd.workers.evaluator import resolve_device
+
+        replay(self._source(), device=resolve_device(self.device), out=self.out)
+
+    def _source(self) -> Any:
+        from qd.show.elites import open_run
+        from qd.show.replay import RECORDING, source_of_map, source_of_recording, source_of_run
         from sim.robots.find import get_robot
 
-        terrain = read_own_terrain(self.terrain, self.size, self.scale, self.offset)
-        cross_map(
-            terrain, get_robot(self.robot or "anymal"), self.policy, episodes=self.episodes, seed=self.seed,
-            device=resolve_device(self.device), out=self.out,
-        )  # fmt: skip
+        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
+        if self.terrain is None:
+            opened_run = open_run(self.robot, self.run, space=self.space)
+            return source_of_run(opened_run, self.elite, self.minimal, **crossing)
+        if self.run is not None:
+            raise ValueError("give one of --run and --terrain")
+        if self.terrain.name.endswith(RECORDING):
+            return source_of_recording(self.terrain, self.robot, self.policy)
+        robot, how = get_robot(self.robot or "anymal"), {"size_m": self.size, "scale_m": self.scale}
+        return source_of_map(self.terrain, robot, offset_m=self.offset, **how, **crossing)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film(Replay):
+    """Film how a robot fails, on elites of a run or on a terrain of your own.
+
+    The terrains and the episodes are those that `faultline replay` shows. The film begins 3 s before the robot falls,
+    collides or gets stuck, shows the last second before that four times slower, and ends 1 s after it. Feet that touch
+    are yellow, base and legs that touch magenta. Arrows are contact forces of the feet, red beyond the robot's limit.
+    The map shows all paths. The recording is stored beside the film, so that it can be filmed again elsewhere.
+    """
+
+    episode: NonNegativeInt | None = None
+    """Which episode to film. If left out, of the episodes that end as most do, the one with the median penalties."""
+    whole: bool = False
+    """Film the whole episode."""
+    gif: bool = False
+    """Write a GIF 480 pixels wide, of at most 2 MB."""
+    beside: str | None = None
+    """Another controller to show as a ghost from the same start: C-G or another name of the robot's panel, or a file,
+    as --policy takes it. If left out, ghosts are two other episodes."""
+    shadows: bool = True
+    """Whether the sun casts shadows; without a GPU they take half of the time."""
+
+    def execute(self) -> None:
+        """Makes the films."""
+        from qd.show.film import FilmCfg, film_source
+        from qd.workers.evaluator import resolve_device
+
+        look = FilmCfg(episode=self.episode, whole=self.whole, gif=self.gif, shadows=self.shadows)
+        film_source(self._source(), look, beside=self.beside, device=resolve_device(self.device), out=self.out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +122,7 @@ class Export(ControllerFlags, EliteFlags):
     For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
     has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
     (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
-    closed block). `faultline cross --terrain elite-N.npz`, or with the .png, crosses it again.
+    closed block). `faultline replay --terrain elite-N.npz`, or with the .png, crosses it again.
 
     With --pack it makes a pack from a judged run: faults and near-faults, to test any controller on with `faultline
     evaluate --pack`. The terrains are spread over the ways in which the searched controller fails and over families of

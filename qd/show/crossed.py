@@ -48,6 +48,12 @@ def ending_of(outcome: int) -> Ending:
     return ENDINGS.get(Outcome(outcome), _INVALID)
 
 
+def way_to_end(outcome: int, fallen: bool) -> str:
+    """How an episode ended, as one says of a robot: ``topples``."""
+    ways = {Outcome.GOAL: "crosses it", Outcome.TIME_OUT: "gets stuck", Outcome.OUT: "leaves the terrain"}
+    return ways.get(Outcome(outcome), "topples" if fallen else "hits the ground")
+
+
 class Rate(NamedTuple):
     """Hits among episodes."""
 
@@ -164,6 +170,20 @@ def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
     return int(candidates[order[(len(candidates) - 1) // 2]])
 
 
+_NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}  # of robots, as their makers write them
+
+
+def title_of(recording: Recording, controller: str = "") -> str:
+    """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
+    outcome = recording.outcome[0]
+    valid = outcome != Outcome.INVALID
+    most = int(np.bincount(outcome[valid], minlength=1).argmax())
+    ended = outcome == most
+    way = way_to_end(most, recording.fallen[0, ended].mean() > 0.5) if valid.any() else "no valid episode"
+    who = _NAMES.get(recording.robot, recording.robot) + (f" with {controller}" if controller else "")
+    return f"{who}, {recording.labels[0]}: {way}, {ended.sum()} of {valid.sum()}"
+
+
 def penalties_by_place(crossed: Crossed, penalties: tuple[str, ...], edges: NDArray[np.float64]) -> NDArray[np.float64]:
     """Scaled penalties per episode by where along x they were incurred.
 
@@ -202,18 +222,6 @@ def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> F
         handles.append(Patch(facecolor=look.color, hatch=look.hatch, edgecolor="white", label=label_of(name)))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
     top.set_xlim(*_x_limits(crossed))
-    return figure
-
-
-def draw_paths(crossed: Crossed, title: str) -> Figure:
-    """One terrain from above with the robots' paths, and marks where they ended, by how."""
-    figure = new_figure(11.0, 6.2)
-    axes = figure.subplots()
-    figure.colorbar(draw_map(axes, crossed), ax=axes, label="height [m]", shrink=0.7)
-    axes.set_title(title)
-    axes.set_xlabel("x [m]")
-    axes.set_xlim(*_x_limits(crossed))
-    figure.legend(handles=_legend(crossed), loc="outside lower center", ncols=6, frameon=False, handlelength=3)
     return figure
 
 

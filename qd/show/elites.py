@@ -11,7 +11,7 @@ from qd.archive import Archive, goal_rates, read_archive
 from qd.fitness import FitnessCfg
 from qd.judge import CERTIFIERS_FOLDER, panel_of
 from qd.minimise import MinimalTerrains, read_minimal
-from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run, folder_for
+from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy, suffix_of
 from sim.files.command import chosen_elites
 from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
@@ -121,10 +121,6 @@ class OpenedRun:
         rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
         return max((name for name in self.certifiers() if rate_of[name] > 0.0), key=rate_of.__getitem__, default=None)
 
-    def output(self, stem: str, policy: str | None = None) -> Path:
-        """Where a file about a terrain goes, without its ending: into the run, or for a published one under runs/."""
-        return folder_for(self.path, self.robot.name) / (stem + (self.suffix(policy) if policy else ""))
-
     def minima(self) -> MinimalTerrains:
         """The minimal terrains of its elites."""
         minima = read_minimal(self.folder, self.archive)
@@ -139,18 +135,14 @@ class OpenedRun:
             elite: Numbers of elites apart by spaces or commas, or ``all``.
             minimal: The same of minimal terrains, which are then meant instead.
         """
-        archive, whole = self.archive, f"of {len(self.archive):,} of {self.archive.robot}"
         if minimal is None:
-            numbers = chosen_elites(elite, len(archive), self.path)
-            return [Terrain(n, archive.genes[n], f"elite-{n}", f"elite {n} {whole}") for n in numbers]
+            numbers = chosen_elites(elite, len(self.archive), self.path)
+            return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}") for n in numbers]
         minima = self.minima()
         return [
-            Terrain(
-                n, minima.genes[n], f"minimal-{n}", f"minimal terrain of elite {n} {whole}", minima.entry(n),
-                minima.words(n),
-            )
+            Terrain(n, minima.genes[n], f"minimal-{n}", f"minimal terrain {n}", minima.entry(n), minima.words(n))
             for n in minima.chosen(minimal, self.path)
-        ]  # fmt: skip
+        ]
 
     def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
         """The terrain that a command line names, where only one makes sense."""

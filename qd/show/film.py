@@ -1,162 +1,325 @@
 """Films of crossings: ``faultline film --elite 0``, without a screen, with a GPU or without."""
 
-import sys
+import io
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
+from PIL import Image, ImageDraw, ImageFont
 
-from qd.show.cross import OWN_FOLDER, OwnTerrain
-from qd.show.crossed import typical_episode
-from qd.show.elites import OpenedRun, Terrain
-from qd.show.film_cfg import FilmCfg
-from qd.show.replay import record_terrains
-from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of, num_pictures
-from sim.files.atomic import prepare_output, write_atomically
-from sim.policy.spec import crosser_name
-from sim.recording.file import read_recording, write_recording
+from kernels.episode import Outcome
+from qd.judge import panel_of
+from qd.run.progress import share_bar
+from qd.show.crossed import crossed_of, ending_of, moment_of_failure, title_of, typical_episode, way_to_end
+from qd.show.replay import RECORDING, Source, save
+from qd.workers.evaluator import check_policy
+from sim.crossing import CrossingCfg
+from sim.maps.picture import LENGTH
+from sim.mujoco_c.model import surface_heights
+from sim.policy.spec import label_suffix, spec_of
+from sim.recording.file import write_recording
 from sim.recording.recorder import Recording
-from sim.recording.renderer import Renderer, open_context
-from sim.robots.find import robot_of
+from sim.recording.renderer import Camera, Ghost, Renderer, open_context
+from sim.recording.scene import OTHER_CONTROLLER, height_colors
 from sim.robots.robot import RobotCfg
 
-RECORDING = ".recording.npz"
-"""Ending of the recording that stands beside a film."""
-_DISTANCE = 4.6  # of the camera, in standing heights of the robot
+FPS, GIF_FPS = 25, 12.5
+"""Pictures a second of a film and of a GIF, whose pictures last whole hundredths of a second."""
+SIZE, GIF_SIZE = (1280, 720), (480, 270)
+"""Width and height [pixels]."""
+MOST_BYTES = 2_000_000
+"""The largest GIF."""
+_COLORS = (256, 128, 64, 32, 16)  # of a GIF; fewer where it would be too large
+_FINER = 2  # than a GIF its pictures are rendered
+_BEFORE_S, _AFTER_S, _SLOW_S, _SLOWNESS = 3.0, 1.0, 1.0, 4.0  # of the moment of failure
+_GHOSTS = 2  # other episodes shown
+_DISTANCE = 2.8  # of the camera, in heights or lengths of the robot
+_SMOOTH_S = 0.8  # over which the camera follows the base
+_ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
+_CLEARANCE = 0.05  # of the line of sight over the ground [m]
+
+Picture = NDArray[np.uint8]
+"""RGB, shape (height, width, 3)."""
 
 
-def film_elites(
-    opened_run: OpenedRun,
-    terrains: Sequence[Terrain],
-    cfg: FilmCfg,
-    *,
-    policy: str | None = None,
-    replicas: int = 20,
-    seed: int = 0,
-    device: str = "cpu",
-    out: Path | None = None,
-) -> list[Path]:
-    """Films of an archive's terrains, in the run, in a folder ``out``, or one in a file ``out``.
+@dataclass(frozen=True, kw_only=True)
+class FilmCfg:
+    """What a film shows, and as what."""
 
-    All recordings are written before the first film is made.
-    """
-    controller = opened_run.policy(policy)
-    outs = [Path(f"{opened_run.output(terrain.stem, controller)}.mp4") for terrain in terrains]
-    if out is not None:
-        outs = [out / path.name for path in outs] if len(outs) > 1 or out.is_dir() else [out]
-    _check(cfg, outs, replicas)
-    recordings = record_terrains(opened_run, terrains, policy=controller, replicas=replicas, seed=seed, device=device)
-    scales = dict(zip(opened_run.archive.penalties, opened_run.archive.scales, strict=True))
-    return _store_and_film(recordings, opened_run.robot, scales, cfg, outs)
+    episode: int | None = None
+    """Number of the episode; the typical one if None."""
+    whole: bool = False
+    """All of the episode, not the seconds about its failure alone."""
+    gif: bool = False
+    """A GIF, not an MP4."""
+    shadows: bool = True
+    """Whether the sun casts shadows."""
 
 
-def film_map(
-    terrain: OwnTerrain,
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One episode of a recording of one terrain, and others beside it as ghosts."""
+
+    recording: Recording
+    episode: int
+    """Its index."""
+    scales: dict[str, float]
+    """What each penalty is divided by, so that they compare; those not named are not drawn."""
+    title: str = ""
+    beside: tuple[str, Recording] | None = None
+    """Name of another controller, and what was recorded of it from the same starts; without it ghosts are others of
+    the recording's episodes."""
+
+    @cached_property
+    def end(self) -> float:
+        """When the episode ends [s]."""
+        return self.recording.dt * (int(self.recording.num_frames[0, self.episode]) - 1)
+
+    @cached_property
+    def moment(self) -> float | None:
+        """When the robot fails [s]; None if it does not."""
+        arrives = self.recording.outcome[0, self.episode] == Outcome.GOAL
+        return None if arrives else moment_of_failure(self.recording, self.episode)
+
+    @property
+    def ghosts(self) -> list[Ghost]:
+        """The others, with all their poses, shape (frames, 7 + num_joints)."""
+        if self.beside is not None:
+            name, other = self.beside
+            return [Ghost(other.qpos(0, self.episode), OTHER_CONTROLLER, name)]
+        others = [k for k in range(self.recording.num_episodes) if k != self.episode]
+        return [Ghost(self.recording.qpos(0, k)) for k in others[:_GHOSTS]]
+
+    def times(self, fps: float, *, whole: bool = False) -> NDArray[np.float64]:
+        """Time of each picture [s], from 3 s before the robot fails to 1 s after it, slower by four just before it.
+
+        The whole of the episode, or one in which the robot arrives, is shown to 1 s after its end.
+        """
+        moment = self.end if self.moment is None else self.moment
+        whole = whole or self.moment is None
+        begin, stop = (0.0, self.end + _AFTER_S) if whole else (max(0.0, moment - _BEFORE_S), moment + _AFTER_S)
+        slow = moment if self.moment is None else max(begin, moment - _SLOW_S)
+        played = np.cumsum([0.0, slow - begin, _SLOWNESS * (moment - slow), stop - moment])
+        return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, [begin, slow, moment, stop])
+
+    def second_line(self) -> str:
+        """Who else crosses, or how often this controller arrives."""
+        if self.beside is not None:
+            return f"{self.beside[0]} {title_of(self.beside[1]).partition(': ')[2]}"
+        arrived = crossed_of(self.recording, (), ()).rates[ending_of(Outcome.GOAL).words]
+        return f"reached the goal: {arrived}"
+
+
+def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
+    """Between two poses in proportion, MuJoCo's coordinates, shape (7 + num_joints,); past the last one the last."""
+    low = min(int(frame), len(poses) - 1)
+    first, last, share = poses[low], poses[min(low + 1, len(poses) - 1)].copy(), frame - int(frame)
+    last[3:7] *= np.copysign(1.0, first[3:7] @ last[3:7])
+    pose = (1.0 - share) * first + share * last
+    pose[3:7] /= np.linalg.norm(pose[3:7])
+    return pose
+
+
+def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Camera]:
+    """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it."""
+    recording, frames = shot.recording, round(shot.end / shot.recording.dt) + 1
+    base = recording.base_position[0, shot.episode, :frames].astype(np.float64)
+    width = max(1, round(_SMOOTH_S / recording.dt)) | 1
+    padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
+    sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
+    smooth = (sums[width:] - sums[:-width]) / width
+    targets = np.stack([np.interp(times, recording.dt * np.arange(frames), axis) for axis in smooth.T], axis=1)
+    along = np.linspace(0.1, 1.0, 19)[:, None]
+    for elevation in _ELEVATIONS:
+        camera = Camera(target=(0.0, 0.0, 0.0), distance=distance, elevation=elevation)
+        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
+        back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
+        sight = targets[:, None] + along * back
+        ground = surface_heights(recording.heights[0].astype(np.float64), sight[..., 0], sight[..., 1])
+        if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
+            break
+    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+
+
+def pictures_of(
+    shot: Shot, renderer: Renderer, cameras: Sequence[Camera], times: NDArray[np.float64], size: tuple[int, int]
+) -> Iterator[Picture]:
+    """The pictures of a film, each at a time of the episode [s] by a camera, of a size [pixels]."""
+    recording, dt = shot.recording, shot.recording.dt
+    poses, ghosts, chart = recording.qpos(0, shot.episode), shot.ghosts, map_of(shot, size[0] // 5)
+    is_slow = np.diff(times, append=np.inf) < 0.9 * np.diff(times).max(initial=0.0)
+    for time_s, slow, camera in zip(times.tolist(), is_slow.tolist(), cameras, strict=True):
+        frame = min(time_s / dt, float(len(poses) - 1))
+        pose, marks = pose_at(poses, frame), ("touching", "foot_force")
+        view = renderer.render(
+            pose,
+            camera,
+            ghosts=[ghost._replace(qpos=pose_at(ghost.qpos, time_s / dt)) for ghost in ghosts],
+            **{name: getattr(recording, name)[0, shot.episode, int(frame + 0.5)] for name in marks},
+        )
+        picture = Image.fromarray(view).resize(size, Image.Resampling.BOX)
+        _letter(picture, shot, time_s, "  1/4 speed" * slow)
+        here = chart.copy()
+        ImageDraw.Draw(here).circle(_on_map(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
+        picture.paste(here, (size[0] - chart.width, 0))
+        yield np.asarray(picture)
+
+
+def _letter(picture: Image.Image, shot: Shot, time_s: float, speed: str) -> None:
+    """Writes the title at the top of a picture, the time at its bottom, and from it on the moment of failure."""
+    unit, draw = picture.height / 540, ImageDraw.Draw(picture)
+    width = picture.width / unit
+
+    def write(place: tuple[float, float], text: str, size: float, color: Any, anchor: str = "ls") -> None:
+        font, edge = ImageFont.load_default(size * unit), max(1, round(2 * unit))
+        draw.text((place[0] * unit, place[1] * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
+
+    write((10, 32), shot.title, 26, "black")
+    write((10, 60), shot.second_line(), 20, "#0b6e62" if shot.beside else "#303030")
+    write((width - 10, 528), f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
+    if shot.moment is not None and time_s >= shot.moment:
+        outcome, fallen = shot.recording.outcome[0, shot.episode], shot.recording.fallen[0, shot.episode]
+        words = f"{way_to_end(outcome, bool(fallen))} at {shot.moment:.1f} s"
+        write((10, 528), words, 30, ending_of(outcome).color)
+
+
+def map_of(shot: Shot, width: int) -> Image.Image:
+    """The terrain from above with all paths, that of the film in the colour of how it ended; ``width`` [pixels]."""
+    recording = shot.recording
+    colors = np.rint(255.0 * height_colors(recording.heights[0])[::-1]).astype(np.uint8)
+    image = Image.fromarray(colors).resize((width, width * colors.shape[0] // colors.shape[1]))
+    draw = ImageDraw.Draw(image)
+    for k in [*(k for k in range(recording.num_episodes) if k != shot.episode), shot.episode]:
+        path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
+        shown = k == shot.episode
+        draw.line(_on_map(image, path), ending_of(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
+    draw.circle(_on_map(image, np.array([CrossingCfg.goal]))[0], width / 60, "#009e73", "white")
+    return image
+
+
+def _on_map(image: Image.Image, places: NDArray[np.floating]) -> list[tuple[float, float]]:
+    """Pixels of places [m], shape (count, 2), on a map."""
+    pixels = image.width / LENGTH * places.astype(np.float64)
+    return [(x, image.height - y) for x, y in pixels.tolist()]
+
+
+def film(
+    recording: Recording,
     robot: RobotCfg,
-    cfg: FilmCfg,
+    scales: dict[str, float],
+    out: Path,
+    cfg: FilmCfg | None = None,
     *,
-    policy: str | None = None,
-    replicas: int = 20,
-    seed: int = 0,
-    device: str = "cpu",
-    out: Path | None = None,
-) -> list[Path]:
-    """A film of a user's own terrain."""
-    controller = policy or str(robot.policy_file)
-    outs = [out or OWN_FOLDER / f"{terrain.name}-{crosser_name(robot, controller)}.mp4"]
-    _check(cfg, outs, replicas)
-    print(f"{terrain.file}: {terrain.fitted}", flush=True)
-    recording = terrain.record(robot, controller, replicas=replicas, seed=seed, device=device)
-    return _store_and_film([recording], robot, scales_of(robot, policy), cfg, outs)
+    by: str = "",
+    beside: tuple[str, Recording] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> None:
+    """Films an episode of a recording of one terrain.
 
-
-def _store_and_film(
-    recordings: Sequence[Recording], robot: RobotCfg, scales: dict[str, float], cfg: FilmCfg, outs: list[Path]
-) -> list[Path]:
-    for recording, path in zip(recordings, outs, strict=True):
-        write_recording(path.with_name(path.stem + RECORDING), recording)
-    for recording, path in zip(recordings, outs, strict=True):
-        film(recording, robot, scales, cfg, path)
-    return outs
-
-
-def film_recording(
-    file: Path, cfg: FilmCfg, *, robot: str | None = None, policy: str | None = None, out: Path | None = None
-) -> list[Path]:
-    """Films of what was recorded of one terrain or several, beside the recording or in ``out``; nothing is crossed.
-
-    Penalties are drawn by the scales of ``policy``.
+    Args:
+        recording: Of the terrain.
+        robot: Its robot.
+        scales: What each penalty is divided by.
+        out: The file.
+        cfg: What to show.
+        by: Name of the controller, where it is not the robot's own.
+        beside: Name and recording of another controller from the same starts, to be shown beside it.
+        progress: Called with the share that is done.
     """
-    recording = read_recording(file)
-    recorded = robot_of({**recording.origin, "robot": recording.robot}, robot, file)
-    if recording.joint_names != recorded.joint_names:
-        raise ValueError(f"{file} is of other joints than {recorded.name} has: give the --robot that was recorded")
-    count, stem = recording.num_terrains, file.name.removesuffix(RECORDING).removesuffix(".npz")
-    outs = [(out or file.parent) / (f"{stem}.mp4" if count == 1 else f"{stem}-{k}.mp4") for k in range(count)]
-    if out is not None and count == 1 and not out.is_dir():
-        outs = [out]
-    _check(cfg, outs)
-    for k, path in enumerate(outs):
-        film(recording.of_terrain(k), recorded, scales_of(recorded, policy), cfg, path)
-    return outs
-
-
-def _check(cfg: FilmCfg, outs: list[Path], replicas: int | None = None) -> None:
-    """Refuses an episode that is not crossed or a machine without OpenGL, and prepares the folder, before crossing."""
-    if cfg.episode is not None and replicas is not None and cfg.episode >= replicas:
-        raise ValueError(f"episode must be one of 0..{replicas - 1}, got {cfg.episode}")
-    open_context(64, 64).free()
-    prepare_output(outs[0])
-
-
-def scales_of(robot: RobotCfg, policy: str | None) -> dict[str, float]:
-    """The robot's penalty scales; 1 each, and so raw sums, where they were never measured."""
-    try:
-        scales = robot.read_penalty_scales(policy)
-    except ValueError as error:
-        print(f"{error}; penalties are drawn as they are, unscaled", flush=True)
-        scales = (1.0,) * len(robot.penalties)
-    return dict(zip(robot.penalties, scales, strict=True))
-
-
-def film(recording: Recording, robot: RobotCfg, scales: dict[str, float], cfg: FilmCfg, out: Path) -> None:
-    """Films an episode of a recording of one terrain."""
-    replicas = recording.replicas.tolist()
+    cfg, replicas = cfg or FilmCfg(), recording.replicas.tolist()
     if cfg.episode is not None and cfg.episode not in replicas:
         raise ValueError(f"episode {cfg.episode} was not recorded, expected one of {', '.join(map(str, replicas))}")
     episode = typical_episode(recording, scales) if cfg.episode is None else replicas.index(cfg.episode)
-    ghosts = tuple(k for k in range(len(replicas)) if k != episode)[: cfg.ghosts]
-    shot = Shot(recording=recording, episode=episode, ghosts=ghosts, scales=scales)
-    cameras = follow(shot, _DISTANCE * robot.default_base_height)
-    replaced = " (replaced)" if out.exists() else ""
+    title = title_of(recording, by)
+    shot = Shot(recording=recording, episode=episode, scales=scales, title=title, beside=beside)
+    times = shot.times(GIF_FPS if cfg.gif else FPS, whole=cfg.whole)
+    cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
+    size, finer = (GIF_SIZE, _FINER) if cfg.gif else (SIZE, 1)
     look: dict[str, Any] = {"shadows": cfg.shadows, "ground": recording.ground}
-    with Renderer(robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT, **look) as renderer:
-        bar: dict[str, Any] = {"desc": f"filming {recording.labels[0]}", "unit": "picture", "disable": None}
-        pictures = frames_of(shot, renderer, cameras, cfg.fps)
-        write_film(out, tqdm(pictures, total=num_pictures(shot, cfg.fps), file=sys.stderr, **bar), cfg.fps)
-    print(f"Film: {out}{replaced}", flush=True)
+
+    def reported() -> Iterator[Picture]:
+        for count, picture in enumerate(pictures_of(shot, renderer, cameras, times, size), 1):
+            yield picture
+            progress(count / len(times))
+
+    with Renderer(robot, recording.heights[0], width=finer * size[0], height=finer * size[1], **look) as renderer:
+        content = as_gif(list(reported())) if cfg.gif else as_mp4(reported())
+    save(out, content, "Film")
 
 
-def write_film(path: Path, pictures: Iterable[NDArray[np.uint8]], fps: int) -> None:
-    """Encodes RGB pictures of one shape with even sides as an MP4 (H.264) that plays everywhere, atomically."""
+def as_mp4(pictures: Iterable[Picture], fps: int = FPS) -> bytes:
+    """Pictures of one shape with even sides as an MP4 (H.264) that plays everywhere."""
     with tempfile.TemporaryDirectory() as folder:
-        draft = Path(folder) / "film.mp4"
-        writer: Any = None
+        draft, writer = Path(folder) / "film.mp4", None
         try:
             for picture in pictures:
                 if writer is None:
                     size = (picture.shape[1], picture.shape[0])
-                    writer = imageio_ffmpeg.write_frames(
-                        str(draft), size, fps=fps, quality=7, macro_block_size=2, ffmpeg_log_level="error"
-                    )
+                    how: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+                    writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **how)
                     writer.send(None)
                 writer.send(np.ascontiguousarray(picture))
         finally:
             if writer is not None:
                 writer.close()
-        write_atomically(path, draft.read_bytes())
+        return draft.read_bytes()
+
+
+def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
+    """Pictures of one shape as a GIF that repeats, with as many colours, and then pictures, as its size allows."""
+    for step in (1, 2, 4):
+        images = [Image.fromarray(picture) for picture in pictures[::step]]
+        sample = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)]))
+        for colors in _COLORS:
+            palette = sample.quantize(colors, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+            first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+            content = io.BytesIO()
+            duration = round(1000 * step / GIF_FPS)
+            first.save(content, "GIF", save_all=True, append_images=others, duration=duration, loop=0, optimize=False)
+            if content.tell() <= most_bytes:
+                return content.getvalue()
+    raise ValueError(
+        f"a GIF must have at most {most_bytes} bytes, got more of {len(pictures)} pictures: film it as MP4"
+    )
+
+
+def film_source(
+    source: Source, cfg: FilmCfg, *, beside: str | None = None, device: str = "cpu", out: Path | None = None
+) -> list[Path]:
+    """Films of terrains, each with its recording beside it; all is crossed and stored before the first is made.
+
+    Args:
+        source: The terrains.
+        cfg: What to show.
+        beside: Another controller to show as a ghost: a name of the run's certifiers or of the panel, or a file.
+        device: Where to cross.
+        out: File, or of several terrains a folder.
+    """
+    files = source.files(".gif" if cfg.gif else ".mp4", out)
+    replicas = [crossing.replicas for crossing in source.wanted[:1]]
+    if cfg.episode is not None and replicas and cfg.episode >= replicas[0]:
+        raise ValueError(f"episode must be one of 0..{replicas[0] - 1}, got {cfg.episode}")
+    if beside is not None and source.recorded:
+        raise ValueError(f"beside {beside} needs crossings from the same starts: film the elite or the map instead")
+    open_context(64, 64).free()
+    certifiers = {**panel_of(source.robot), **(source.opened_run.certifiers() if source.opened_run else {})}
+    policy = None if beside is None else certifiers.get(beside, spec_of(beside, source.robot))
+    if policy is not None:
+        check_policy(policy, source.robot, device)
+    recordings = source.record(device)
+    others = [None] * len(files) if policy is None else source.record(device, policy)
+    if not source.recorded:
+        for recording, file in zip(recordings, files, strict=True):
+            write_recording(file.with_name(file.stem + RECORDING), recording)
+    scales = dict(zip(source.fitness.penalties, source.fitness.scales, strict=True))
+    for recording, other, file in zip(recordings, others, files, strict=True):
+        ghost = None if other is None else (label_suffix(str(beside))[1:], other)
+        with share_bar(f"filming {recording.labels[0]}") as progress:
+            film(recording, source.robot, scales, file, cfg, by=source.by, beside=ghost, progress=progress)
+    return files

@@ -1,149 +1,270 @@
-"""One elite again: its numbers beside those of fresh episodes, and its terrain with the robots' paths over it."""
+"""Terrains again: elites of a run, a map of one's own, or what was recorded; their numbers and their figures."""
 
+import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from matplotlib.figure import Figure
-
+from kernels.episode import Outcome
 from qd.archive import Archive
+from qd.descriptors import Cells
 from qd.faults import elite_words
-from qd.fitness import Evaluation, evaluation_of
-from qd.show.crossed import crossed_of, draw_paths
+from qd.fitness import Evaluation, FitnessCfg, evaluation_of
+from qd.run.directory import RUNS, folder_for
+from qd.show.crossed import Crossed, crossed_of, draw_crossing, title_of
 from qd.show.elites import OpenedRun, Terrain
-from qd.show.figures import look_of, save_figure
-from qd.show.recordings import Recordings, on_elite
-from sim.files.atomic import prepare_output
-from sim.files.intervals import rate_words
-from sim.policy.spec import ControllerSpec
+from qd.show.figures import label_of, look_of
+from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
+from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
+from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.figures import as_png
+from sim.files.intervals import rate_words, wilson_interval
+from sim.maps.heightmap import as_terrain, fitted, read_heightmap
+from sim.policy.spec import ControllerSpec, crosser_name
+from sim.recording.file import read_recording
 from sim.recording.recorder import Recording
+from sim.robots.find import robot_of
+from sim.robots.robot import RobotCfg
 
-
-def record_terrains(
-    opened_run: OpenedRun, terrains: Sequence[Terrain], *, policy: str, replicas: int, seed: int, device: str
-) -> list[Recording]:
-    """Crossings of an archive's terrains, which are crossed where no recording of them is stored."""
-    wanted = [
-        on_elite(
-            opened_run.archive, terrain.number, policy=policy, replicas=replicas, seed=seed, label=terrain.label,
-            minimal=terrain.genes if terrain.minimal else None,
-        )
-        for terrain in terrains
-    ]  # fmt: skip
-    return Recordings(opened_run.robot, device=device).all_of(wanted)
+OWN_FOLDER = RUNS / "terrains"
+"""Where what is made of a user's own terrains goes."""
+RECORDING = ".recording.npz"
+"""Ending of the recording that stands beside a film."""
+_LONGEST_NAME = 120  # characters of a map's path; with robot, controller and ending a file may have 255
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay:
-    """A terrain and what became of it this time."""
+class Source:
+    """Terrains to show, and who crosses them."""
 
-    opened_run: OpenedRun
-    terrain: Terrain
-    recording: Recording
-    """Of the terrain."""
-    fresh: Evaluation
-    controller: str = ""
-    """Who crossed it this time, if that is another controller than the search's."""
+    robot: RobotCfg
+    fitness: FitnessCfg
+    """Penalties, and the scales that make them comparable."""
+    folder: Path
+    """Where files about them go."""
+    stems: Sequence[str]
+    """What files about each terrain are called, without their ending."""
+    about: Sequence[dict[str, Any]]
+    """What is known of each terrain, for the file of its numbers."""
+    wanted: Sequence[Wanted] = ()
+    """The crossings of each terrain."""
+    recorded: Sequence[Recording] = ()
+    """The recording of each terrain, where nothing is to be crossed."""
+    inputs: tuple[Path, ...] = ()
+    """Files of the user, which are never overwritten."""
+    by: str = ""
+    """Name of the controller, where it is not the usual one."""
+    opened_run: OpenedRun | None = None
+    """The run of elites."""
+    terrains: Sequence[Terrain] = ()
+    """The elites."""
+
+    def record(self, device: str, policy: str | None = None) -> list[Recording]:
+        """The recording of each terrain, by another controller if one is named; what is not stored is crossed."""
+        wanted = [replace(crossing, policy=policy or crossing.policy) for crossing in self.wanted]
+        return list(self.recorded) or Recordings(self.robot, device=device).all_of(wanted)
+
+    def files(self, ending: str, out: Path | None) -> list[Path]:
+        """The file of each terrain: in its folder, in a folder ``out``, or ``out``; refused before long work."""
+        files = [self.folder / f"{stem}{ending}" for stem in self.stems]
+        if out is not None:
+            files = [out / file.name for file in files] if len(files) > 1 or out.is_dir() else [out]
+        if files[0].suffix != ending:
+            raise ValueError(f"out must be a file named *{ending}, got {out}")
+        given = {file.resolve() for file in self.inputs}
+        if given & {other.resolve() for file in files for other in (file, file.with_suffix(".json"))}:
+            raise ValueError(f"out {out} would overwrite {self.inputs[0]} or its scale: name another file")
+        prepare_output(files[0])
+        return files
 
 
-def replay(
+def source_of_run(
     opened_run: OpenedRun,
-    terrain: Terrain,
+    elite: str = "0",
+    minimal: str | None = None,
     *,
     policy: str | None = None,
     replicas: int = 20,
     seed: int = 0,
-    device: str = "cpu",
-    out: Path | None = None,
-) -> Replay:
-    """Crosses a terrain again, prints its numbers, and draws it with the robots' paths."""
-    controller = opened_run.policy(policy)
-    out = out or Path(f"{opened_run.output(terrain.stem, controller)}.png")
-    if out.suffix != ".png":
-        raise ValueError(f"out must be a file named *.png, got {out}")
-    prepare_output(out)
-    (recording,) = record_terrains(
-        opened_run, [terrain], policy=controller, replicas=replicas, seed=seed, device=device
-    )  # fmt: skip
+) -> Source:
+    """Elites of a run or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
+    controller, terrains = opened_run.policy(policy), opened_run.terrains(elite, minimal)
+    suffix = opened_run.suffix(controller)
     _, fitness = opened_run.as_searched()
-    replayed = Replay(
+    return Source(
+        robot=opened_run.robot,
+        fitness=fitness,
+        folder=folder_for(opened_run.path, opened_run.robot.name),
+        stems=[f"{terrain.stem}{suffix}" for terrain in terrains],
+        by=suffix[1:],
+        about=[{"run": str(opened_run.path), "elite": t.number, "minimal": t.minimal} for t in terrains],
+        wanted=[
+            on_elite(
+                opened_run.archive, terrain.number, policy=controller, replicas=replicas, seed=seed,
+                label=terrain.label, minimal=terrain.genes if terrain.minimal else None,
+            )
+            for terrain in terrains
+        ],
         opened_run=opened_run,
-        terrain=terrain,
-        recording=recording,
-        fresh=evaluation_of(recording.result(), opened_run.archive.cells, fitness),
-        controller=controller if opened_run.suffix(controller) else "",
+        terrains=terrains,
+    )  # fmt: skip
+
+
+def source_of_map(
+    file: Path,
+    robot: RobotCfg,
+    *,
+    size_m: tuple[float, float] | None = None,
+    scale_m: float | None = None,
+    offset_m: float | None = None,
+    policy: str | None = None,
+    replicas: int = 20,
+    seed: int = 0,
+) -> Source:
+    """A height map of one's own; arguments as of :func:`sim.maps.heightmap.read_heightmap`."""
+    heightmap = read_heightmap(file, size_m=size_m, scale_m=scale_m, offset_m=offset_m)
+    print(f"{file}: {fitted(heightmap)}", flush=True)
+    heights, controller = as_terrain(heightmap), policy or str(robot.policy_file)
+    path, here = file.resolve(), Path.cwd()  # its path from here: two maps of one name have files of their own
+    name = "-".join(path.relative_to(here if path.is_relative_to(here) else path.anchor).parts)[-_LONGEST_NAME:]
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return Source(
+        robot=robot,
+        fitness=fitness_of(robot, policy),
+        folder=OWN_FOLDER,
+        stems=[f"{name}-{crosser_name(robot, controller)}"],
+        about=[{"terrain": str(file), "terrain_sha256": digest, "map": fitted(heightmap),
+                "heights_m": [float(heights.min()), float(heights.max())]}],
+        wanted=[on_heights(heights, label=file.name, policy=controller, replicas=replicas, seed=seed,
+                           ground=heightmap.ground)],
+        inputs=(file, file.with_suffix(".json")),
+        by="" if (crosser := crosser_name(robot, controller)) == robot.name else crosser.removeprefix(f"{robot.name}-"),
+    )  # fmt: skip
+
+
+def source_of_recording(file: Path, robot: str | None = None, policy: str | None = None) -> Source:
+    """What was recorded of one terrain or several: nothing is crossed. Penalties are scaled by those of ``policy``."""
+    recording = read_recording(file)
+    recorded = robot_of({**recording.origin, "robot": recording.robot}, robot, file)
+    if recording.joint_names != recorded.joint_names:
+        raise ValueError(f"{file} is of other joints than {recorded.name} has: give the --robot that was recorded")
+    count, stem = recording.num_terrains, file.name.removesuffix(RECORDING).removesuffix(".npz")
+    return Source(
+        robot=recorded,
+        fitness=fitness_of(recorded, policy),
+        folder=file.parent,
+        stems=[stem] if count == 1 else [f"{stem}-{k}" for k in range(count)],
+        about=[{"recording": str(file), "terrain": label} for label in recording.labels],
+        recorded=[recording.of_terrain(k) for k in range(count)],
+        inputs=(file,),
     )
-    print(describe(replayed))
-    save_figure(out, draw(replayed))
-    print(f"Figure: {out}")
-    return replayed
 
 
-def describe(replay: Replay) -> str:
-    """An elite's numbers as they were found, those that 40 fresh episodes corrected, if any did, and those of now."""
-    archive, n, fresh = replay.opened_run.archive, replay.terrain.number, replay.fresh
-    cells, minimal = archive.cells, replay.terrain.words
-    columns: list[tuple[str, Archive | Evaluation, int]] = [("found", archive, n)]
-    if archive.fresh is not None:
-        columns.append(("corrected", archive.fresh, n))
-    if minimal:
-        columns = [(f"whole elite, {label}", values, k) for label, values, k in columns]
-    columns.append(("minimal, now" if minimal else "now", fresh, 0))
-    rows = {
-        "": [f"{label} ({values.episodes[k]} episodes)" for label, values, k in columns],
-        "fitness": [f"{values.fitness[k]:.2f}" for _, values, k in columns],
+def fitness_of(robot: RobotCfg, policy: str | None) -> FitnessCfg:
+    """The robot's penalties with their scales; 1 each, and so raw sums, where they were never measured."""
+    try:
+        scales = robot.read_penalty_scales(policy)
+    except ValueError as error:
+        print(f"{error}; penalties are compared as they are, unscaled", flush=True)
+        scales = (1.0,) * len(robot.penalties)
+    return FitnessCfg(penalties=robot.penalties, scales=scales)
+
+
+def replay(source: Source, *, device: str = "cpu", out: Path | None = None) -> list[dict[str, Any]]:
+    """Crosses terrains again, prints numbers, writes them and a figure of each; returns the numbers."""
+    figures, reports = source.files(".png", out), []
+    for k, (recording, figure) in enumerate(zip(source.record(device), figures, strict=True)):
+        refuse_all_invalid(recording.result())
+        crossed = crossed_of(recording, source.fitness.penalties, source.fitness.scales)
+        policy = ControllerSpec.parse(str(recording.origin["policy"])).label
+        reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(crossed)})
+        print(describe(source, k, recording))
+        save(figure.with_suffix(".json"), to_json(reports[-1]), "Numbers")
+        save(figure, as_png(draw_crossing(crossed, source.fitness.penalties, title_of(recording, source.by))), "Figure")
+    return reports
+
+
+def save(file: Path, data: bytes, what: str) -> None:
+    """Writes a file, and says where and whether there was one before."""
+    replaced = " (replaced)" if file.exists() else ""
+    write_atomically(file, data)
+    print(f"{what}: {file}{replaced}", flush=True)
+
+
+def numbers_of(crossed: Crossed) -> dict[str, Any]:
+    """Rates with 95 % intervals (Wilson), ends and raw penalties, over the valid episodes; at least one is."""
+    recording, count = crossed.recording, len(crossed.chosen)
+    ended = {o.name.lower(): int((recording.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
+    hits = {"success": count - ended["base_collision"], "goal": ended["goal"], "fallen": crossed.rates["fallen"].hits}
+    names, sums = recording.penalty_names, recording.result().penalties[0, crossed.chosen]
+    return {
+        "episodes": recording.num_episodes,
+        "invalid_episodes": recording.num_episodes - count,
+        "invalid_reasons": invalid_reasons(recording.result()),
+        "rates": {
+            name: {"rate": number / count, "hits": number, "interval": list(wilson_interval(number, count))}
+            for name, number in hits.items()
+        },
+        "outcomes": ended,
+        "duration_s": float(recording.duration_s[0, crossed.chosen].mean()),
+        "penalties": {
+            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": look_of(name).unit}
+            for name, column in zip(names, sums.T, strict=True)
+        },
     }
-    for p, name in enumerate(archive.penalties):
-        rows[f"{name} [{look_of(name).unit}]"] = [
-            _penalty(values.penalty_mean[k, p], values.penalty_std[k, p], archive.scales[p], values.ratios[k, p])
-            for _, values, k in columns
+
+
+def describe(source: Source, k: int, recording: Recording) -> str:
+    """How robots crossed a terrain and what it cost them; an elite's numbers as found and as corrected beside."""
+    run, names, scales = source.opened_run, source.fitness.penalties, source.fitness.scales
+    cells = Cells(len(names)) if run is None else run.archive.cells
+    now = evaluation_of(recording.result(), cells, source.fitness)
+    columns: list[tuple[str, Archive | Evaluation, int]] = [("now", now, 0)]
+    if run is not None:
+        n, whole = source.terrains[k].number, "whole, " if source.terrains[k].minimal else ""
+        stored = {"as found": run.archive, "corrected": run.archive.fresh}
+        columns[:0] = [(f"{whole}{label}", values, n) for label, values in stored.items() if values is not None]
+    rows = {"": [f"{label} ({values.episodes[row]} episodes)" for label, values, row in columns]}
+    for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
+        counted = [(getattr(values, rate)[row], _valid_episodes(values, row)) for _, values, row in columns]
+        rows[label] = [rate_words(round(share * count) if count else 0, count) for share, count in counted]
+    for p, (name, scale) in enumerate(zip(names, scales, strict=True)):
+        rows[f"{label_of(name)} [{look_of(name).unit}]"] = [
+            f"{scale * values.penalty_mean[row, p]:.2f} +- {scale * values.penalty_std[row, p]:.2f} "
+            f"({values.ratios[row, p]:.0%} of all)"
+            for _, values, row in columns
         ]
-    for label, name in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
-        counted = [(getattr(values, name)[k], _valid_episodes(values, k)) for _, values, k in columns]
-        rows[label] = [rate_words(round(rate * count) if count else 0, count) for rate, count in counted]
-    width = 44 if minimal else 34
-    near = bool(fresh.valid[0]) and bool(cells.are_neighbours(archive.cell[n : n + 1], fresh.cell)[0])
-    known = (
-        f"It {'lands in its cell or a neighbour of it' if near else 'does not land in its cell or beside it'} again."
-    )
-    if minimal:
-        known = f"Of the minimal terrain: {minimal}."
-    elif replay.controller:
-        known = f"Now it was crossed with {replay.controller}; all else is of the controller that was searched."
-    return "\n".join(
-        [
-            f"{replay.opened_run.path}, {replay.terrain.label}, found in iteration {archive.iteration[n]}, "
-            f"with ratios in {cells.describe(int(archive.cell[n]))}",
-            *(f"  {label:22}" + "".join(f"{value:>{width}}" for value in row) for label, row in rows.items()),
-            "  Its terrain:",
-            *(f"    {line}" for line in replay.opened_run.space.describe(replay.terrain.genes).splitlines()),
-            "  Rates with their 95 % intervals (Wilson); those as found are of the episodes that made it an elite.",
-            *(f"  {line}" for line in [known, *elite_words(archive, n)]),
-        ]
-    )
+    if run is not None:
+        rows["fitness"] = [f"{values.fitness[row]:.2f}" for _, values, row in columns]
+    lines = [f"  {label:36}" + "".join(f"{value:>28}" for value in row).rstrip() for label, row in rows.items()]
+    lines.append("  Rates have 95 % intervals (Wilson). A robot that stands still has no base collision either.")
+    if reasons := invalid_reasons(recording.result()):
+        lines.append(f"  {sum(reasons.values())} invalid episodes are left out: {reason_words(reasons)}.")
+    if run is not None:
+        lines += [f"  {line}" for line in _about_elite(run, source.terrains[k], source.by, now)]
+    return "\n".join([title_of(recording, source.by), *lines])
 
 
-def _penalty(mean: float, std: float, scale: float, ratio: float) -> str:
-    return f"{mean * scale:.2f} +- {std * scale:.2f} ({ratio:.0%} of all)"
+def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> list[str]:
+    """What the run knows of an elite, and whether what was crossed now agrees."""
+    archive, n = run.archive, terrain.number
+    if terrain.minimal:
+        known = f"Of the minimal terrain: {terrain.words}."
+    elif by:
+        known = f"Now it was crossed with {by}; all else is of the controller that was searched."
+    else:
+        near = bool(now.valid[0]) and bool(archive.cells.are_neighbours(archive.cell[n : n + 1], now.cell)[0])
+        known = f"It {'lands in its cell or beside it' if near else 'does not land in its cell or beside it'} again."
+    return [
+        f"Of {run.path}: one of {len(archive):,} elites, found in iteration {archive.iteration[n]}, with ratios in "
+        f"{archive.cells.describe(int(archive.cell[n]))}. Its terrain:",
+        *(f"  {line}" for line in run.space.describe(terrain.genes).splitlines()),
+        *[known, *elite_words(archive, n)],
+    ]
 
 
-def _valid_episodes(values: Archive | Evaluation, number: int) -> int:
+def _valid_episodes(values: Archive | Evaluation, row: int) -> int:
     """Episodes that a terrain's rates are of: none of a terrain that is invalid as a whole."""
-    valid = isinstance(values, Archive) or values.valid[number]  # what is found is valid, or it were no elite
-    return int(values.episodes[number] - values.invalid_episodes[number]) if valid else 0
-
-
-def draw(replay: Replay) -> Figure:
-    """The height map of a terrain with the robots' paths, and marks where they ended, by how."""
-    archive, n = replay.opened_run.archive, replay.terrain.number
-    corrected = "" if archive.fresh is None else f"{archive.fresh.fitness[n]:.2f} corrected, "
-    title = (
-        f"{archive.robot}, elite {n} of {len(archive):,} after {archive.iterations:,} iterations: fitness "
-        f"{archive.fitness[n]:.2f} as found, {corrected}"
-        f"{replay.fresh.fitness[0]:.2f} in {replay.fresh.episodes[0]} fresh episodes"
-    )
-    if replay.terrain.words:
-        title = f"{replay.terrain.label}:\n{replay.terrain.words}"
-    if replay.controller:
-        title += f"\nwith another controller than was searched: {ControllerSpec.parse(replay.controller).label}"
-    return draw_paths(crossed_of(replay.recording, archive.penalties, archive.scales), title)
+    valid = isinstance(values, Archive) or values.valid[row]  # what is found is valid, or it were no elite
+    return int(values.episodes[row] - values.invalid_episodes[row]) if valid else 0

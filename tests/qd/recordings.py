@@ -45,7 +45,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frame
         foot_force=np.zeros((*shape, len(feet), 3), np.float32),
         penalties=(sums[None, :, None, :] * share[:, None]).astype(np.float32),
         command=np.zeros((*shape, 3), np.float32), origin={"policy": "made up"},
-        geom_names=(), touching=np.zeros((*shape, 0), bool),
+        geom_names=robot.geom_names, touching=np.zeros((*shape, len(robot.geom_names)), bool),
     )  # fmt: skip
 
 

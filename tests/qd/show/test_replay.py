@@ -1,110 +1,199 @@
-"""One terrain again: its numbers by hand, its drawing, and which terrains a command line names."""
+"""Terrains again: numbers by hand, drawings, files, and which terrains a command line names."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from kernels.episode import Outcome
+from kernels.episode import Invalidity, Outcome
 from qd.archive import write_archive
 from qd.descriptors import Cells
-from qd.fitness import FitnessCfg, evaluation_of
 from qd.run.directory import RunDirectory
 from qd.run.settings import suffix_of
+from qd.show.commands import Export, Replay
+from qd.show.crossed import crossed_of, draw_crossing, penalties_by_place
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
-from qd.show.replay import Replay, describe, draw, replay
-from sim.files.records import robot_identity
+from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
+from qd.show.view.plots import MINIMAL, Choice
+from qd.show.view.show import find_show
+from sim.files.command import run_command
+from sim.files.records import identity, robot_identity
 from sim.policy.spec import controller_hash
+from sim.recording.file import write_recording
 from sim.robots.find import get_robot
 from tests.builders import fresh_values, small_archive
-from tests.qd.recordings import FRAMES, recording_of
+from tests.qd.recordings import FRAMES, NAMES, recording_of
 from tests.qd.searches import CFG
+from tests.qd.show.report.pages import make_run, minimal_of
+
+STAND = "tests.sim.policies:stand"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture
-def done(tmp_path, anymal):
+def opened_run(tmp_path, anymal):
     ratios = np.array([[0.35, 0.65]])
     archive = dataclasses.replace(
-        small_archive(1),
-        ratios=ratios,
-        cell=Cells(2).cell_of(ratios),
-        penalty_mean=np.array([[2.0, 3.0]]),
-        penalty_std=np.array([[1.0, 0.5]]),
-        fitness=np.array([3.25]),
-        collision_rate=np.array([0.25]),
-        goal_rate=np.array([0.75]),
-        fallen_rate=np.array([0.0]),
-    )
-    # raw sums of four episodes; scales .5 and 2 make them (4, 8), a ratio of 1/3
+        small_archive(1), ratios=ratios, cell=Cells(2).cell_of(ratios), penalty_mean=np.array([[2.0, 3.0]]),
+        penalty_std=np.array([[1.0, 0.5]]), fitness=np.array([3.25]), collision_rate=np.array([0.25]),
+        goal_rate=np.array([0.75]), fallen_rate=np.array([0.0]),
+    )  # fmt: skip
+    return OpenedRun(path=tmp_path, archive=archive, robot=anymal)
+
+
+@pytest.fixture
+def recording(anymal):
+    """Raw sums of four episodes; scales .5 and 2 make them (4, 8), a ratio of 1/3."""
     sums = np.tile([2.0, 16.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
-    recording = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
-    opened_run = OpenedRun(path=tmp_path, archive=archive, robot=anymal)
-    fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
-    fresh = evaluation_of(recording.result(), Cells(2), fitness)
-    return Replay(opened_run=opened_run, terrain=opened_run.terrain(), recording=recording, fresh=fresh)
+    made = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
+    return dataclasses.replace(made, origin=identity(anymal, "shipped") | {"space": "super_gaussian"})
 
 
-def lines_of(replayed):
-    return [" ".join(line.split()) for line in describe(replayed).splitlines()]
+def lines_of(opened_run, recording, policy=None):
+    lines = describe(source_of_run(opened_run, policy=policy), 0, recording).splitlines()
+    return [" ".join(line.split()) for line in lines]
 
 
-def test_numbers_are_raw_with_units_beside_the_fresh_ones(done):
-    lines = lines_of(done)
-    assert "yaw_rate [(rad/s)^2 s] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
-    assert "vel_x [(m/s)^2 s] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)" in lines
+def test_an_elites_numbers_are_raw_with_units_beside_the_fresh_ones(opened_run, recording, anymal):
+    lines = lines_of(opened_run, recording)
+    assert lines[0] == "ANYmal C, made up: crosses it, 3 of 4"
+    assert "yaw-rate error [(rad/s)^2 s] 1.00 +- 0.50 (35% of all) 2.00 +- 0.00 (33% of all)" in lines
+    assert "forward-velocity error [(m/s)^2 s] 6.00 +- 1.00 (65% of all) 16.00 +- 0.00 (67% of all)" in lines
     # Wilson, z^2 = 3.8415, of 1 of 4: (.25 + .4802 +- 1.96 sqrt(.0469 + .0600)) / 1.9604 = .3725 +- .3269
     assert "base collision 1 of 4 (25%, 5 to 70%) 1 of 4 (25%, 5 to 70%)" in lines
     assert "goal reached 3 of 4 (75%, 30 to 95%) 3 of 4 (75%, 30 to 95%)" in lines
     assert "fitness 3.25 10.50" in lines  # fresh: 4 + 8 - 0 - 2 * 3/4
-    far = dataclasses.replace(done, fresh=dataclasses.replace(done.fresh, cell=np.array([9])))
-    other = dataclasses.replace(done, controller="runs/tuned/C-G.pt")
-    cases = (lines, lines_of(far), lines_of(other))
+    dear = np.tile([16.0, 2.0, 0.0, 0.0, 0.0, 0.0], (4, 1))[None, :, None] * np.linspace(0.0, 1.0, FRAMES)[:, None]
+    far = dataclasses.replace(recording, penalties=dear.astype(np.float32))
+    cases = (lines, lines_of(opened_run, far), lines_of(opened_run, recording, STAND))
     assert [any("does not land" in line for line in case) for case in cases] == [False, True, False]
-    assert any("runs/tuned/C-G.pt" in line for line in lines_of(other))
+    assert any("policies-stand" in line for line in cases[2])
 
 
-def test_corrected_values_stand_between_the_found_ones_and_those_of_now(done):
-    fresh = dataclasses.replace(fresh_values(done.opened_run.archive), invalid_episodes=np.array([8]))
-    archive = dataclasses.replace(done.opened_run.archive, fresh=fresh)
-    invalid = dataclasses.replace(done.fresh, invalid_episodes=np.array([3]), collision_rate=np.array([0.0]))
-    case = dataclasses.replace(done, opened_run=dataclasses.replace(done.opened_run, archive=archive), fresh=invalid)
-    lines = lines_of(case)
-    assert lines[2].split() == ["fitness", "3.25", "1.62", "10.50"]
-    # 8 of the 40 are invalid, and now the terrain as a whole
-    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) no valid episode" in lines
-    title = draw(case).axes[0].get_title()
-    assert all(number in title for number in ("3.25", "1.62", "10.50"))
+def test_corrected_values_stand_between_the_found_ones_and_those_of_now(opened_run, recording):
+    fresh = dataclasses.replace(fresh_values(opened_run.archive), invalid_episodes=np.array([8]))
+    archive = dataclasses.replace(opened_run.archive, fresh=fresh)
+    lines = lines_of(dataclasses.replace(opened_run, archive=archive), recording)
+    assert "fitness 3.25 1.62 10.50" in lines
+    # 8 of the 40 are invalid
+    assert "base collision 1 of 4 (25%, 5 to 70%) 8 of 32 (25%, 13 to 42%) 1 of 4 (25%, 5 to 70%)" in lines
 
 
-def test_the_drawing_has_all_paths_and_how_they_ended(done):
-    outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]
-    figure = draw(dataclasses.replace(done, recording=recording_of(outcomes, [5.0, 14.0, 14.0, 9.0])))
-    axes = figure.axes[0]
-    assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 4
-    assert axes.images[0].get_array().shape == (161, 321)
-    assert tuple(axes.images[0].get_extent()) == (0.0, 16.0, 0.0, 8.0)
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["reached the goal (2)", "base collision (1)", "out of time (1)", "start", "goal"]
-
-
-def test_a_terrain_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_run(done, monkeypatch):
-    asked, opened_run = [], done.opened_run
+def test_an_elite_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_run(
+    opened_run, recording, monkeypatch, capsys
+):
+    asked = []
 
     def all_of(recordings, wanted):
         asked.extend(wanted)
-        return [done.recording]
+        return [recording]
 
     monkeypatch.setattr(Recordings, "all_of", all_of)
-    assert replay(opened_run, opened_run.terrain("0"), replicas=4, seed=2).controller == ""
-    assert (opened_run.folder / "elite-0.png").is_file()
+    for _ in range(2):
+        replay(source_of_run(opened_run, replicas=4, seed=2))
+    assert Image.open("elite-0.png").size[0] > 1000
+    assert capsys.readouterr().out.count("(replaced)") == 2  # numbers and figure
     assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(opened_run.robot.policy_file), 4, 2)
-    assert replay(opened_run, opened_run.terrain("0"), policy="os.path:join").controller == "os.path:join"
-    assert (opened_run.folder / "elite-0-os.path-join.png").is_file()
-    np.testing.assert_array_equal(asked[1].terrain, opened_run.archive.genes[0])
+    replay(source_of_run(opened_run, policy=STAND))
+    report = json.loads(Path("elite-0-tests.sim.policies-stand.json").read_text())
+    assert report["elite"] == 0 and report["rates"]["goal"]["hits"] == 3
+    np.testing.assert_array_equal(asked[2].terrain, opened_run.archive.genes[0])
     with pytest.raises(ValueError, match="out"):
-        replay(opened_run, opened_run.terrain("0"), out=opened_run.folder / "a.jpg")
+        replay(source_of_run(opened_run), out=Path("a.jpg"))
+    write_recording(Path("a.recording.npz"), recording)
+    assert run_command(Replay, ["--terrain", "a.recording.npz", "--device", "cpu"], name="replay") == 0
+    assert json.loads(Path("a.json").read_text())["rates"] == report["rates"] and len(asked) == 3
+
+
+def test_rates_of_ones_own_terrain_with_their_intervals():
+    gray = np.zeros((81, 161), np.uint8)
+    gray[:, 100:] = 200  # a wall of 2 m before the goal
+    Image.fromarray(gray).save("wall.png")
+    flags = f"--terrain wall.png --size 16 8 --scale 0.01 --policy {STAND} --device cpu --replicas 4"
+    assert run_command(Replay, flags.split(), name="replay") == 0
+    stem = "runs/terrains/wall.png-anymal-tests.sim.policies-stand"
+    report = json.loads(Path(f"{stem}.json").read_text())
+    # It stands where it starts: no collision, no goal. Wilson of 4 of 4: 1 / (1 + 3.8415 / 4) = .5101
+    assert report["rates"]["success"] == {"rate": 1.0, "hits": 4, "interval": [pytest.approx(0.5101, abs=1e-4), 1.0]}
+    assert report["rates"]["goal"] == {"rate": 0.0, "hits": 0, "interval": [0.0, pytest.approx(0.4899, abs=1e-4)]}
+    assert report["outcomes"] == {"goal": 0, "base_collision": 0, "time_out": 4, "out": 0, "invalid": 0}
+    assert report["heights_m"] == [0.0, 2.0] and report["duration_s"] == 20.0
+    # 20 s at rest against 0.75 m/s: 20 * 0.75^2
+    assert report["penalties"]["vel_x"]["mean"] == pytest.approx(11.25, rel=0.1)
+    keys = {"command", "commit", "device", "versions", "seed", "date", "policy_sha256", "terrain_sha256"}
+    assert keys <= report.keys()
+    assert Image.open(f"{stem}.png").size[0] > 1000
+
+
+def test_invalid_episodes_are_left_out_of_the_rates():
+    ends = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.INVALID]
+    sums = np.repeat([[1.0], [3.0], [np.nan]], 6, axis=1)
+    made = recording_of(ends, [4.0, 14.0, 3.0], penalties=sums, fallen=[False, False, True])
+    made = dataclasses.replace(
+        made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
+    )
+    numbers = numbers_of(crossed_of(made, NAMES, (1.0,) * 6))
+    assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
+    assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
+    assert numbers["duration_s"] == 10.0  # of 4 and 16
+    assert (numbers["invalid_episodes"], numbers["invalid_reasons"]) == (1, {"speed": 1})
+
+
+def test_crossings_in_numbers_by_hand():
+    outcomes = [Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.BASE_COLLISION, Outcome.INVALID]
+    sums = np.arange(24.0).reshape(4, 6)
+    recording = recording_of(outcomes, [14.0, 5.0, 7.0, 3.0], penalties=sums, fallen=[False, True, False, True])
+    crossed = crossed_of(recording, ("vel_x", "stumble"), (2.0, 4.0))
+    assert crossed.chosen.tolist() == [0, 1, 2]
+    assert crossed.scaled.tolist() == [[0.5, 1.0], [3.5, 2.5], [6.5, 4.0]]
+    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33%, 6 to 79%)"
+    hits = {label: rate.hits for label, rate in crossed.rates.items()}
+    assert hits == {"reached the goal": 1, "base collision": 2, "out of time": 0, "left the terrain": 0, "fallen": 1}
+    np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])
+    assert crossed.failed_at == pytest.approx(6.0)
+
+
+def test_penalties_by_place_add_up_and_the_drawing_has_all_paths():
+    recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0], penalties=np.full((2, 6), 10.0))
+    crossed = crossed_of(recording, NAMES, (1.0,) * 6)
+    amounts = penalties_by_place(crossed, NAMES, np.array([0.0, 3.0, 16.0]))
+    # the first robot makes a step of 0.5 m twenty times, of which one ends below x = 3; the second stays at 2
+    np.testing.assert_allclose(amounts[:, 0], [(0.5 + 10.0) / 2, 9.5 / 2], rtol=1e-5)
+    np.testing.assert_allclose(amounts.sum(axis=0), 10.0, rtol=1e-5)
+    figure = draw_crossing(crossed, NAMES, "a hill")
+    axes = figure.axes[0]
+    assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 2
+    assert axes.images[0].get_array().shape == (161, 321)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:4] == ["reached the goal (1)", "out of time (1)", "start", "goal"]
+
+
+def test_a_map_is_never_overwritten(anymal):
+    for folder in ("a", "b"):  # two maps of one name have files of their own
+        Path(folder).mkdir()
+        np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
+        with pytest.raises(ValueError, match="size"):
+            source_of_map(Path(folder) / "hill.npz", anymal)
+        assert source_of_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
+            f"{folder}-hill.npz-anymal"
+        ]
+    Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
+    Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
+    before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}
+    with pytest.raises(ValueError, match="out"):
+        replay(source_of_map(Path("hill.png"), anymal), out=Path("hill.png"))
+    with pytest.raises(ValueError, match=r"none\.pt"):
+        replay(source_of_map(Path("hill.png"), anymal, policy="none.pt"))
+    assert {path.name: path.read_bytes() for path in Path().glob("hill.*")} == before
 
 
 def test_what_one_controller_wrote_another_does_not_overwrite(tmp_path):
@@ -143,3 +232,32 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     robot = {"robot": "cassie", **robot_identity(cassie)}
     write_archive(archive, dataclasses.replace(small_archive(), **robot))
     assert open_run(None, archive).robot.name == "cassie"
+
+
+def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_path, monkeypatch, capsys):
+    run = make_run(tmp_path)
+    minimal_of(run, 2)  # of 20 elites: the elite with its last gene changed
+    opened_run = open_run("anymal", run)
+    genes = opened_run.minima().genes
+    number = next(iter(genes))
+    wanted = []
+
+    def all_of(recordings, asked):
+        wanted.extend(asked)
+        return [
+            dataclasses.replace(recording_of([Outcome.GOAL, Outcome.TIME_OUT], [14.0, 6.0]), genes=genes[number][None])
+        ]
+
+    monkeypatch.setattr(Recordings, "all_of", all_of)
+    replay(source_of_run(opened_run, minimal=str(number), replicas=2, policy="shipped"))
+    np.testing.assert_array_equal(wanted[0].terrain, genes[number])
+    assert (run / f"minimal-{number}.png").is_file() and opened_run.minima().words(number) in capsys.readouterr().out
+    Export(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
+    assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}
+    with np.load(tmp_path / "out" / f"minimal-{number}.npz") as content:
+        np.testing.assert_array_equal(content["genes"], genes[number])
+    about = json.loads((tmp_path / "out" / f"minimal-{number}.json").read_text())
+    assert about["elite"] == number and about["minimal"]["cause"]["kind"] == "rise"
+    show = find_show(run, minimal=str(number), policies=("base=shipped",))
+    assert show.elite == number and f"{MINIMAL} (2)" in show.axes.kinds()
+    assert set(show.axes.listed(Choice(ranges={}, kind=MINIMAL)).tolist()) == set(genes)
