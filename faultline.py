@@ -1,7 +1,7 @@
 """The command ``faultline``, and its functions for Python; only what a command or a function needs is loaded.
 
-``faultline.search``, ``judge``, ``evaluate`` and ``finetune`` do what the commands of these names do, ``cross`` crosses;
-docs/searching.md shows them in twenty lines.
+``faultline.search``, ``judge``, ``evaluate`` and ``finetune`` do what the commands of these names do, ``cross`` lets a
+controller cross terrains; docs/searching.md shows them in twenty lines.
 """
 
 import difflib

@@ -6,25 +6,19 @@ not there yet. Pictures are JPEGs of docs/pictures.
 
 import argparse
 import io
-import itertools
 from pathlib import Path
 
 from PIL import Image
 
 from qd.groups import rank
-from qd.show.crossed import typical_episode
 from qd.show.elites import open_run
-from qd.show.recordings import Recordings, on_elite
 from qd.show.report.report import write_report
-from qd.show.shot import VIEW_HEIGHT, WIDTH, Shot, follow, frames_of
-from sim.recording.renderer import Renderer
 from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
 from tests.qd.show.view.visitor import ROOT, serve
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDE, NARROW = (1400, 900), (390, 844)
 QUALITY = 80
-FRAME = 5  # of the film [s]
 SETTLE_MS = 3000  # for the last frames of a browser that draws without a GPU
 
 
@@ -77,21 +71,6 @@ def report_picture(browser, file: Path) -> None:
     page.close()
 
 
-def film_picture(run: Path, elite: int) -> None:
-    """A frame of the film of an elite that the viewer has recorded."""
-    opened_run = open_run(None, run)
-    archive, robot = opened_run.archive, opened_run.robot
-    wanted = on_elite(archive, elite, policy=opened_run.policy(None), replicas=20)
-    (recording,) = Recordings(robot).all_of([wanted])
-    scales = dict(zip(archive.penalties, archive.scales, strict=True))
-    shot = Shot(recording=recording, episode=typical_episode(recording, scales), ghosts=(0, 1), scales=scales)
-    cameras = follow(shot, 4.6 * robot.default_base_height)
-    with Renderer(robot, recording.heights[0], width=WIDTH, height=VIEW_HEIGHT) as renderer:
-        pictures = list(itertools.islice(frames_of(shot, renderer, cameras, fps=1), FRAME + 1))
-    Image.fromarray(pictures[-1]).save(FOLDER / "film.jpg", quality=QUALITY)
-    print(FOLDER / "film.jpg")
-
-
 def main() -> None:
     """Takes all pictures."""
     flags = argparse.ArgumentParser(description=__doc__)
@@ -105,7 +84,6 @@ def main() -> None:
     with serve("--run", str(args.run)) as (address, _), open_chromium() as browser:
         viewer_pictures(browser, address, elite)
         report_picture(browser, report)
-        film_picture(args.run, elite)
 
 
 if __name__ == "__main__":
