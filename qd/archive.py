@@ -144,6 +144,11 @@ class Archive(Evaluation):
     """What fresh episodes say of the elites; None if there were none."""
     faults: FaultCounts | None = None
     """What became of those that fail under other conditions; only beside fresh values."""
+    family: NDArray[np.int64] | None = None
+    """Family of each elite (:func:`qd.groups.families_of`), shape (N,); None where nobody has judged them."""
+    cause: NDArray[np.str_] | None = None
+    """What stops the robot where its typical episode ends (:func:`qd.causes.causes_at`), shape (N,); empty of an elite
+    that does not fail; None likewise."""
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
@@ -211,7 +216,8 @@ class Archive(Evaluation):
         """The archive with some of its elites alone, in the order given."""
         fresh = None if self.fresh is None else self.fresh.rows(chosen)
         faults = None if self.faults is None else self.faults.rows(chosen)
-        elites = {name: getattr(self, name)[chosen] for name in PER_ELITE}
+        known = [name for name in _JUDGED if getattr(self, name) is not None]
+        elites = {name: getattr(self, name)[chosen] for name in (*PER_ELITE, *known)}
         return replace(self, fresh=fresh, faults=faults, **elites)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
@@ -220,8 +226,10 @@ class Archive(Evaluation):
 
 
 _OF_IDENTITY = ("robot", "robot_sha256", "policy_sha256", "penalty_definition")
-_OPTIONAL = ("policy_sha256", "space_sha256")  # of controllers and spaces without files
-_TEXTS = ("robot", "robot_sha256", "penalty_definition", "space", *_OPTIONAL)
+_JUDGED = ("family", "cause")  # of elites that were judged
+_BESIDE = ("fresh", "faults", *_JUDGED)
+_OPTIONAL = ("policy_sha256", "space_sha256", *_JUDGED)
+_TEXTS = ("robot", "robot_sha256", "penalty_definition", "space", "policy_sha256", "space_sha256")
 _SETTINGS = (*_TEXTS, "penalties", "scales", "intervals", "collision_bit", "iterations")
 _PREFIX = "fresh_"
 _CERTIFIERS = ("certifiers", "certifier_sha256")
@@ -234,7 +242,7 @@ _SHAPES = {
     **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
 }  # fmt: skip
 """Dimensions of arrays in N elites, G genes, P penalties and C certifiers; N alone of all others."""
-PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, "fresh", "faults"))
+PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))
 """Names of the arrays that have one row an elite."""
 
 
@@ -243,6 +251,7 @@ def write_archive(path: Path, archive: Archive) -> None:
     settings = {name: getattr(archive, name) for name in _SETTINGS}
     content = {name: np.asarray(value) for name, value in settings.items() if value is not None}
     content |= {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}
+    content |= {name: getattr(archive, name) for name in _JUDGED if getattr(archive, name) is not None}
     if archive.fresh is not None:
         content |= {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
     if archive.faults is not None:
@@ -268,7 +277,7 @@ def read_archive(path: str | Path) -> Archive:
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         stored = set(array_names(file))
-        names = [name for name in (*_SETTINGS, *PER_ELITE) if name not in _OPTIONAL or name in stored]
+        names = [name for name in (*_SETTINGS, *PER_ELITE, *_JUDGED) if name not in _OPTIONAL or name in stored]
         fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
         fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
         expected = [*names, *fresh_names, *fault_names]
@@ -304,7 +313,7 @@ def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
         expected = tuple(sizes[letter] for letter in _SHAPES.get(name.removeprefix(_PREFIX), "N"))
         if array.shape != expected:
             raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
-        is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties")
+        is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties", "cause")
         if array.dtype.kind not in ("U" if is_text else "bif"):
             raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")
         if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():

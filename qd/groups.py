@@ -406,24 +406,26 @@ def rank(
         judged: Whether elites whose fresh episodes are invalid are left out.
     """
     elites = elites_of(archive, judged=judged)
-    families = families_of(archive.genes[elites.numbers], space)
-    by_worst = [*dict.fromkeys(families[elites.by_severity()].tolist())]
-    numbers = 1 + np.argsort(by_worst)[families]
-    return Ranking(elites=elites, causes=_causes_of(elites, archive, space, minima), families=numbers)
-
-
-def _causes_of(
-    elites: Elites, archive: Archive, space: TerrainSpace, minima: MinimalTerrains | None
-) -> tuple[str, ...]:
+    archive = archive.rows(elites.numbers)
+    families = families_of(archive.genes, space) if archive.family is None else archive.family
+    by_worst = {family: place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()].tolist()), 1)}
+    causes = causes_of(elites, archive, space) if archive.cause is None else archive.cause
     entries = [] if minima is None else minima.numbers["elites"]
     of_minimal = {entry["elite"]: entry["cause"]["kind"] for entry in entries if entry["cause"]}
-    causes = [of_minimal.get(number, UNCLEAR) for number in elites.numbers.tolist()]
-    left = [row for row in np.flatnonzero(elites.failing).tolist() if causes[row] == UNCLEAR]
-    half_width = ROBOTS[archive.robot].footprint[1] if archive.robot in ROBOTS else HALF_WIDTH
-    at_ends = causes_at(archive.genes[elites.numbers[left]], elites.end_position[left], space, half_width)
-    for row, cause in zip(left, at_ends, strict=True):
-        causes[row] = cause
-    return tuple(cause if failing else "" for cause, failing in zip(causes, elites.failing.tolist(), strict=True))
+    rows = zip(elites.numbers.tolist(), causes.tolist(), strict=True)
+    return Ranking(
+        elites=elites,
+        causes=tuple(of_minimal.get(number, cause) if cause else "" for number, cause in rows),
+        families=np.array([by_worst[family] for family in families.tolist()], np.int64),
+    )
+
+
+def causes_of(elites: Elites, archive: Archive, space: TerrainSpace) -> NDArray[np.str_]:
+    """What stops the robot on each elite where its typical episode ends, shape (N,); empty where it does not fail."""
+    failing, half_width = elites.failing, ROBOTS[archive.robot].footprint[1] if archive.robot in ROBOTS else HALF_WIDTH
+    causes = np.full(len(elites), "", object)
+    causes[failing] = causes_at(archive.genes[failing], elites.end_position[failing], space, half_width)
+    return causes.astype(np.str_)
 
 
 def summary_of(ranking: Ranking, archive: Archive) -> str:

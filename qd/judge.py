@@ -26,7 +26,7 @@ from qd.archive import (
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fault_words, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
-from qd.groups import families_of
+from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import (
     CONFIG_FILE,
     METRICS_FILE,
@@ -371,7 +371,10 @@ def judge(
             else:
                 archive = confirm(archive, failing, search, crossings, stage)
             if families is None or stage == "fresh":
-                families = families_of(archive.genes, get_space(search.cfg.space, search.cfg.space_sha256))
+                space_now = get_space(search.cfg.space, search.cfg.space_sha256)
+                families = families_of(archive.genes, space_now)
+                causes = causes_of(elites_of(archive), archive, space_now)
+                archive = replace(archive, family=families, cause=causes)
             origin = origin_of(compute.device, fresh_seed, compute.workers) | identity(search.robot, search.policy)
             _write(archive, families, search, certifiers, {stage: origin})
     print(f"{run}: {len(archive):,} elites, of which {archive.failing.sum():,} fail by their fresh episodes.")

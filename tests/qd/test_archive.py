@@ -7,7 +7,13 @@ from qd.archive import COUNTS, FRESH, Archive, goal_rates, read_archive, write_a
 from tests.builders import fresh_values, judged_archive, small_archive
 
 
-@pytest.mark.parametrize("archive", [small_archive(0), small_archive(3), judged_archive()], ids=["0", "3", "judged"])
+def grouped_archive():
+    """Judged elites with families and causes."""
+    causes = np.array(["ridge", "", "oblique rise", "drop", ""])
+    return dataclasses.replace(judged_archive(), family=np.array([0, 1, 0, 2, 3]), cause=causes)
+
+
+@pytest.mark.parametrize("archive", [small_archive(0), small_archive(3), grouped_archive()], ids=["0", "3", "judged"])
 def test_an_archive_comes_back_whole_and_equal_ones_have_equal_files(tmp_path, archive):
     for name in ("archive.npz", "again.npz"):
         write_archive(tmp_path / name, archive)
@@ -38,6 +44,8 @@ def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
     assert corrected.fresh.fitness.tolist() == [5.0, 1.0, -30.0, -20.0]
     assert corrected.fresh.reproduced.tolist() == [True, True, False, False]
     assert corrected.rows(np.array([3, 0])).fresh.fitness.tolist() == [-20.0, 5.0]
+    some = grouped_archive().rows(np.array([3, 0]))
+    assert (some.family.tolist(), some.cause.tolist()) == ([2, 0], ["drop", "ridge"])
 
 
 def test_an_elite_collides_as_it_was_found_whatever_fresh_episodes_say():
