@@ -160,7 +160,9 @@ def open_run(named: str | None, run: Path | None = None, *, space: str | None = 
         run: Run directory or archive file.
         space: Terrain space that the command line names.
     """
-    run = run or find_run(get_robot(named or "anymal"))
+    if run is None:
+        run = find_run(get_robot(named or "anymal"))
+        print(f"Run: {run}", flush=True)
     archive = read_archive(run)
     robot = robot_of(archive.named(), named, run)
     check_space(archive, space)
