@@ -302,8 +302,10 @@ class Evaluate(ControllerFlags, WorkerFlags):
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
-        from qd.evaluate.evaluate import SetsCfg, compare, evaluate_rates, evaluate_tables
+        from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
+        from qd.evaluate.labels import COMPARED
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
+        from qd.evaluate.tables import is_regression
         from qd.workers.evaluator import Compute
         from sim.files.command import split_words
         from sim.policy.spec import controllers_of
@@ -333,19 +335,16 @@ class Evaluate(ControllerFlags, WorkerFlags):
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
         controllers = controllers_of(self.policies, robot)
-        if {*controllers} == {"old", "new"} and self.archive is not None:
-            if self.sets or self.independent or self.part != "test":
+        names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"} and self.archive is not None
+        if compared:
+            if names or self.independent or self.part != "test":
                 raise ValueError("old and new are compared on --archive: leave --sets, --independent and --part out")
-            report = compare(
-                robot, **controllers, archive_path=self.archive, compute=compute, space=self.space, out=self.out, **size
-            )
-            return int(report["regression"])
+            names = (COMPARED,)
         cfg = SetsCfg(
-            names=tuple(split_words(self.sets)), archive=self.archive, independent=self.independent, space=self.space,
-            part=self.part, **size,
-        )  # fmt: skip
-        evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
-        return 0
+            names=names, archive=self.archive, independent=self.independent, space=self.space, part=self.part, **size
+        )
+        report = evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
+        return int(compared and is_regression(report))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,10 @@ import numpy as np
 
 from qd.archive import ARCHIVE_FILE, Archive
 from qd.evaluate.figures import draw_tables
-from qd.evaluate.marks import check_untrained, marks_of, recorded_marks
+from qd.evaluate.labels import COMPARED, HELD_OUT
+from qd.evaluate.marks import check_untrained, recorded_marks
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
 from qd.evaluate.sets import (
-    HELD_OUT,
     Part,
     TerrainSet,
     make_sets,
@@ -25,7 +25,7 @@ from qd.evaluate.sets import (
     split_elites,
 )
 from qd.evaluate.show import show_comparison, show_rates, show_tables
-from qd.evaluate.tables import Controller, Tables, check_seeds, make_tables
+from qd.evaluate.tables import Tables, check_seeds, make_tables
 from qd.run.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
@@ -51,7 +51,8 @@ class SetsCfg:
     """Which terrains controllers are evaluated on, and how often they cross them."""
 
     names: tuple[str, ...] = ()
-    """Some of :data:`qd.evaluate.labels.SETS`; all that can be had if empty."""
+    """Some of :data:`qd.evaluate.labels.SETS`; all that can be had if empty. ``elites`` alone: those of the archive
+    that no controller was trained on, to compare ``old`` and ``new``."""
     archive: Path | None = None
     """Run of a search, or its archive file: its held-out elites are the generated terrains."""
     independent: Path | None = None
@@ -154,7 +155,7 @@ def evaluate(
         for name, row in results.items()
     }
     about = {
-        name: Controller(policy=name_of(policy, robot), sha256=controller_hash(policy))
+        name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
         for name, policy in controllers.items()
     }
     return make_tables(crossed, sets, robot, controllers=about, episodes=episodes, seed=seed)
@@ -181,99 +182,54 @@ def evaluate_tables(
     if cfg.independent is not None:
         independent = read_independent(cfg.independent, cfg.archive, robot, cfg.space)
     space = load_space(cfg.space or SUPER_GAUSSIAN.name)
-    sets = make_sets(
-        cfg.names, terrains, cfg.seed, archive=archive, independent=independent, space=space, part=cfg.part
-    )
     check_seeds(controllers)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
+    if cfg.names == (COMPARED,) and archive is not None:
+        sets = {COMPARED: _untrained_elites(archive, controllers, terrains, cfg)}
+    else:
+        sets = make_sets(
+            cfg.names, terrains, cfg.seed, archive=archive, independent=independent, space=space, part=cfg.part
+        )
     for name in set(HELD_OUT).intersection(sets):
         check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for {cfg.part}")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
         check_untrained(controllers, independent.genes, str(cfg.independent))
-    about = {"space": space.name, "part": cfg.part, **_about_archives(cfg, archive, independent)}  # before they change
-    out = out or RUNS / f"{robot.name}-tables" / ("tables.json" if cfg.part == "test" else "validation.json")
+    about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}  # before they change
+    if cfg.archive is not None and archive is not None:
+        split = split_elites(archive)
+        parts = {"train": len(split.train), "validation": len(split.validation), "test": len(split.test)}
+        about |= {"archive": _about(cfg.archive, archive) | parts, "archive_sha256": _file_sha256(cfg.archive)}
+    if cfg.independent is not None and independent is not None:
+        search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
+        about["independent"] = _about(cfg.independent, independent) | search
+    about |= {"space": space.name, "part": cfg.part}
+    file, show = "tables.json" if cfg.part == "test" else "validation.json", show_tables
+    if COMPARED in sets:
+        file, show = "compared.json", show_comparison
 
     def make() -> dict[str, Any]:
         tables = evaluate(
             controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed,
             cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )  # fmt: skip
-        origin = origin_of(compute.device, cfg.seed, compute.workers)
-        return {**origin, **robot_identity(robot), **about, **tables}
+        return {**origin_of(compute.device, cfg.seed, compute.workers), **robot_identity(robot), **about, **tables}
 
-    return publish(out, make, show_tables, draw=lambda tables: as_png(draw_tables(tables)))
+    out = out or RUNS / f"{robot.name}-tables" / file
+    return publish(out, make, show, draw=lambda tables: as_png(draw_tables(tables)))
 
 
-def compare(
-    robot: RobotCfg,
-    old: str,
-    new: str,
-    archive_path: Path,
-    *,
-    compute: Compute,
-    space: str | None = None,
-    terrains: int | None = None,
-    episodes: int | None = None,
-    seed: int = 0,
-    out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
-) -> dict[str, Any]:
-    """Compares a new controller with an old one on elites of an archive that neither was trained on.
-
-    Both have the same episodes. It is a *regression* if the 95 % interval of the difference of the mean goal rates, new
-    minus old, lies wholly below 0: terrain by terrain, bootstrap over families. A terrain that newly fails alone is
-    none, since among hundreds some do by chance.
-
-    Returns:
-        The tables of the set ``elites`` (:func:`qd.evaluate.tables.make_tables`), with ``regression`` behind them. They
-        are printed and written; without ``out`` the file lies under runs/.
-    """
-    full = (paper_terrains(robot.name), EPISODES)
-    terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=_SMALL)
-    controllers = {"old": old, "new": new}
-    check_seeds(controllers)
-    for policy in controllers.values():
-        check_policy(policy, robot, compute.device)
-    archive = read_elites(archive_path, robot, space)
-    trained_on = recorded_marks(old) | recorded_marks(new)
-    is_new = ~np.isin(marks_of(archive.genes), [*trained_on])
-    elites = random_elites("elites", archive, terrains, seed, is_new)
-    assert elites.families is not None
-    if (families := len(np.unique(elites.families))) < 2:
+def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: int, cfg: SetsCfg) -> TerrainSet:
+    """Elites that no controller was trained on, of families enough to tell how far a difference may be chance."""
+    trained_on = set().union(*map(recorded_marks, controllers.values()))
+    elites = random_elites(COMPARED, archive, count, cfg.seed, trained_on)
+    families = 0 if elites.families is None else len(np.unique(elites.families))
+    if families < 2:
         raise ValueError(
-            f"archive must have elites of 2 families or more that neither controller was trained on, got {len(elites)} "
-            f"of {families} in {archive_path}: give another"
+            "archive must have elites of 2 families that no controller was trained on, got "
+            f"{len(elites)} elites of {families} in {cfg.archive}: give another"
         )
-
-    def make() -> dict[str, Any]:
-        tables = evaluate(
-            controllers, {"elites": elites}, robot=robot, compute=compute, episodes=episodes, seed=seed,
-            cache=crossings_folder(robot), open_evaluator=open_evaluator,
-        )  # fmt: skip
-        limits = tables["differences"]["elites"]["old -> new"]["gain"]["goal"]["interval"]
-        return {
-            **origin_of(compute.device, seed, compute.workers),
-            **robot_identity(robot),
-            "archive": _about(archive_path, archive),
-            "archive_sha256": _file_sha256(archive_path),
-            **tables,
-            "regression": limits is not None and limits[1] < 0.0,
-        }
-
-    return publish(out or RUNS / f"{robot.name}-compared.json", make, show_comparison)
-
-
-def _about_archives(cfg: SetsCfg, archive: Archive | None, independent: Archive | None) -> dict[str, Any]:
-    about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
-    if cfg.archive is not None and archive is not None:
-        split = split_elites(archive)
-        parts = {"train": len(split.train), "validation": len(split.validation), "test": len(split.test)}
-        about |= {"archive": {**_about(cfg.archive, archive), **parts}, "archive_sha256": _file_sha256(cfg.archive)}
-    if cfg.independent is not None and independent is not None:
-        search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
-        about["independent"] = {**_about(cfg.independent, independent), **search}
-    return about
+    return elites
 
 
 def _about(path: Path, archive: Archive) -> dict[str, Any]:

@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qd.evaluate.labels import SETS
-from qd.evaluate.show import published_value
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.figures import bar_lengths, new_figure
 from sim.policy.spec import firsts, kind_of
@@ -18,7 +16,6 @@ _PANELS = {
     "success": ("no base collision\n[% of episodes]", 100.0),
     "reward": ("training reward\n[sum over 20 s]", 1.0),
 }
-_PAPER = "of that name in the paper"
 _DOSE_COLUMNS = 4
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
@@ -26,60 +23,32 @@ _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 
 
 def draw_tables(report: Mapping[str, Any]) -> Figure:
-    """Goal rate, no base collision and reward by set with intervals, and goals on certified terrains."""
-    certified = {name: about["terrains"] for name, about in report["certified"].items() if about["terrains"]}
-    rows, columns, size = (2, 2, (11.5, 8.0)) if certified else (1, 3, (13.0, 4.2))
-    figure = new_figure(*size)
-    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(len(_PANELS) + bool(certified))]
-    for axes, (measure, (label, factor)) in zip(panels, _PANELS.items(), strict=False):
-        _draw_measure(axes, report, measure, factor, {name: _label(name) for name in report[measure]})
-        axes.set_ylabel(label)
-    if certified:
-        labels = {name: f"{_label(name)}\n({terrains} certified)" for name, terrains in certified.items()}
-        _draw_measure(panels[-1], report, "certified_goal", 100.0, labels)
-        panels[-1].set_ylabel("goal reached on certified terrains\n[% of episodes]")
-    part = ", validation" if report.get("part") == "validation" else ""
-    figure.suptitle(f"{report['robot']}{part}: {report['episodes']} episodes on each terrain, 95 % intervals")
-    handles = {}
-    for axes in panels:
-        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    if _PAPER in handles:  # last
-        handles[_PAPER] = handles.pop(_PAPER)
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=8, frameon=False)
-    return figure
-
-
-def _label(name: str) -> str:
-    return SETS.get(name, name)
-
-
-def _draw_measure(
-    axes: Axes, report: Mapping[str, Any], measure: str, factor: float, labels: Mapping[str, str]
-) -> None:
-    """Points of all controllers side by side over each set, times a factor; several seeds of a kind look alike."""
-    controllers = list(report["controllers"])
+    """Goal rate, no base collision and reward of all controllers by set, with intervals; seeds of a kind look alike."""
+    figure, controllers = new_figure(13.0, 4.2), list(report["controllers"])
     kinds = [kind_of(first) for first in firsts(controllers)]
     step = min(0.16, 0.7 / len(controllers))
-    for number, controller in enumerate(controllers):
-        kind = kind_of(controller)
-        place = kinds.index(kind)
-        seeds = [kind_of(other) for other in controllers].count(kind)
-        label = kind + (f" ({seeds} seeds)" if seeds > 1 else "")
-        means = np.array([report[measure][name][controller] for name in labels], np.float64)
-        limits = [report["intervals"][measure][name][controller] for name in labels]
-        x = np.arange(len(labels)) + step * (number - (len(controllers) - 1) / 2)
-        axes.errorbar(
-            x, factor * means, factor * bar_lengths(means, limits), linestyle="", capsize=3,
-            marker=_MARKERS[place % len(_MARKERS)], color=_COLOURS[place % len(_COLOURS)],
-            label=label if controller in firsts(controllers) else "",
-        )  # fmt: skip
-        paper = np.array([published_value(report, measure, name, controller) for name in labels], np.float64)
-        if np.isfinite(paper).any():
-            axes.plot(x, factor * paper, "D", label=_PAPER, markersize=10, markerfacecolor="none", color="0.4")
-    lines = [label.replace(", ", ",\n") for label in labels.values()]
-    axes.set_xticks(range(len(labels)), lines, fontsize=10.0 if len(labels) < 5 else 8.5)
-    axes.set_xlim(-0.5, len(labels) - 0.5)
-    axes.grid(axis="y", alpha=0.3)
+    for panel, (measure, (label, factor)) in enumerate(_PANELS.items(), 1):
+        axes, sets = figure.add_subplot(1, len(_PANELS), panel), list(report[measure])
+        for number, controller in enumerate(controllers):
+            place = kinds.index(kind_of(controller))
+            means = np.array([report[measure][name][controller] for name in sets], np.float64)
+            limits = [report["intervals"][measure][name][controller] for name in sets]
+            axes.errorbar(
+                np.arange(len(sets)) + step * (number - (len(controllers) - 1) / 2),
+                factor * means, factor * bar_lengths(means, limits), linestyle="", capsize=3,
+                marker=_MARKERS[place % len(_MARKERS)], color=_COLOURS[place % len(_COLOURS)],
+                label=kinds[place] if controller in firsts(controllers) else "",
+            )  # fmt: skip
+        labels = [str(SETS.get(name, name)).replace(", ", ",\n") for name in sets]
+        axes.set_xticks(range(len(sets)), labels, fontsize=8.5)
+        axes.set_xlim(-0.5, len(sets) - 0.5)
+        axes.grid(axis="y", alpha=0.3)
+        axes.set_ylabel(label)
+    part = ", validation" if report.get("part") == "validation" else ""
+    figure.suptitle(f"{report['robot']}{part}: {report['episodes']} episodes on each terrain, 95 % intervals")
+    handles = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=8, frameon=False)
+    return figure
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:

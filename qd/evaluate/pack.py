@@ -1,4 +1,4 @@
-"""Packs: terrains on which any controller can be tested, spread over the ways in which a searched one fails.
+"""Packs: terrains on which any controller can be tested, spread over the causes on which a searched one fails.
 
 Every terrain is a fault or a *near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh
 episodes, and it is known to be passable, since another controller is certified on it or the searched one crosses it in
@@ -23,9 +23,9 @@ from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_pack, show_pack_test
 from qd.faults import EPISODES, fresh_counts, judgement, rate_of
 from qd.fitness import FAILING_GOAL_RATE
-from qd.groups import Modes, elites_of, families_of, find_modes, verdict_of
+from qd.groups import families_of, rank, verdict_of
 from qd.judge import certifiers_of, find_search
-from qd.minimise import read_minimal
+from qd.minima import read_minimal
 from qd.run.directory import RUNS
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.bank import heights_of
@@ -47,7 +47,7 @@ HEIGHT_UNIT_M = 1e-3
 """Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
-GROUPS = ("verdict", "mode", "cause", "kind")
+GROUPS = ("verdict", "cause", "kind")
 """What terrains are grouped by."""
 
 _MAX_BYTES = 1e9  # of an array that is read
@@ -120,7 +120,7 @@ def evaluate_pack(
         )["pack"][controller]  # fmt: skip
         rows = rows_of(result)
         beside = {name: [about["rates"][name] for about in abouts] for name in pack.content["rates"]}
-        keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched", "modes")
+        keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
         return {
             **origin_of(compute.device, seed, compute.workers),
             **identity(robot, policy),
@@ -140,7 +140,7 @@ def passes(report: dict[str, Any], least: float) -> bool:
     limits = report["rates"]["goal_interval"]
     low = limits[0] if limits else 0.0  # of one family nothing is known of the spread
     word, style = ("passes", "bold green") if low >= least else ("fails", "bold red")
-    say((word, style), f": at least {low:.3f} of the robots reach the goal (95 %), asked for {least:.3f}")
+    say((word, style), f": the goal rate is at least {low:.3f} (95 %), asked for {least:.3f}")
     return low >= least
 
 
@@ -186,7 +186,7 @@ def make_pack(
     for other in controllers.values():
         check_policy(other, body, compute.device)
     _check_judged(archive, run)
-    candidates, modes, not_passable = candidates_of(archive, run)
+    candidates, not_passable = candidates_of(archive, run)
     chosen = choose_terrains(candidates, size)
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
@@ -218,9 +218,6 @@ def make_pack(
             "controllers": about_controllers(controllers, body),
             "rates": {name: rates_over_all(of_controller, abouts, seed) for name, of_controller in rows.items()},
             "by": rates_by_group(abouts, rows),
-            "modes": [
-                {"mode": mode.number, "ending": mode.ending, "marked_by": mode.marked_by} for mode in modes.modes
-            ],
             "terrains_sha256": write_terrains(out, heights, genes),
             "terrains": [
                 about | {"rates": {name: of_controller[place] for name, of_controller in rows.items()}}
@@ -243,76 +240,62 @@ def _check_judged(archive: Archive, run: Path) -> None:
         )
 
 
-def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], Modes, int]:
+def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
     Returns:
-        The terrains, the failure modes of the elites among them, and how many failing elites and minimal terrains are
-        left out, since nobody is known to cross them.
+        The terrains, and how many failing elites and minimal terrains are left out: nobody is known to cross them.
     """
     assert archive.fresh is not None
+    space, minima = get_space(archive.space, archive.space_sha256), read_minimal(run, archive)
     rate = archive.fresh.goal_rate
     near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
     passable = archive.certified | (rate >= FAILING_GOAL_RATE)
-    families = families_of(archive.genes[near], get_space(archive.space, archive.space_sha256))
-    modes = find_modes(elites_of(archive.rows(near))) if len(near) else Modes(modes=[], labels=near, silhouettes={})
-    kin = {
-        number: {"mode": mode, "family": family}
-        for number, mode, family in zip(near.tolist(), modes.labels.tolist(), families.tolist(), strict=True)
-    }
-    minima = read_minimal(run, archive)
-    entries = {} if minima is None else {entry["elite"]: entry for entry in minima.numbers["elites"]}
+    families = dict(zip(near.tolist(), families_of(archive.genes[near], space).tolist(), strict=True))
+    causes = rank(archive, space, minima).causes if len(near) else ()
+
+    def about(number: int, parts: list[int] | None, verdict: str, **known: Any) -> dict[str, Any]:
+        return {
+            "name": f"elite-{number}{'' if parts is None else '-minimal'}",
+            "kind": "elite" if parts is None else "minimal",
+            "elite": number,
+            "cell": int(archive.cell[number]),
+            "iteration": int(archive.iteration[number]),
+            "parts": parts,
+            "verdict": "fault" if verdict == "fault" else "near-fault",
+            "cause": causes[number] or None,
+            "family": families[number],
+            **known,
+        }
+
     candidates, not_passable = [], 0
     for number in near.tolist():
         if passable[number]:
-            about = _about_elite(archive, number, entries.get(number))
-            candidates.append(Candidate(archive.genes[number], about | kin[number]))
+            known = {"searched": rate_of(fresh_counts(archive, number)), **judgement(archive, number)}
+            terrain = about(number, None, verdict_of(archive, number), **known)
+            candidates.append(Candidate(archive.genes[number], terrain))
         not_passable += not passable[number]
-    for number, entry in entries.items():
-        if minima is None or not archive.failing[number] or len(entry["bumps"]) == entry["of"]:
+    for entry in minima.numbers["elites"] if minima else ():
+        number = entry["elite"]
+        if not archive.failing[number] or len(entry["bumps"]) == entry["of"]:
             continue  # with all its parts it is the elite itself
-        if entry["certificates"]:
-            candidates.append(Candidate(minima.genes[number], _about_minimal(entry) | kin[number]))
+        if minima and entry["certificates"]:
+            searched = {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")}
+            known = {"searched": searched, "resolved": entry["resolved"], "certificates": entry["certificates"]}
+            terrain = about(number, entry["bumps"], entry["verdict"], **known)
+            candidates.append(Candidate(minima.genes[number], terrain))
         not_passable += not entry["certificates"]
-    return candidates, modes, int(not_passable)
-
-
-def _about_elite(archive: Archive, number: int, minimal: dict[str, Any] | None) -> dict[str, Any]:
-    return {
-        "name": f"elite-{number}",
-        "kind": "elite",
-        "elite": number,
-        "cell": int(archive.cell[number]),
-        "iteration": int(archive.iteration[number]),
-        "parts": None,
-        "verdict": "fault" if verdict_of(archive, number) == "fault" else "near-fault",
-        "cause": None if minimal is None or minimal["cause"] is None else minimal["cause"]["kind"],
-        "searched": rate_of(fresh_counts(archive, number)),
-        **judgement(archive, number),
-    }
-
-
-def _about_minimal(entry: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "name": f"elite-{entry['elite']}-minimal",
-        "kind": "minimal",
-        **{key: entry[key] for key in ("elite", "cell", "iteration")},
-        "parts": entry["bumps"],
-        "verdict": "fault" if entry["verdict"] == "fault" else "near-fault",
-        "cause": None if entry["cause"] is None else entry["cause"]["kind"],
-        "searched": {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")},
-        **{key: entry[key] for key in ("resolved", "certificates")},
-    }
+    return candidates, int(not_passable)
 
 
 def choose_terrains(candidates: Sequence[Candidate], size: int) -> list[Candidate]:
     """Some of the candidates, so that each beginning of the list is spread as well as can be.
 
-    Next comes a fault before a near-fault, then one of the family that was chosen least often, of the failure mode that
-    was, of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
+    Next comes a fault before a near-fault, then one of the family that was chosen least often, of the cause that was,
+    of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
     """
     left, chosen = list(candidates), list[Candidate]()
-    counts = {name: Counter[Any]() for name in ("family", "mode", "kind")}
+    counts = {name: Counter[Any]() for name in ("family", "cause", "kind")}
 
     def turn(candidate: Candidate) -> tuple[Any, ...]:
         about = candidate.about
@@ -380,21 +363,21 @@ def rates_by_group(
         without a valid terrain) and ``failing``.
     """
     goal = {controller: _rates(of_controller, "goal") for controller, of_controller in rows.items()}
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for group in GROUPS:
-        members: dict[Any, list[int]] = {}
-        for place, about in enumerate(abouts):
-            members.setdefault(about[group], []).append(place)
-        groups[group] = [
-            {
-                group: value,
-                "terrains": len(places),
-                "goal_rate": {name: mean_of(rates[places]) for name, rates in goal.items()},
-                "failing": {name: int((rates[places] < FAILING_GOAL_RATE).sum()) for name, rates in goal.items()},
-            }
-            for value, places in sorted(members.items(), key=lambda pair: (-len(pair[1]), str(pair[0])))
-        ]
-    return groups
+
+    def part(group: str, value: object) -> dict[str, Any]:
+        member = np.array([about[group] == value for about in abouts])
+        return {
+            group: value,
+            "terrains": int(member.sum()),
+            "goal_rate": {name: mean_of(rates[member]) for name, rates in goal.items()},
+            "failing": {name: int((rates[member] < FAILING_GOAL_RATE).sum()) for name, rates in goal.items()},
+        }
+
+    values = {group: Counter(about[group] for about in abouts) for group in GROUPS}
+    return {
+        group: [part(group, value) for value in sorted(counts, key=lambda value: (-counts[value], str(value)))]
+        for group, counts in values.items()
+    }
 
 
 def round_heights(heights: NDArray[np.floating]) -> NDArray[np.float32]:

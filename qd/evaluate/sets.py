@@ -9,10 +9,10 @@ controller was trained on before; :mod:`qd.evaluate.marks` finds them.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,7 @@ class EliteSplit:
     """Held out to be reported: the first n are a random choice of n of them."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Certificates:
+class Certificates(NamedTuple):
     """Who is known to cross T elites that the controller of their search fails (:class:`qd.archive.FaultCounts`)."""
 
     certifiers: tuple[str, ...]
@@ -75,16 +74,10 @@ class Certificates:
 
 def certificates_of(archive: Archive, rows: NDArray[np.int64]) -> Certificates | None:
     """Who certifies some elites of an archive; None where no certifier was asked."""
-    faults = archive.faults
-    if faults is None or not faults.certifiers:
+    if (faults := archive.faults) is None or not faults.certifiers:
         return None
     given = faults.certificates() & archive.failing[:, None]
-    return Certificates(
-        certifiers=faults.certifiers,
-        sha256=faults.certifier_sha256,
-        given=given[rows],
-        searched_sha256=archive.policy_sha256,
-    )
+    return Certificates(faults.certifiers, faults.certifier_sha256, given[rows], archive.policy_sha256)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +105,15 @@ class TerrainSet:
     def __len__(self) -> int:
         """Number of terrains."""
         return len(self.seeds)
+
+    def rows(self, places: NDArray[np.int64]) -> "TerrainSet":
+        """The terrains in some places."""
+        arrays: dict[str, Any] = {
+            name: value[places] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        if self.certificates is not None:
+            arrays["certificates"] = self.certificates._replace(given=self.certificates.given[places])
+        return replace(self, **arrays)
 
 
 def paper_terrains(robot: str) -> int:
@@ -170,15 +172,14 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")
     if archive_path is not None:
-        archive = read_elites(archive_path, robot, space)
-        shared = len(set(marks_of(independent.genes)) & set(marks_of(archive.genes)))
-        seed = search_seed(path)
+        archive, seed = read_elites(archive_path, robot, space), search_seed(path)
+        shared = len({*marks_of(independent.genes)} & {*marks_of(archive.genes)})
         other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)
         if other_space or shared or (seed is not None and seed == search_seed(archive_path)):
             raise ValueError(
                 f"independent must be of space {archive.space} and share neither elites nor the search's seed with "
                 f"{archive_path}, got {path} of {independent.space} and seed {seed} with {shared} elites in both: give "
-                f"a search with another seed"
+                "a search with another seed"
             )
     return independent
 
@@ -205,14 +206,9 @@ def plain_set(
     else:
         terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
     return TerrainSet(
-        name=name,
-        terrains=terrains,
-        seeds=_episode_seeds(rng, count),
-        numbers=np.arange(count),
-        types=types,
-        levels=levels,
-        space=space.name,
-    )
+        name=name, terrains=terrains, seeds=_episode_seeds(rng, count), numbers=np.arange(count), types=types,
+        levels=levels, space=space.name,
+    )  # fmt: skip
 
 
 def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") -> TerrainSet:
@@ -223,28 +219,21 @@ def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") 
     return _set_of_elites("generated", archive, held_out[:count], seeds[:count])
 
 
-def random_elites(
-    name: str, archive: Archive, count: int, seed: int, allowed: NDArray[np.bool_] | None = None
-) -> TerrainSet:
-    """``count`` elites of an archive, or all, of those ``allowed``, shape (N,); ``seed`` draws them and episodes."""
+def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on: Set[str] = frozenset()) -> TerrainSet:
+    """``count`` elites, or all, without those of some marks (:mod:`qd.evaluate.marks`); ``seed`` draws them."""
     rng = set_rng(name, seed)
     rows = _in_order_of_genes(archive)[rng.permutation(len(archive))]
     seeds = _episode_seeds(rng, len(archive))
-    chosen = slice(None) if allowed is None else allowed[rows]
-    return _set_of_elites(name, archive, rows[chosen][:count], seeds[chosen][:count])
+    untrained = ~np.isin(marks_of(archive.genes[rows]), [*trained_on])
+    return _set_of_elites(name, archive, rows[untrained][:count], seeds[untrained][:count])
 
 
 def _set_of_elites(name: str, archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
-    space = space_of(archive)
+    genes, space = archive.genes[rows], space_of(archive)
     return TerrainSet(
-        name=name,
-        terrains=archive.genes[rows],
-        seeds=seeds,
-        numbers=rows,
-        space=space.name,
-        families=families_of(archive.genes[rows], space),
+        name=name, terrains=genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(genes, space),
         certificates=certificates_of(archive, rows),
-    )
+    )  # fmt: skip
 
 
 def space_of(archive: Archive) -> TerrainSpace:
@@ -258,16 +247,7 @@ def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
     ``distance`` of each terrain to its nearest training terrain has shape (T,).
     """
     places = np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)])
-    families, certificates = whole.families, whole.certificates
-    return replace(
-        whole,
-        name="generated_far",
-        terrains=whole.terrains[places],
-        seeds=whole.seeds[places],
-        numbers=whole.numbers[places],
-        families=None if families is None else families[places],
-        certificates=None if certificates is None else replace(certificates, given=certificates.given[places]),
-    )
+    return replace(whole.rows(places), name="generated_far")
 
 
 def nearest_distance(

@@ -8,12 +8,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from qd.evaluate.labels import CERTIFIED, MEASURES, SETS
+from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, SETS
+from qd.evaluate.tables import is_regression
 from sim.files.command import say
 from sim.files.intervals import value_words
 
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
+_RATES = ("goal", "success", "fallen")
 _BIASED = {
     None: "",
     "searched": "too low, since the terrains were chosen by its failures",
@@ -33,20 +35,12 @@ def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]
     console.print(table)
 
 
-def show_rates(report: dict[str, Any]) -> None:
-    """Prints the rates of one controller, as ``base.json`` has them."""
-    rows = []
-    for name in ("hand_crafted", "hard_random"):
-        groups = {SETS[name]: report[name]}
-        groups |= {f"  {key}": group for key, group in (report[name]["by_type"] or {}).items()}
-        groups |= {f"  level {key}": group for key, group in (report[name]["by_level"] or {}).items()}
-        for label, group in groups.items():
-            rates = (value_words(group[f"{key}_rate"], group.get(f"{key}_interval")) for key in ("goal", "success"))
-            rows.append((label, *rates, value_words(group["fallen_rate"], None), group["terrains"]))
-    show_table(report["policy"], ("", MEASURES["goal"], MEASURES["success"], "fallen", "terrains"), rows)
-    error = value_words(report["flat"]["vx_error_mean"], None)
-    print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
-    _show_invalid({SETS[name]: report[name]["outcomes"] for name in ("hand_crafted", "hard_random")})
+def _heads(measures: Iterable[str]) -> list[str]:
+    return ["", *(MEASURES[measure] for measure in measures)]
+
+
+def _rate_cells(row: Mapping[str, Any]) -> list[str]:
+    return [value_words(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in _RATES]
 
 
 def _show_invalid(outcomes: Mapping[str, Mapping[str, int]]) -> None:
@@ -56,26 +50,53 @@ def _show_invalid(outcomes: Mapping[str, Mapping[str, int]]) -> None:
             print(f"{label}: {counts['invalid']} episodes are invalid ({share:.1%}) and left out; they may be failures")
 
 
+def show_rates(report: dict[str, Any]) -> None:
+    """Prints the rates of one controller, as ``base.json`` has them."""
+    sets, rows = {SETS[name]: report[name] for name in ("hand_crafted", "hard_random")}, []
+    for label, group in sets.items():
+        parts = {f"  {key}": part for key, part in (group["by_type"] or {}).items()}
+        parts |= {f"  level {key}": part for key, part in (group["by_level"] or {}).items()}
+        rows += [(key, *_rate_cells(part), part["terrains"]) for key, part in ({label: group} | parts).items()]
+    show_table(report["policy"], (*_heads(_RATES), "terrains"), rows)
+    error = value_words(report["flat"]["vx_error_mean"], None)
+    print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
+    _show_invalid({label: group["outcomes"] for label, group in sets.items()})
+
+
 def show_tables(report: dict[str, Any]) -> None:
     """Prints ``tables.json``: every set with every controller, and what became of terrains."""
+
+    def cell(measure: str, name: str, controller: str) -> str:
+        limits = report["intervals"][measure][name][controller]
+        return value_words(report[measure][name][controller], limits, _FORMS.get(measure, ".3f"))
+
     if report.get("part") == "validation":
         print("\nValidation terrains, to choose settings by. Rates to report are of part test.")
-    for name in report["goal"]:
+    controllers, paper = report["controllers"], report["paper"] or {}
+    for name, count in report["terrains"].items():
+        published = [(_FORMS[key], paper.get(key, {}).get(name, {})) for key in ("success", "reward")]
         rows = [
-            (controller, *_cells(report, name, controller, _FORMS), _paper_cell(report, name, controller))
-            for controller in report["goal"][name]
+            (
+                controller,
+                *(cell(measure, name, controller) for measure in _FORMS),
+                ", ".join(format(values[controller], form) for form, values in published if controller in values),
+            )
+            for controller in controllers
         ]
-        title = f"{SETS.get(name, name)}: {report['terrains'][name]} terrains x {report['episodes']} episodes"
-        show_table(title, ("", *(MEASURES[key] for key in _FORMS), "paper: success, reward"), rows)
+        title = f"{SETS.get(name, name)}: {count} terrains x {report['episodes']} episodes"
+        show_table(title, (*_heads(_FORMS), "paper: success, reward"), rows)
     for name, about in report["certified"].items():
         certifiers = ", ".join(f"{certifier} {count}" for certifier, count in about["certifiers"].items())
         title = f"{SETS.get(name, name)}, certified: {about['terrains']} of {report['terrains'][name]} ({certifiers})"
         rows = [
-            (controller, *_cells(report, name, controller, CERTIFIED), _BIASED[about["chosen_by"].get(controller)])
-            for controller in report["goal"][name]
+            (
+                controller,
+                *(cell(measure, name, controller) for measure in CERTIFIED),
+                _BIASED[about["chosen_by"].get(controller)],
+            )
+            for controller in controllers
         ]
-        head = ("", *(MEASURES[measure] for measure in CERTIFIED.values()), "biased")
-        show_table(title, head, rows if about["terrains"] else [])
+        show_table(title, (*_heads(CERTIFIED.values()), "biased"), rows if about["terrains"] else [])
     rows = [
         (f"{name}, {kind}, {measure.replace('_', ' ')}", value_words(summary["mean"], summary["interval"]))
         for measure, sets in report["over_seeds"].items()
@@ -84,68 +105,31 @@ def show_tables(report: dict[str, Any]) -> None:
     ]
     if rows:
         show_table("several controllers of a kind: mean, 95 % t interval over them", ("", "mean"), rows)
-    by_controller = {
-        f"{name}, {controller}": values
-        for name, row in report["penalties"].items()
-        for controller, values in row.items()
-    }
-    rows = [
-        (label, *(value_words(value, None, ".2f") for value in values.values()))
-        for label, values in by_controller.items()
-    ]
-    show_table("scaled penalties", ("", *next(iter(by_controller.values()))), rows)
-    _show_differences(report["differences"])
-    _show_invalid(
-        {
-            f"{controller} on {name}": counts
-            for name, row in report["outcomes"].items()
-            for controller, counts in row.items()
-        }
-    )
-
-
-def _cells(report: dict[str, Any], name: str, controller: str, measures: Iterable[str]) -> list[str]:
-    intervals = report["intervals"]
-    return [
-        value_words(report[key][name][controller], intervals[key][name][controller], _FORMS.get(key, ".3f"))
-        for key in measures
-    ]
-
-
-def published_value(report: Mapping[str, Any], measure: str, name: str, controller: str) -> float | None:
-    """The paper's number of a measure, a set and a controller's name; None where it has none."""
-    return (report["paper"] or {}).get(measure, {}).get(name, {}).get(controller)
-
-
-def _paper_cell(report: dict[str, Any], name: str, controller: str) -> str:
-    success, reward = (published_value(report, key, name, controller) for key in ("success", "reward"))
-    return "" if success is None else f"{success:.3f}, {reward:.1f}"
-
-
-def _show_differences(differences: dict[str, Any]) -> None:
     rows = []
-    for name, pairs in differences.items():
-        for pair, about in pairs.items():
-            changed = (f"{about[kind]['count']} ({about[kind]['clear']})" for kind in ("mended", "newly_broken"))
-            gain = value_words(about["gain"]["goal"]["mean"], about["gain"]["goal"]["interval"], "+.3f")
-            rows.append((f"{name}, {pair}", *changed, about["still_failing"]["count"], about["compared"], gain))
+    for name, pairs in report["differences"].items():
+        for pair, change in pairs.items():
+            changed = (f"{change[fate]['count']} ({change[fate]['clear']})" for fate in ("mended", "newly_broken"))
+            gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+            rows.append((f"{name}, {pair}", *changed, change["still_failing"]["count"], change["compared"], gain))
     if rows:
         title = "terrains on which under half of the episodes reach the goal; in brackets beyond chance"
         show_table(title, ("", "mended", "newly broken", "still failing", "of", "gain of the goal rate"), rows)
+    outcomes = report["outcomes"].items()
+    _show_invalid({f"{controller} on {name}": counts for name, row in outcomes for controller, counts in row.items()})
 
 
 def show_comparison(report: dict[str, Any]) -> None:
     """Prints what became of elites from an old controller to a new one."""
-    change = report["differences"]["elites"]["old -> new"]
+    change = report["differences"][COMPARED]["old -> new"]
     for name in ("old", "new"):
-        goal = value_words(report["goal"]["elites"][name], report["intervals"]["goal"]["elites"][name])
+        goal = value_words(report["goal"][COMPARED][name], report["intervals"]["goal"][COMPARED][name])
         say(f"{name}: {goal} of the robots reach the goal")
     for fate, words, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
         count, numbers = change[fate]["count"], ", ".join(map(str, change[fate]["terrains"]))
         which = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
         say((f"{count} of {change['compared']} elites {words}", style if count else ""), which)
     gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
-    verdict = ("a regression", "bold red") if report["regression"] else ("no regression", "bold green")
+    verdict = ("a regression", "bold red") if is_regression(report) else ("no regression", "bold green")
     say(f"new - old: {gain}, 95 % interval over families: ", verdict)
 
 
@@ -160,27 +144,15 @@ def show_pack_test(report: dict[str, Any]) -> None:
     """Prints what of a pack a controller fails, beside the pack's controllers."""
     rates = {"this": report["rates"], **report["beside"]}
     _show_pack_rates(f"pack {report['pack']['folder']} of {report['pack']['robot']}", rates)
-    modes = {mode["mode"]: f"{mode['mode']}: {mode['ending']}, {mode['marked_by']}" for mode in report["pack"]["modes"]}
-    for group in ("verdict", "mode", "cause", "kind"):
-        rows = [
-            (
-                modes.get(about[group], about[group]) if group == "mode" else about[group] or "not looked for",
-                about["terrains"],
-                *about["failing"].values(),
-            )
-            for about in report["by"][group]
-        ]
+    for group, parts in report["by"].items():
+        rows = [(part[group] or "not looked for", part["terrains"], *part["failing"].values()) for part in parts]
         show_table(f"failed, by {group}", ("", "terrains", *rates), rows)
 
 
 def _show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
     rows = [
-        (
-            controller,
-            *(value_words(row[f"{key}_rate"], row[f"{key}_interval"]) for key in ("goal", "success", "fallen")),
-            f"{row['failing']} of {row['terrains']}",
-            f"{row['failing_families']} of {row['families']}",
-        )
-        for controller, row in rates.items()
-    ]
-    show_table(title, ("", *(MEASURES[key] for key in ("goal", "success", "fallen")), "fails", "families"), rows)
+        (name, *_rate_cells(row), f"{row['failing']} of {row['terrains']}",
+         f"{row['failing_families']} of {row['families']}")
+        for name, row in rates.items()
+    ]  # fmt: skip
+    show_table(title, (*_heads(_RATES), "fails", "families"), rows)

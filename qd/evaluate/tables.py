@@ -9,132 +9,41 @@ overlap.
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.labels import CERTIFIED, MEASURES, RATES
+from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, RATES
 from qd.evaluate.measures import Families, Measured, interval_of, mean_of, of_terrains
-from qd.evaluate.paper import Published, published
+from qd.evaluate.paper import published
 from qd.evaluate.sets import TerrainSet
 from qd.fitness import FAILING_GOAL_RATE
+from sim.files.atomic import read_json
 from sim.files.intervals import t_interval, wilson_interval
 from sim.files.records import check_robot
 from sim.policy.spec import controller_hash, firsts, kind_of
 from sim.robots.robot import RobotCfg
 
-Number = float | None
-"""None where no terrain is valid."""
-Limits = list[float] | None
-"""Lower and upper limit of a 95 % interval; None where nothing is known of the spread."""
-Values = dict[str, dict[str, Number]]
-"""Set -> controller -> mean over the set's terrains."""
+Tables = dict[str, Any]
+"""What is said of controllers on sets of terrains, as JSON values; rates are fractions, None where no terrain is valid.
 
-
-class Controller(TypedDict):
-    """A controller of the tables."""
-
-    policy: str
-    sha256: str | None
-
-
-class Counted(TypedDict):
-    """Some of the terrains that were compared."""
-
-    count: int
-    share: Number
-    interval: Limits
-    """Of the share."""
-    terrains: NotRequired[list[int]]
-    """Their numbers, ascending; not of the fine ones, which are the most."""
-    clear: NotRequired[int]
-    """How many of those mended or newly broken are so beyond chance."""
-
-
-class Gain(TypedDict):
-    """Mean difference of a measure, terrain by terrain."""
-
-    mean: Number
-    interval: Limits
-
-
-class Difference(TypedDict):
-    """What became of the terrains of a set from one controller to another."""
-
-    compared: int
-    """Terrains that are valid for both."""
-    mended: Counted
-    still_failing: Counted
-    newly_broken: Counted
-    fine: Counted
-    gain: dict[str, Gain]
-    """By measure."""
-
-
-class Certified(TypedDict):
-    """Certified terrains of a set, and whose rates on them are biased by how they were chosen."""
-
-    terrains: int
-    certifiers: dict[str, int]
-    """Name -> how many of them it certifies."""
-    chosen_by: dict[str, str]
-    """Controller -> ``certifier``, which crossed some of them to certify them, or ``searched``, which failed them all:
-    the rate of the first is biased upward, that of the other downward."""
-
-
-class OverSeeds(TypedDict):
-    """Several controllers of a kind."""
-
-    mean: Number
-    """None where one of the values is."""
-    interval: Limits
-    """95 % t interval over them."""
-    values: list[Number]
-
-
-class Tables(TypedDict):
-    """What is said of controllers on sets of terrains. Rates are fractions."""
-
-    robot: str
-    episodes: int
-    """On each terrain."""
-    controllers: dict[str, Controller]
-    terrains: dict[str, int]
-    """How many, by set."""
-    goal: Values
-    success: Values
-    fallen: Values
-    reward: Values
-    penalties: dict[str, dict[str, dict[str, Number]]]
-    """Set -> controller -> penalty -> mean, scaled."""
-    certified_goal: Values
-    """On certified terrains alone, of sets whose elites have certificates."""
-    certified_success: Values
-    certified: dict[str, Certified]
-    """By set."""
-    intervals: dict[str, dict[str, dict[str, Any]]]
-    """Measure -> set -> controller -> interval; of ``penalties`` by penalty."""
-    over_seeds: dict[str, dict[str, dict[str, OverSeeds]]]
-    """Measure -> set -> kind of controller; only kinds of which there are several."""
-    outcomes: dict[str, dict[str, dict[str, int]]]
-    """Set -> controller -> how many episodes ended so."""
-    invalid_terrains: dict[str, dict[str, int]]
-    differences: dict[str, dict[str, Difference]]
-    """Set -> ``first -> second``, of every two kinds' first controllers."""
-    paper: Published | None
-    """The paper's numbers, None of a robot it has none of."""
-    reward_weights: dict[str, Any]
-    part: NotRequired[str]
-    """``test``, or ``validation`` of terrains by which settings are chosen."""
-    archive: NotRequired[dict[str, Any] | None]
-    """Of which the generated terrains are."""
-    robot_sha256: NotRequired[str]
-
+- ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean over the set's terrains; ``certified_goal``
+  and ``certified_success`` over its certified terrains alone; ``penalties`` by penalty, scaled.
+- ``intervals``: measure -> set -> controller -> 95 % interval, None where nothing is known of the spread.
+- ``over_seeds``: measure -> set -> kind of which there are several controllers -> ``mean``, ``interval`` (t) and
+  ``values``.
+- ``certified``: set -> how many ``terrains``; ``certifiers``, how many each of them certifies; and ``chosen_by``,
+  controller -> ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
+- ``differences``: set -> ``first -> second`` -> ``compared`` terrains, which are valid for both; ``mended``,
+  ``still_failing``, ``newly_broken`` and ``fine``, each with its ``count`` and the numbers of its ``terrains`` (not of
+  the fine ones); how many changes are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
+- ``outcomes``: set -> controller -> episodes that ended so; ``terrains``: how many, by set; ``episodes``: on each.
+- ``paper``: the paper's numbers. ``controllers``: ``policy`` and ``sha256`` by name.
+"""
+_MEASURES = (*MEASURES, *CERTIFIED)
 
 Crossed = Mapping[str, Mapping[str, Measured]]
 """Set -> controller -> what it made of the set's terrains."""
@@ -145,8 +54,8 @@ def read_tables(file: Path, robot: RobotCfg) -> Tables:
     if not file.exists():
         raise FileNotFoundError(f"no tables at {file}: `faultline evaluate` writes them")
     try:
-        tables = as_tables(msgspec.json.decode(file.read_bytes()))
-    except (msgspec.MsgspecError, ValueError) as error:
+        tables = as_tables(read_json(file))
+    except ValueError as error:
         raise ValueError(f"{file} must hold the tables of `faultline evaluate`: {error}: give that file") from None
     if tables["robot"] != robot.name:
         raise ValueError(f"{file} must be of robot {robot.name}, got {tables['robot']}: give other tables")
@@ -157,13 +66,15 @@ def read_tables(file: Path, robot: RobotCfg) -> Tables:
 
 
 def as_tables(content: Any) -> Tables:
-    """JSON values as tables."""
-    tables = msgspec.convert(content, Tables)
-    for measure in (*MEASURES, *CERTIFIED):
-        rows = [*tables[measure].values(), *tables["intervals"].get(measure, {}).values()]
-        if any(row.keys() != tables["controllers"].keys() for row in rows):
+    """JSON values as tables; refuses what has no value of each controller on each set."""
+    keys = (*_MEASURES, "robot", "controllers", "intervals", "over_seeds", "certified", "differences", "terrains")
+    if missing := [key for key in keys if key not in content]:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    for measure in _MEASURES:
+        rows = [*content[measure].values(), *content["intervals"].get(measure, {}).values()]
+        if any(row.keys() != content["controllers"].keys() for row in rows):
             raise ValueError(f"{measure} must have a value of every controller on each set")
-    return tables
+    return content
 
 
 def make_tables(
@@ -171,39 +82,34 @@ def make_tables(
     sets: Mapping[str, TerrainSet],
     robot: RobotCfg,
     *,
-    controllers: dict[str, Controller],
+    controllers: Mapping[str, Mapping[str, str | None]],
     episodes: int,
     seed: int,
 ) -> Tables:
     """Everything that the tables say of crossings."""
     means = _statistics(crossed, sets, lambda values, _: mean_of(values))
-    return Tables(
-        robot=robot.name,
-        episodes=episodes,
-        controllers=controllers,
+    return {
+        "robot": robot.name,
+        "episodes": episodes,
+        "controllers": controllers,
         **means,
-        certified=_about_certified(sets, controllers),
-        over_seeds=over_seeds(means, (*MEASURES, *CERTIFIED)),
-        intervals=_statistics(crossed, sets, lambda values, families: interval_of(values, seed, families)),
-        terrains={name: len(terrains) for name, terrains in sets.items()},
-        outcomes=_each(crossed, lambda measured: measured.outcomes),
-        invalid_terrains=_each(crossed, lambda measured: int((~measured.valid).sum())),
-        differences={
-            name: differences(
-                {first: row[first] for first in firsts(row)}, sets[name].numbers, seed, sets[name].families
-            )
+        "certified": _about_certified(sets, controllers),
+        "over_seeds": over_seeds(means, _MEASURES),
+        "intervals": _statistics(crossed, sets, lambda values, families: interval_of(values, seed, families)),
+        "terrains": {name: len(terrains) for name, terrains in sets.items()},
+        "outcomes": {
+            name: {controller: measured.outcomes for controller, measured in row.items()}
             for name, row in crossed.items()
         },
-        paper=published(robot.name),
-        reward_weights={
-            **{name: weight for name, weight in asdict(robot.training.rewards).items() if weight},
-            "only_positive": robot.training.only_positive,
+        "differences": {
+            name: {
+                f"{first} -> {second}": difference(row[first], row[second], sets[name], seed)
+                for first, second in combinations(firsts(row), 2)
+            }
+            for name, row in crossed.items()
         },
-    )
-
-
-def _each(crossed: Crossed, of: Callable[[Measured], Any]) -> dict[str, dict[str, Any]]:
-    return {name: {controller: of(measured) for controller, measured in row.items()} for name, row in crossed.items()}
+        "paper": published(robot.name),
+    }
 
 
 def _statistics(
@@ -213,8 +119,9 @@ def _statistics(
     tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
     for name, row in crossed.items():
         families, certificates = sets[name].families, sets[name].certificates
+        of_set = {key: {controller: row[controller].values[key] for controller in row} for key in MEASURES}
         for key in MEASURES:
-            tables[key][name] = {controller: statistic(row[controller].values[key], families) for controller in row}
+            tables[key][name] = {controller: statistic(values, families) for controller, values in of_set[key].items()}
         tables["penalties"][name] = {
             controller: {key: statistic(values, families) for key, values in measured.penalties.items()}
             for controller, measured in row.items()
@@ -224,70 +131,63 @@ def _statistics(
             kin = of_terrains(families, member)
             for key, measure in CERTIFIED.items():
                 tables[key][name] = {
-                    controller: statistic(row[controller].values[measure][member], kin) for controller in row
+                    controller: statistic(values[member], kin) for controller, values in of_set[measure].items()
                 }
     return tables
 
 
-def _about_certified(sets: Mapping[str, TerrainSet], controllers: Mapping[str, Controller]) -> dict[str, Certified]:
+def _about_certified(
+    sets: Mapping[str, TerrainSet], controllers: Mapping[str, Mapping[str, str | None]]
+) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
-        certificates = terrains.certificates
-        if certificates is not None:
-            counts = dict(zip(certificates.certifiers, certificates.given.sum(axis=0).tolist(), strict=True))
-            by_hash = dict(zip(certificates.sha256, certificates.certifiers, strict=True))
-            roles = {certificates.searched_sha256: "searched"}
-            roles |= {sha256: "certifier" for sha256, certifier in by_hash.items() if counts[certifier]}
-            hashes = {controller: about["sha256"] for controller, about in controllers.items()}
-            certified[name] = Certified(
-                terrains=int(certificates.certified.sum()),
-                certifiers=counts,
-                chosen_by={
-                    controller: roles[sha] for controller, sha in hashes.items() if sha is not None and sha in roles
-                },
-            )
+        if (certificates := terrains.certificates) is None:
+            continue
+        counts = dict(zip(certificates.certifiers, certificates.given.sum(axis=0).tolist(), strict=True))
+        roles: dict[str | None, str] = {certificates.searched_sha256: "searched"}
+        by_hash = zip(certificates.sha256, certificates.certifiers, strict=True)
+        roles |= {sha256: "certifier" for sha256, certifier in by_hash if counts[certifier]}
+        hashes = {controller: about["sha256"] for controller, about in controllers.items()}
+        certified[name] = {
+            "terrains": int(certificates.certified.sum()),
+            "certifiers": counts,
+            "chosen_by": {controller: roles[sha] for controller, sha in hashes.items() if sha and sha in roles},
+        }
     return certified
 
 
-def difference(
-    before: Measured, after: Measured, numbers: NDArray[np.int64], seed: int, families: Families = None
-) -> Difference:
-    """What became of each terrain from one controller to another, and what the second gains in the mean."""
+def difference(before: Measured, after: Measured, terrains: TerrainSet, seed: int) -> dict[str, Any]:
+    """What became of each terrain of a set from one controller to another, and what the second gains in the mean."""
     both = before.valid & after.valid
-    kin = of_terrains(families, both)
+    kin = of_terrains(terrains.families, both)
     fails, then_fails = (both & (rates.values["goal"] < FAILING_GOAL_RATE) for rates in (before, after))
     limits, then_limits = _wilson_limits(before), _wilson_limits(after)
     apart = (limits[:, 1] < then_limits[:, 0]) | (then_limits[:, 1] < limits[:, 0])
-    members = {
-        "mended": fails & ~then_fails,
-        "still_failing": fails & then_fails,
-        "newly_broken": ~fails & then_fails,
-        "fine": both & ~fails & ~then_fails,
-    }
-    counts: dict[str, Counted] = {}
-    for fate, member in members.items():
-        shares = member[both].astype(float)
-        counts[fate] = Counted(count=int(member.sum()), share=mean_of(shares), interval=interval_of(shares, seed, kin))
-        if fate != "fine":
-            counts[fate]["terrains"] = np.sort(numbers[member]).tolist()
-        if fate in ("mended", "newly_broken"):
-            counts[fate]["clear"] = int((member & apart).sum())
+
+    def changed(member: NDArray[np.bool_]) -> dict[str, Any]:
+        return {"count": int(member.sum()), "terrains": np.sort(terrains.numbers[member]).tolist()}
+
+    mended, broken = fails & ~then_fails, ~fails & then_fails
     gains = {name: (after.values[name] - before.values[name])[both] for name in MEASURES}
-    return Difference(
-        compared=int(both.sum()),
-        **counts,  # type: ignore[typeddict-item]
-        gain={name: Gain(mean=mean_of(gain), interval=interval_of(gain, seed, kin)) for name, gain in gains.items()},
-    )
-
-
-def differences(
-    crossed: dict[str, Measured], numbers: NDArray[np.int64], seed: int, families: Families = None
-) -> dict[str, Difference]:
-    """:func:`difference` of every two controllers, the earlier named one first, under ``first -> second``."""
     return {
-        f"{first} -> {second}": difference(crossed[first], crossed[second], numbers, seed, families)
-        for first, second in combinations(crossed, 2)
+        "compared": int(both.sum()),
+        "mended": {**changed(mended), "clear": int((mended & apart).sum())},
+        "still_failing": changed(fails & then_fails),
+        "newly_broken": {**changed(broken), "clear": int((broken & apart).sum())},
+        "fine": {"count": int((both & ~fails & ~then_fails).sum())},
+        "gain": {
+            name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, kin)} for name, gain in gains.items()
+        },
     }
+
+
+def is_regression(tables: Mapping[str, Any]) -> bool:
+    """Whether the goal rate's difference of :data:`COMPARED` elites, new minus old, has an interval wholly below 0.
+
+    A terrain that newly fails alone is no regression, since among hundreds some do by chance.
+    """
+    limits = tables["differences"][COMPARED]["old -> new"]["gain"]["goal"]["interval"]
+    return limits is not None and limits[1] < 0.0
 
 
 def _wilson_limits(measured: Measured) -> NDArray[np.float64]:
@@ -308,9 +208,9 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
         known[key] = name
 
 
-def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[str, dict[str, dict[str, OverSeeds]]]:
+def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
-    summaries: dict[str, dict[str, dict[str, OverSeeds]]] = {}
+    summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for measure in measures:
         for name, row in tables[measure].items():
             for kind in dict.fromkeys(map(kind_of, row)):
@@ -321,11 +221,11 @@ def over_seeds(tables: Mapping[str, Values], measures: Iterable[str]) -> dict[st
     return summaries
 
 
-def _mean_over_seeds(values: list[Number], *, is_rate: bool) -> OverSeeds:
+def _mean_over_seeds(values: list[float | None], *, is_rate: bool) -> dict[str, Any]:
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
-        return OverSeeds(mean=None, interval=None, values=values)
+        return {"mean": None, "interval": None, "values": values}
     interval = t_interval(np.array(numbers))
     if interval is not None and is_rate:
         interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
-    return OverSeeds(mean=sum(numbers) / len(numbers), interval=interval, values=values)
+    return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}

@@ -113,5 +113,5 @@ class SearchBar(Bar):
             + (f"{invalid:.0%} invalid ({why}), " if why else "")
             + f"{row['episodes_per_s']:.0f} episodes/s"
             + (f" by {workers}" if workers else "")
-            + f", mean fitness {row['mean_fitness']:.2f}",
+            + f", fitness {row['mean_fitness']:.2f}",
         )

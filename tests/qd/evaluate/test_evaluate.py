@@ -11,9 +11,10 @@ import pytest
 from qd.archive import write_archive
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
-from qd.evaluate.evaluate import SetsCfg, compare, evaluate_rates, evaluate_tables, sizes_for
+from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables, sizes_for
 from qd.evaluate.labels import SETS
 from qd.evaluate.sets import split_elites
+from qd.evaluate.tables import is_regression
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.files.records import robot_digest
@@ -85,22 +86,21 @@ def test_a_new_controller_is_compared_with_the_old_one_on_elites_that_neither_wa
     new = str(write_trained(tmp_path, elites.genes[:20]))
     # Of ten elites left, by the sign of the first gene: what old crosses of these, new does not, and new all others.
     crosser = Crosser(lambda policy, genes: (genes[:, 0] > 0) != (policy == new))
-    given = {"compute": CPU, "terrains": 99, "episodes": 4, "open_evaluator": crosser.open}
-    report = compare(anymal, STAND, new, archive, **given)
-    assert json.loads(Path("runs/anymal-compared.json").read_text()) == json.loads(json.dumps(report))
+    given = {"archive": archive, "names": ("elites",), "terrains": 99, "episodes": 4}
+    report = tables_of(anymal, crosser, {"old": STAND, "new": new}, **given)
+    assert json.loads(Path("runs/anymal-tables/compared.json").read_text()) == json.loads(json.dumps(report))
     was_crossed = 20 + np.flatnonzero(elites.genes[20:, 0] > 0)
     change = report["differences"]["elites"]["old -> new"]
     assert (change["compared"], change["newly_broken"]["terrains"]) == (10, was_crossed.tolist())
     assert set(change["mended"]["terrains"]) == {*range(20, 30)} - {*was_crossed}
     # Six gain, four lose. None of 4 episodes is at most .49 (Wilson), all are at least .51: beyond chance.
-    assert change["gain"]["goal"]["mean"] == pytest.approx(0.2) and not report["regression"]
+    assert change["gain"]["goal"]["mean"] == pytest.approx(0.2) and not is_regression(report)
     assert "4 of 10 elites newly failed, 4 of them" in capsys.readouterr().out
-    given["open_evaluator"] = Crosser(lambda policy, genes: [policy == STAND] * 30).open
-    worse = compare(anymal, STAND, STRETCH, archive, seed=1, **given)
-    assert worse["regression"] and worse["goal"]["elites"] == {"old": 1.0, "new": 0.0}
-    trained_on_all = str(write_trained(tmp_path, elites.genes))
+    crosser = Crosser(lambda policy, genes: [policy == STAND] * 30)
+    worse = tables_of(anymal, crosser, {"old": STAND, "new": STRETCH}, seed=1, **given)
+    assert is_regression(worse) and worse["goal"]["elites"] == {"old": 1.0, "new": 0.0}
     with pytest.raises(ValueError, match="archive"):
-        compare(anymal, STAND, trained_on_all, archive, **given)
+        tables_of(anymal, crosser, {"old": STAND, "new": str(write_trained(tmp_path, elites.genes))}, **given)
 
 
 @pytest.mark.parametrize("where", ["test", "validation", "independent"])
@@ -169,7 +169,9 @@ def test_the_command_hands_its_flags_on(archive, monkeypatch):
     assert (robot.name, list(controllers), cfg.names, cfg.seed) == ("anymal", ["base"], ("hard_random", "generated"), 3)
     assert run_command(Evaluate, ["--space", "course", "--robot", "cassie", "--device", "cpu"], name="evaluate") == 0
     assert given["args"][0].name == "cassie" and given["space"] == "course"
-    for regression in (False, True):
-        monkeypatch.setattr(evaluation, "compare", lambda *_, given=regression, **named: {"regression": given})
+    for gain, status in ((0.1, 0), (-0.1, 1)):
+        gains = {"gain": {"goal": {"interval": [-0.5, gain]}}}
+        tables = {"differences": {"elites": {"old -> new": gains}}}
+        monkeypatch.setattr(evaluation, "evaluate_tables", lambda *_, given=tables, **named: given)
         flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--device", "cpu"]
-        assert run_command(Evaluate, flags, name="evaluate") == int(regression)
+        assert run_command(Evaluate, flags, name="evaluate") == status

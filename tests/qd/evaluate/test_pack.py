@@ -45,10 +45,10 @@ def crosses(policy, heights):
     return (np.abs(heights).max(axis=(1, 2)) < 0.2) | ("C-G" in policy)
 
 
-def candidate(elite, *, fault=True, family=0, mode=1, kind="elite", rate=0.0):
+def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=0.0):
     about = {
         "name": f"elite-{elite}", "elite": elite, "kind": kind, "verdict": "fault" if fault else "near-fault",
-        "family": family, "mode": mode, "cause": None, "searched": {"goal_rate": rate},
+        "family": family, "cause": cause, "searched": {"goal_rate": rate},
     }  # fmt: skip
     return Candidate(np.full(64, elite / 100, np.float32), about)
 
@@ -58,7 +58,7 @@ def candidate(elite, *, fault=True, family=0, mode=1, kind="elite", rate=0.0):
     [
         ([candidate(0, fault=False, rate=0.0), candidate(1, rate=0.4)], [1, 0]),  # faults first
         ([candidate(0), candidate(1), candidate(2, family=1, rate=0.4)], [0, 2, 1]),  # one family before two
-        ([candidate(0), candidate(1, family=1), candidate(2, family=2, mode=2, rate=0.4)], [0, 2, 1]),  # modes
+        ([candidate(0), candidate(1, family=1), candidate(2, family=2, cause="drop", rate=0.4)], [0, 2, 1]),  # causes
         ([candidate(0), candidate(1, family=1), candidate(2, family=2, kind="minimal", rate=0.4)], [0, 2, 1]),  # kinds
         ([candidate(0, rate=0.4), candidate(1, family=1, rate=0.1)], [1, 0]),  # the lowest goal rate
     ],
@@ -138,12 +138,11 @@ def pack(tmp_path, anymal, monkeypatch):
     heights[0] = np.random.default_rng(0).uniform(-4.0, 4.0, heights[0].shape)
     heights[2, :, 150:] = 0.5
     Path("pack").mkdir()
-    chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, mode=2)]
+    chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
     rows = rows_of(result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]]))
     abouts = [terrain.about | {"rates": {"base": row}} for terrain, row in zip(chosen, rows, strict=True)]
     content = {
         **identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base", "terrains": abouts,
-        "modes": [{"mode": mode, "ending": "base collision", "marked_by": "vel_x"} for mode in (1, 2)],
         "rates": {"base": rates_over_all(rows, abouts, 0)},
         "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), np.array([c.genes for c in chosen])),
     }  # fmt: skip
@@ -188,13 +187,13 @@ def test_a_pack_of_the_robot_before_it_changed_is_refused(pack, capsys):
 
 
 def test_rates_over_a_pack_are_means_with_families_drawn_together():
-    abouts = [{"family": family, "verdict": "fault", "mode": 1, "cause": None, "kind": "elite"} for family in (0, 0, 1)]
+    abouts = [{"family": family, "verdict": "fault", "cause": "ridge", "kind": "elite"} for family in (0, 0, 1)]
     rows = rows_of(result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]]))
     rates = rates_over_all(rows, abouts, 0)
     assert rates["goal_rate"] == pytest.approx(2 / 3) and rates["success_rate"] == pytest.approx((1 + 1 + 0.5) / 3)
     assert (rates["failing"], rates["terrains"], rates["failing_families"], rates["families"]) == (1, 3, 1, 2)
     assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
-    (line,) = rates_by_group(abouts, {"this": rows})["mode"]
+    (line,) = rates_by_group(abouts, {"this": rows})["cause"]
     assert (line["terrains"], line["failing"]) == (3, {"this": 1})
     assert line["goal_rate"]["this"] == pytest.approx(2 / 3)
     # An invalid terrain is in no rate.
@@ -217,7 +216,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     by_verdict = {line["verdict"]: line["failing"]["this"] for line in report["by"]["verdict"]}
     assert by_verdict == {"fault": 1, "near-fault": 0}
     shown = capsys.readouterr().out
-    assert "1 of 2" in shown and "1: base collision, vel_x" in shown
+    assert "1 of 2" in shown and "ridge" in shown
     assert not crosser.opened[0].reward and not crosser.opened[0].resolved
     whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **given)
     assert whole["rates"]["terrains"] == 3

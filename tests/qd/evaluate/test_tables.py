@@ -17,7 +17,7 @@ from tests.qd.evaluate.made import make_measured, make_report, make_set
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 ABOUT = {who: {"policy": f"{who}.pt", "sha256": sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))}
-NUMBERS = np.array([10, 3, 7, 5, 8])
+SET = replace(make_set("generated", 5), numbers=np.array([10, 3, 7, 5, 8]))
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +36,7 @@ def report(anymal):
 @pytest.fixture(scope="module")
 def certified(anymal):
     """Three controllers on four elites of a search against base, of which C-G certifies the first two."""
-    given = Certificates(
-        certifiers=("C-G", "S"), sha256=("a", "b"), given=np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool),
-        searched_sha256="f",
-    )  # fmt: skip
+    given = Certificates(("C-G", "S"), ("a", "b"), np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool), "f")
     goals = {"base": [4, 1, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
     row = {who: make_measured(counts, of=4) for who, counts in goals.items()}
     sets = {
@@ -55,10 +52,8 @@ def test_values_are_means_over_terrains(report):
     assert report["goal"]["generated"] == {"base": pytest.approx(1.25 / 3), "C-G": 0.5}
     assert report["reward"]["generated"] == {"base": pytest.approx((20 + 6.5 + 8) / 3), "C-G": 14.0}
     assert report["penalties"]["generated"]["base"] == {"yaw_rate": 0.0, "vel_x": 0.0}
-    assert report["invalid_terrains"]["generated"] == {"base": 0, "C-G": 1}
     assert report["outcomes"]["generated"]["C-G"]["invalid"] == 4
     assert report["terrains"] == {"hand_crafted": 3, "generated": 3}
-    assert report["reward_weights"]["tracking_lin_vel"] == 1.0 and report["reward_weights"]["only_positive"] is True
     for name in MEASURES:
         for chosen, row in report[name].items():
             for who, value in row.items():
@@ -79,8 +74,7 @@ def test_intervals_over_elites_are_over_families_of_kin(anymal):
     # Of four families 1 of 16 resamples has nothing but the two that fail; of ten terrains hardly any has 6 that do.
     assert of_kin["intervals"]["goal"]["generated"]["base"][0] == 0.0
     assert of_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
-    fates = of_kin["differences"]["generated"]["base -> C-G"]
-    assert fates["fine"]["interval"][0] == 0.0 and fates["gain"]["goal"]["interval"] == [0.0, 0.0]
+    assert of_kin["differences"]["generated"]["base -> C-G"]["gain"]["goal"]["interval"] == [0.0, 0.0]
 
 
 def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
@@ -99,30 +93,29 @@ def test_a_terrain_is_failed_below_half():
     # Goal rates                before: 0    .45  .5   .95  1
     #                           after:  1    .5   .45  .95  .1
     before, after = make_measured([0, 9, 10, 19, 20]), make_measured([20, 10, 9, 19, 2])
-    changes = difference(before, after, NUMBERS, 0)
+    changes = difference(before, after, SET, 0)
     assert [changes[fate].get("terrains") for fate in FATES] == [[3, 10], [], [7, 8], None]
     assert [changes[fate]["count"] for fate in FATES] == [2, 0, 2, 1] and changes["compared"] == 5
-    assert [changes[fate]["share"] for fate in FATES] == [0.4, 0.0, 0.4, 0.2]
     # .45 to .5 may be chance: the Wilson intervals are (.26, .66) and (.30, .70). 0 to 1 and 1 to .1 are not.
     assert (changes["mended"]["clear"], changes["newly_broken"]["clear"]) == (1, 1)
-    both = difference(make_measured([0, 9]), make_measured([9, 0]), NUMBERS[:2], 0)
-    assert both["still_failing"]["terrains"] == [3, 10] and both["still_failing"]["share"] == 1.0
+    both = difference(make_measured([0, 9]), make_measured([9, 0]), SET.rows(np.arange(2)), 0)
+    assert both["still_failing"]["terrains"] == [3, 10]
 
 
 def test_gains_are_means_of_differences_terrain_by_terrain():
     # Goal rates differ by +.5 on every terrain: no spread, however hard the terrains are.
     before, after = make_measured([0, 5, 10], reward=8.0), make_measured([10, 15, 20], reward=9.5)
-    gain = difference(before, after, NUMBERS[:3], 0)["gain"]
+    gain = difference(before, after, SET.rows(np.arange(3)), 0)["gain"]
     for name, value in (("goal", 0.5), ("reward", 1.5)):
         assert gain[name] == {"mean": pytest.approx(value), "interval": pytest.approx([value, value])}
 
 
 def test_a_terrain_invalid_to_one_is_not_compared():
     before, after = make_measured([0, 20, 0], bad=[0]), make_measured([20, 20, 20], bad=[2])
-    changes = difference(before, after, NUMBERS[:3], 0)
+    changes = difference(before, after, SET.rows(np.arange(3)), 0)
     assert changes["compared"] == 1 and [changes[fate]["count"] for fate in FATES] == [0, 0, 0, 1]
-    nothing = difference(make_measured([0], bad=[0]), make_measured([20]), NUMBERS[:1], 0)
-    assert nothing["compared"] == 0 and nothing["mended"]["share"] is None and nothing["gain"]["goal"]["mean"] is None
+    nothing = difference(make_measured([0], bad=[0]), make_measured([20]), SET.rows(np.arange(1)), 0)
+    assert nothing["compared"] == 0 and nothing["gain"]["goal"]["mean"] is None
 
 
 def test_mean_and_interval_of_a_kind_with_several():
@@ -164,14 +157,14 @@ def test_tables_are_read_as_they_were_written(certified, report, anymal, tmp_pat
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"goal": {"generated": {"base": "x", "C-G": 1.0}}}, "goal"),
         ({"certified_goal": {"generated": {"base": 1.0}}}, "certified_goal"),
-        ({"differences": {"generated": {"base -> C-G": {"compared": 4}}}}, "differences"),
+        ({"differences": None}, "differences"),
     ],
 )
 def test_what_are_no_tables_is_refused(report, change, field):
+    changed = {key: value for key, value in {**report, **change}.items() if value is not None}
     with pytest.raises(ValueError, match=field):
-        as_tables({**report, **change})
+        as_tables(changed)
 
 
 def test_the_terminal_shows_the_numbers(report, certified, capsys):
@@ -188,18 +181,10 @@ def test_the_terminal_shows_the_numbers(report, certified, capsys):
     assert "certified: 2 of 4 (C-G 2, S 0)" in shown and "too low" in shown and "too high" in shown
 
 
-def test_the_figure_shows_the_tables(report, certified):
-    figure = draw_tables(report)
-    _, success, reward = figure.axes
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["base", "C-G", "of that name in the paper"]
+def test_the_figure_shows_the_tables(report):
+    *_, reward = draw_tables(report).axes
     points = next(line for line in reward.lines if line.get_marker() == "s")
     np.testing.assert_allclose(points.get_ydata(), [report["reward"][name]["C-G"] for name in report["reward"]])
-    diamonds = next(line for line in success.lines if line.get_marker() == "D")
-    np.testing.assert_allclose(diamonds.get_ydata(), [98.0, 91.4])
-    *_, certified_axes = draw_tables(certified).axes
-    points = next(line for line in certified_axes.lines if line.get_marker() == "s")
-    assert points.get_ydata().tolist() == [75.0]
 
 
 def test_little_can_be_shown_too(anymal, capsys):
