@@ -4,7 +4,7 @@ Elites are grouped in two ways. Families: terrains that are much alike, so that 
 Causes: failing elites on which a part of the same kind stops the robot, such as a ridge.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -395,7 +395,12 @@ class Ranking:
 
 
 def rank(
-    archive: Archive, space: TerrainSpace, minima: MinimalTerrains | None = None, *, judged: bool = False
+    archive: Archive,
+    space: TerrainSpace,
+    minima: MinimalTerrains | None = None,
+    *,
+    judged: bool = False,
+    numbers: Sequence[int] | None = None,
 ) -> Ranking:
     """The ranking of an archive that has elites.
 
@@ -404,8 +409,10 @@ def rank(
         space: What their genes mean.
         minima: Their minimal terrains, which say best what the cause is.
         judged: Whether elites whose fresh episodes are invalid are left out.
+        numbers: Elites to rank alone, one a row; all if None.
     """
     elites = elites_of(archive, judged=judged)
+    elites = elites if numbers is None else elites.rows(np.searchsorted(elites.numbers, numbers))
     archive = archive.rows(elites.numbers)
     families = families_of(archive.genes, space) if archive.family is None else archive.family
     by_worst = {family: place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()].tolist()), 1)}

@@ -119,10 +119,13 @@ class PackFlags(WorkerFlags):
 class Export(ControllerFlags, EliteFlags):
     """Write terrains as files that other programs read, a pack of terrains, or a controller as ONNX.
 
-    For each elite it writes `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground
-    has them), `elite-N.png` (16-bit grayscale seen from above; scale and offset in `elite-N.json`), `elite-N.xml`
-    (MJCF: a scene of the terrain alone, whose surface is the simulation's, between the nodes too) and `elite-N.stl` (a
-    closed block). `faultline replay --terrain elite-N.npz`, or with the .png, crosses it again.
+    For each elite it writes `elite-N.xml` (MJCF: the terrain with start and goal, whose surface is the simulation's
+    between the nodes too), `elite-N.stl` (a closed block), `elite-N.glb` (the same with heights as colours),
+    `elite-N.sdf` (a model of the STL for Gazebo), `elite-N.npy` (heights as int16 in mm, x along the rows, as the
+    terrain generators of Isaac Lab and legged_gym take them), `elite-N.png` (16-bit grayscale seen from above) and
+    `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground has them). `elite-N.json`
+    has scales, start, goal, verdict, cause and ending, README.md says how MuJoCo, mjlab, Isaac Lab and Gazebo take the
+    files. `faultline replay --terrain elite-N.npz`, or with the .png, crosses it again.
 
     With --pack it makes a pack from a judged run: faults and near-faults, to test any controller on with `faultline
     evaluate --pack`. The terrains are spread over the ways in which the searched controller fails and over families of
@@ -133,10 +136,10 @@ class Export(ControllerFlags, EliteFlags):
     from_pack: str | None = None
     """Take the terrains of a pack instead of elites: its folder, or anymal or cassie for the published one. --elite
     counts its terrains, from 0; their files are called as the pack calls them."""
-    formats: tuple[str, ...] = ("npz", "png", "xml", "stl")
-    """Which of npz, png, xml and stl to write; several may stand in one, apart by spaces."""
+    formats: tuple[str, ...] = ("npz", "png", "npy", "xml", "stl", "glb", "sdf")
+    """Which to write; several may stand in one, apart by spaces."""
     overwrite: bool = False
-    """Replace files of an earlier export; without it the command refuses to."""
+    """Replace files of an earlier export, or the ONNX file; without it the command refuses to."""
     pack: bool = False
     """Make a pack from the run."""
     onnx: Path | None = None
@@ -157,7 +160,7 @@ class Export(ControllerFlags, EliteFlags):
         if sum([self.pack, self.from_pack is not None, self.onnx is not None]) > 1:
             raise ValueError("give one of --pack, --from-pack and --onnx")
         if self.onnx is not None:
-            export_controller(self.policy, get_robot(self.robot or "anymal"), self.onnx)
+            export_controller(self.policy, get_robot(self.robot or "anymal"), self.onnx, overwrite=self.overwrite)
             return
         if self.pack:
             self._make_pack()

@@ -12,6 +12,8 @@ from tqdm import tqdm
 
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
+from qd.groups import VERDICTS, Ranking, rank
+from qd.minima import read_minimal
 from qd.run.directory import RUNS, folder_for
 from qd.show.elites import OpenedRun
 from sim.bank import terrains_of
@@ -19,7 +21,7 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
 from sim.files.records import provenance
 from sim.ground import GroundMaps
-from sim.maps.terrain_files import check_formats, write_terrain
+from sim.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.robots.find import robot_of
@@ -27,7 +29,8 @@ from sim.robots.robot import RobotCfg
 
 INDEX_FILE = "index.json"
 """What was exported, in the folder of the files."""
-FORMATS = ("npz", "png", "xml", "stl")
+README_FILE = "README.md"
+"""How other programs take the files, beside it."""
 _FOLDER = "terrains"
 _AT_ONCE = 32  # terrains rasterised
 
@@ -50,6 +53,8 @@ class Source:
     """Where they come from, for every file."""
     named: dict[str, Any]
     """The same for the index alone."""
+    timestep: float
+    """Physics step of the robot [s]."""
     ground: tuple[str, ...] = ()
     """What the terrains have maps of beside heights."""
 
@@ -59,20 +64,23 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | No
     archive, space = opened_run.archive, opened_run.space
     terrains = opened_run.terrains(elite, minimal)
     genes = np.stack([terrain.genes for terrain in terrains])
+    minima = read_minimal(opened_run.folder, archive)
+    ranking = rank(archive, space, minima, numbers=[terrain.number for terrain in terrains])
     return Source(
         folder=folder_for(opened_run.path, opened_run.robot.name)
         / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
         stems=[terrain.stem for terrain in terrains],
         about=[
-            about_elite(archive, terrain.number)
+            about_elite(ranking, row, archive)
             | ({"minimal": terrain.minimal} if terrain.minimal else {})
             | {"terrain": space.describe(terrain.genes)}
-            for terrain in terrains
+            for row, terrain in enumerate(terrains)
         ],
         genes=genes,
         heights=lambda part: terrains_of(genes[part], space),
         origin={"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256},
         named=archive.named(),
+        timestep=opened_run.robot.physics_dt,
         ground=space.ground,
     )
 
@@ -91,11 +99,12 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
         heights=lambda part: (pack.heights[rows[part]], None),
         origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
         named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+        timestep=of_robot.physics_dt,
     )
 
 
 def export_terrains(
-    source: Source, *, formats: Sequence[str] = FORMATS, out: Path | None = None, overwrite: bool = False
+    source: Source, *, formats: Sequence[str] = tuple(FORMATS), out: Path | None = None, overwrite: bool = False
 ) -> list[Path]:
     """Writes terrains as files that other programs read."""
     formats, folder = list(dict.fromkeys(formats)), out or source.folder
@@ -116,26 +125,58 @@ def export_terrains(
             grids, maps = source.heights(part)
             for k, heights in enumerate(grids):
                 about, stem = source.about[first + k], source.stems[first + k]
-                files += write_terrain(
-                    folder / stem, heights, formats=formats, about={**about, **origin}, genes=source.genes[first + k],
+                terrain = ExportedTerrain(
+                    heights=heights, name=stem, genes=source.genes[first + k], timestep=source.timestep,
                     ground=None if maps is None else maps[k : k + 1],
                 )  # fmt: skip
+                files += write_terrain(folder, terrain, formats=formats, about={**about, **origin})
                 index.append({**about, "files": stem})
                 bar.update()
-    files.append(folder / INDEX_FILE)
+    files += [folder / README_FILE, folder / INDEX_FILE]
+    write_atomically(files[-2], readme_of(source.stems[0], formats).encode())
     write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
     print(f"{count} terrain{'s' * (count != 1)} as {', '.join(formats)}: {folder}")
     return files
 
 
-def export_controller(policy: str | None, robot: RobotCfg, out: Path) -> None:
+_README = """# Terrains of faultline
+
+x runs along the course (0 to 16 m), y across it (0 to 8 m), z up. Robots start at (2, 4) and walk to (14, 4).
+`STEM.json` says what the numbers in its files mean and what is known of the terrain; `index.json` lists all terrains.
+The line of MuJoCo is tested, the others follow the sources of these programs.
+
+"""
+_PROGRAMS = (
+    ("MuJoCo", "xml", "`python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file("
+     "'STEM.xml')`, `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`"),
+    ("mjlab", "xml", "`SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach("
+     "mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`"),
+    ("Isaac Lab", "stl", "`import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or "
+     "`scripts/tools/convert_mesh.py` for a USD file"),
+    ("Isaac Lab's and legged_gym's generators", "npy", "`convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, "
+     "0.001)` (x along the rows); it cuts cells along the other diagonal, so between nodes the mesh is truer"),
+    ("Gazebo", "sdf", "`gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world"),
+)  # fmt: skip
+"""How programs take the files, and the format that it needs."""
+
+
+def readme_of(stem: str, formats: Sequence[str]) -> str:
+    """How other programs take the files of a terrain, a line each."""
+    lines = [f"- **{program}**: {words}\n" for program, ending, words in _PROGRAMS if ending in formats]
+    return (_README + "".join(lines)).replace("STEM", stem)
+
+
+def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwrite: bool = False) -> None:
     """Writes a robot's controller, an rsl_rl checkpoint or by default the shipped one, as one ONNX file."""
+    if out.exists() and not overwrite:
+        raise ValueError(f"{out} exists: give --overwrite to replace it, or another --onnx")
     export_onnx(load_checkpoint(policy or robot.policy_file, robot), out)
     print(f"Controller: {out}")
 
 
-def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
-    """An elite's numbers as JSON values: as found, and under ``fresh`` what 40 fresh episodes say, None if none did."""
+def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
+    """An elite's verdict, cause, ending and numbers as JSON values: as found, and as 40 fresh episodes say, if any."""
+    elite, elites = int(ranking.elites.numbers[row]), ranking.elites
     names = ("fitness", "collision_rate", "goal_rate", "fallen_rate", "episodes")
 
     def numbers(values: Any) -> dict[str, Any]:
@@ -145,6 +186,10 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
     return {
         "robot": archive.robot,
         "elite": elite,
+        "verdict": VERDICTS[elites.verdict[row]] or "not failing",
+        "cause": ranking.causes[row] or None,
+        "ending": elites.ending(row)[0] if elites.failing[row] else "crossed",
+        "in_words": ranking.name(row),
         "iteration": int(archive.iteration[elite]),
         **numbers(archive),
         "fresh": None if archive.fresh is None else numbers(archive.fresh),
@@ -152,7 +197,8 @@ def about_elite(archive: Archive, elite: int) -> dict[str, Any]:
 
 
 def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
-    replaced = sorted(file.name for file in folder.glob("*") if file.name == INDEX_FILE or file.stem in stems)
+    written = (INDEX_FILE, README_FILE)
+    replaced = sorted(file.name for file in folder.glob("*") if file.name in written or file.stem in stems)
     if replaced:
         names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")

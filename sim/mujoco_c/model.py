@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
-from sim.maps.terrain_files import Margins, as_hfield
+from sim.maps.hfield import Margins, as_hfield
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
+from sim.maps.hfield import as_hfield
 from sim.maps.picture import tinted
-from sim.maps.terrain_files import as_hfield
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, robot_spec
 from sim.terrain import SPACING
@@ -86,7 +86,7 @@ def scene_model(
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
     texture = model.texture(_GROUND)
     first = int(texture.adr[0])
-    # The asset lies on its side (sim.maps.terrain_files): the rows of its texture run along x, its columns along y.
+    # The asset lies on its side (sim.maps.hfield): the rows of its texture run along x, its columns along y.
     model.tex_data[first : first + paint.size] = paint.swapaxes(0, 1).ravel()
     return model
 

@@ -1,5 +1,6 @@
 """Terrains as files for other programs: what is in them, and what is refused."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from qd.archive import write_archive
 from qd.show.elites import open_run
-from qd.show.export import export_terrains, source_of_archive
+from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
 from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
 from tests.builders import fresh_values, small_archive
@@ -21,7 +22,8 @@ def run(tmp_path, monkeypatch):
     folder = Path("runs/anymal-small-0")
     folder.mkdir(parents=True)
     archive = small_archive(3)
-    write_archive(folder / "archive.npz", archive.corrected_by(fresh_values(archive)))
+    fresh = dataclasses.replace(fresh_values(archive), goal_rate=np.array([0.1, 0.2, 0.9]))
+    write_archive(folder / "archive.npz", dataclasses.replace(archive, fresh=fresh))
     return folder
 
 
@@ -32,8 +34,8 @@ def export(elite, **options):
 def test_elites_are_exported_as_the_simulation_has_them(run):
     archive = open_run("anymal", run).archive
     files, folder, elites = export("2 1 0"), run / "terrains", (2, 1, 0)
-    endings = ("npz", "png", "xml", "stl", "json")
-    expected = [*(f"elite-{k}.{ending}" for k in elites for ending in endings), "index.json"]
+    endings = ("npz", "png", "npy", "xml", "stl", "glb", "sdf", "json")
+    expected = [*(f"elite-{k}.{ending}" for k in elites for ending in endings), "README.md", "index.json"]
     assert [path.name for path in files] == expected and sorted(expected) == sorted(p.name for p in folder.iterdir())
     for elite in elites:
         heights = heights_of(archive.genes[elite : elite + 1])[0]
@@ -46,23 +48,37 @@ def test_elites_are_exported_as_the_simulation_has_them(run):
         assert about["fitness"] == archive.fitness[elite] and about["fresh"]["episodes"] == 40
         assert about["ratios"] == dict(zip(archive.penalties, archive.ratios[elite].tolist(), strict=True))
         assert {"command", "commit", "versions", "date", "run"} <= about.keys() and "seed" not in about
+        assert about["verdict"] == ("not failing" if elite == 2 else "failing")
+        assert (about["cause"] is None) == (about["ending"] == "crossed") == (elite == 2)
+        assert about["in_words"].startswith("crossed, 36 of 40" if elite == 2 else f"{about['cause']}: ")
     index = json.loads((folder / "index.json").read_text())
     assert [(row["elite"], row["files"]) for row in index["elites"]] == [(k, f"elite-{k}") for k in elites]
 
 
-def test_mistakes_are_refused_before_anything_is_written(run):
-    with pytest.raises(ValueError, match="formats"):
-        export("0", formats=("obj",))
-    assert not list(run.rglob("elite-*"))
-
-
 def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
-    (file, _, index) = export("0", formats=("npz",), out=Path("out"))
+    (file, _, _, readme, index) = export("0", formats=("npz", "xml"), out=Path("out"))
     assert file == Path("out/elite-0.npz")
+    # A line for each program that can take the files.
+    assert "--mjcf=elite-0.xml" in readme.read_text() and "Gazebo" not in readme.read_text()
     file.write_bytes(b"mine")
-    index.unlink()
+    (index.unlink(), readme.unlink())
     with pytest.raises(ValueError, match="overwrite"):
         export("0", formats=("npz",), out=Path("out"))
     assert file.read_bytes() == b"mine"
     export("0", formats=("npz",), out=Path("out"), overwrite=True)
     assert file.read_bytes() != b"mine"
+
+
+def test_a_pack_is_exported_with_what_it_knows(tmp_path):
+    source = source_of_pack("anymal", "3")
+    (*_, about, _, _) = export_terrains(source, formats=("xml",), out=tmp_path)
+    content = json.loads(about.read_text())
+    assert content["verdict"] == "fault" and content["start"][:2] == [2, 4] and content["pack"] == "pack"
+
+
+def test_a_controller_is_not_replaced_silently(anymal, tmp_path):
+    out = tmp_path / "mine.onnx"
+    out.write_bytes(b"mine")
+    with pytest.raises(ValueError, match="overwrite"):
+        export_controller(None, anymal, out)
+    assert out.read_bytes() == b"mine"

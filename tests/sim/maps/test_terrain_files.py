@@ -1,15 +1,21 @@
 """Terrains for other programs: what they read is the ground that the robots of the simulation stand on."""
 
+import io
 import json
+import warnings
+import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from sim.ground import GroundMaps
 from sim.maps.heightmap import as_terrain, read_heightmap
-from sim.maps.terrain_files import FORMATS, as_hfield, mjcf_of, stl_of, triangles_of, write_terrain
+from sim.maps.hfield import as_hfield
+from sim.maps.terrain_files import FORMATS, ExportedTerrain, block_of, glb_of, mjcf_of, npy_of, stl_of, write_terrain
+from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 
@@ -25,7 +31,7 @@ def rough():
 def ray_heights(heights, tmp_path, points):
     """Where rays from above meet the exported scene."""
     path = tmp_path / "terrain.xml"
-    path.write_bytes(mjcf_of(heights))
+    path.write_bytes(mjcf_of(ExportedTerrain(heights=heights)))
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -47,6 +53,24 @@ def test_rays_meet_the_exported_scene_where_the_simulations_surface_is(rough, tm
     assert ray_heights(FLAT, tmp_path, [(8.0, 4.0)]) == pytest.approx([0.2], abs=1e-5)
 
 
+def test_a_scene_has_the_simulations_options_and_takes_its_robots(rough):
+    scene = mujoco.MjSpec.from_string(mjcf_of(ExportedTerrain(heights=rough, timestep=0.002)).decode())
+    model = scene.compile()
+    assert model.opt.timestep == 0.002 and model.opt.gravity.tolist() == [0, 0, -9.81] and model.nlight == 1
+    assert model.site("start").pos.tolist() == pytest.approx([2, 4, rough[80, 40]])
+    assert model.site("goal").pos.tolist() == pytest.approx([14, 4, rough[80, 280]])
+    scene = mujoco.MjSpec.from_string(mjcf_of(ExportedTerrain(heights=FLAT)).decode())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of options that differ
+        robot = mujoco.MjSpec.from_file(str(ROBOTS["anymal"].model_file))
+        scene.attach(robot, prefix="robot/", frame=scene.worldbody.add_frame(pos=(2, 4, 0.25)))
+    model = scene.compile()
+    data = mujoco.MjData(model)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    assert 0.2 < data.xpos[1, 2] - 0.2 < 0.7  # it has come down on the ground, and not through it
+
+
 def test_a_margin_continues_the_edge(rough):
     plain, wide = as_hfield(rough), as_hfield(rough, margin=((10, 20), (30, 40)))
     assert wide.data.shape == (NUM_COLS + 70, NUM_ROWS + 30)
@@ -60,7 +84,8 @@ def test_a_margin_continues_the_edge(rough):
 @pytest.mark.parametrize("flat", [False, True])
 def test_an_image_reads_back_within_half_a_gray_level(rough, tmp_path, flat):
     heights = FLAT if flat else rough
-    (path, _) = write_terrain(tmp_path / "a", heights, formats=["png"], about={"robot": "anymal"})
+    terrain = ExportedTerrain(heights=heights, name="a")
+    (path, _) = write_terrain(tmp_path, terrain, formats=["png"], about={"robot": "anymal"})
     meaning = json.loads((tmp_path / "a.json").read_text())
     gray = np.asarray(Image.open(path))
     assert gray.dtype == np.uint16 and gray.shape == (NUM_ROWS, NUM_COLS)
@@ -69,18 +94,23 @@ def test_an_image_reads_back_within_half_a_gray_level(rough, tmp_path, flat):
     read = meaning["offset_m"] + scale * gray[::-1].astype(np.float64)  # the topmost row is the highest y
     np.testing.assert_allclose(read, heights, rtol=0, atol=0.5 * scale * (1 + 1e-6))
     assert meaning["size_m"] == pytest.approx([16, 8]) and meaning["nodes"] == [161, 321]
-    assert meaning["robot"] == "anymal"
+    assert meaning["robot"] == "anymal" and meaning["goal"] == pytest.approx([14, 4, heights[80, 280]])
     # Our own reader says the same.
     np.testing.assert_allclose(as_terrain(read_heightmap(path)), heights, rtol=0, atol=0.51 * scale + 1e-7)
 
 
-def test_an_npz_is_the_grid_itself(rough, tmp_path):
+def test_an_npz_is_the_grid_itself_and_an_sdf_a_static_model_of_the_mesh(rough, tmp_path):
     genes = np.linspace(-1, 1, 64, dtype=np.float32)
     patches = np.random.default_rng(2).uniform(0.4, 0.9, (2, 1, 4, 8)).astype(np.float32)
     ground = GroundMaps(friction=patches[0], time_constant_s=0.05 * patches[1])
     formats = list(FORMATS)
-    paths = write_terrain(tmp_path / "elite-0.1", rough, formats=formats, about={}, genes=genes, ground=ground)
-    assert [path.name for path in paths] == [f"elite-0.1.{ending}" for ending in ("npz", "png", "xml", "stl", "json")]
+    terrain = ExportedTerrain(heights=rough, name="elite-0.1", genes=genes, ground=ground)
+    paths = write_terrain(tmp_path, terrain, formats=formats, about={})
+    assert [path.name for path in paths] == [f"elite-0.1.{ending}" for ending in (*formats, "json")]
+    model = ET.parse(tmp_path / "elite-0.1.sdf").getroot().find("model")
+    assert model.get("name") == "elite-0.1" and model.findtext("static") == "true"
+    uris = [model.findtext(f"link/{part}/geometry/mesh/uri") for part in ("collision", "visual")]
+    assert uris == ["elite-0.1.stl"] * 2
     with np.load(paths[0]) as content:
         np.testing.assert_array_equal(content["heights"], rough)
         np.testing.assert_array_equal(content["genes"], genes)
@@ -90,43 +120,41 @@ def test_an_npz_is_the_grid_itself(rough, tmp_path):
     np.testing.assert_array_equal(heightmap.ground.time_constant_s, ground.time_constant_s)
 
 
-def test_an_stl_is_a_closed_block_with_the_terrain_on_top(rough):
+def test_an_npy_is_what_terrain_generators_hold(rough):
+    whole = np.load(io.BytesIO(npy_of(ExportedTerrain(heights=rough))))
+    assert whole.dtype == np.int16 and whole.shape == (NUM_COLS, NUM_ROWS)  # x along the rows
+    np.testing.assert_allclose(0.001 * whole[30, 7], rough[7, 30], atol=0.00051)
+    with pytest.raises(ValueError, match="npy"):
+        npy_of(ExportedTerrain(heights=FLAT + 40.0))
+
+
+def test_a_mesh_is_a_closed_block_with_the_simulations_surface_on_top(rough):
     small = rough[:9, :13]
-    data = stl_of(small)
-    count = int(np.frombuffer(data, "<u4", 1, 80)[0])
-    assert len(data) == 84 + 50 * count
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    records = np.frombuffer(data, record, count, 84)
-    corners = records["corners"].astype(np.float64)
-    # Closed: every edge is walked once in each direction.
-    walked = {}
-    for triangle in np.round(corners, 6):
-        ring = [tuple(corner) for corner in triangle]
-        for k in range(3):
-            edge = ring[k], ring[(k + 1) % 3]
-            walked[edge] = walked.get(edge, 0) + 1
-    assert set(walked.values()) == {1}
-    assert all((end, start) in walked for start, end in walked)
-    # Outside out: the volume is that between the terrain and the bottom, half a metre below its lowest point.
-    volume = np.einsum("ni,ni->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    mesh = trimesh.load(io.BytesIO(stl_of(ExportedTerrain(heights=small))), file_type="stl", force="mesh")
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    # The volume between the terrain and the bottom, half a metre below its lowest point.
     cells = [small[:-1, :-1], small[:-1, 1:], small[1:, :-1], small[1:, 1:]]
     ends, cut = (cells[0] + cells[3]).astype(float), (cells[1] + cells[2]).astype(float)
     above = SPACING**2 * ((ends + 2 * cut) / 6 - small.min() + 0.5).sum()
-    assert volume == pytest.approx(above, rel=1e-4)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    np.testing.assert_allclose(records["normal"], normals, atol=2e-3)
-    assert (records["normal"][: 2 * 8 * 12, 2] > 0).all()
-
-
-def test_the_top_of_an_stl_is_the_simulations_surface(rough):
-    top = triangles_of(rough)[: 2 * (NUM_ROWS - 1) * (NUM_COLS - 1)]
+    assert mesh.volume == pytest.approx(above, rel=1e-4)
+    top = block_of(rough).triangles[: 2 * (NUM_ROWS - 1) * (NUM_COLS - 1)]
     for x, y, z in top.mean(axis=1)[::997]:
         assert z == pytest.approx(oracle.surface_height(rough, SPACING, x, y), abs=1e-6)
 
 
+def test_a_glb_stands_upright_and_is_coloured_by_height():
+    heights = np.zeros((9, 13), np.float32)
+    heights[:, 6:] = 1.0
+    scene = trimesh.load(io.BytesIO(glb_of(ExportedTerrain(heights=heights))), file_type="glb")
+    (mesh,) = scene.geometry.values()
+    # 0.6 m along x, -0.5 to 1 m along y, which is up in glTF, and 0.4 m along -z.
+    np.testing.assert_allclose(scene.bounds, [[0.0, -0.5, -0.4], [0.6, 1.0, 0.0]], atol=1e-6)
+    colors = mesh.visual.vertex_colors[: 9 * 13].reshape(9, 13, 4)
+    assert len(np.unique(colors.reshape(-1, 4), axis=0)) == 2 and (colors[:, 5] != colors[:, 6]).any(axis=1).all()
+
+
 def test_unknown_formats_are_refused(tmp_path):
-    for formats in ([], ["npz", "gif"]):
+    for formats in ([], ["npz", "gif"], ["sdf"]):  # an SDF needs its mesh
         with pytest.raises(ValueError, match="formats"):
-            write_terrain(tmp_path / "a", FLAT, formats=formats, about={})
+            write_terrain(tmp_path, ExportedTerrain(heights=FLAT), formats=formats, about={})
     assert list(tmp_path.iterdir()) == []

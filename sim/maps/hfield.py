@@ -1,0 +1,56 @@
+"""A height grid as a heightfield of MuJoCo's, with the same surface.
+
+MuJoCo cuts every cell of a heightfield from its (low x, low y) to its (high x, high y) corner, for contacts as for
+rays; ours are cut from (low x, high y) to (high x, low y) (:mod:`kernels.heightfield`). On a grid that is turned by a
+quarter the one cut is the other, so our grids are handed over on their side, their columns along MuJoCo's rows: then
+both have the same surface, between the nodes too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.terrain import SPACING
+
+LEAST_EXTENT = 1e-3
+"""Of flat ground, whose range is 0 where a size or scale may not be [m]."""
+_QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hfield:
+    """What an ``hfield`` asset and the ``geom`` that shows it need; world axes are those of the height grid."""
+
+    data: NDArray[np.float64]
+    """0 to 1, as in ``MjModel.hfield_data``; an asset's ``elevation`` has its rows in reverse."""
+    size: tuple[float, float, float, float]
+    """Half lengths along the asset's x and y, height of data 1, thickness below data 0 [m]."""
+    position: tuple[float, float, float]
+    """Of the geom [m]."""
+    quaternion: tuple[float, float, float, float] = _QUARTER_TURN
+    """Of the geom, w x y z: its x axis is the grid's y, its y axis the grid's -x."""
+
+
+Margins = tuple[tuple[int, int], tuple[int, int]]
+"""Nodes to add at low y and high y, and at low x and high x."""
+
+
+def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thickness: float = 1.0) -> Hfield:
+    """A height grid as a heightfield with the same surface.
+
+    Args:
+        heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
+        margin: Nodes of edge height to add, on every side or on each.
+        thickness: Of the ground below its lowest point [m].
+    """
+    margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
+    grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")
+    lowest, extent = float(grid.min()), float(np.ptp(grid)) or LEAST_EXTENT
+    half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
+    (low_y, _), (low_x, _) = margins
+    return Hfield(
+        data=((grid - lowest) / extent).T[::-1],
+        size=(half_y, half_x, extent, thickness),
+        position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
+    )
