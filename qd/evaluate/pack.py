@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,15 +52,15 @@ GROUPS = ("verdict", "cause", "kind")
 
 _MAX_BYTES = 1e9  # of an array that is read
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
-_TESTED = "this"  # the controller that is tested, beside the pack's
+_RATES = ("goal", "success", "fallen")
 
-Row = dict[str, Any]
-"""What a controller made of one terrain, as JSON values; rates are None on an invalid one."""
+About = dict[str, Any]
+"""What is known of one terrain, as JSON values; ``rates`` by controller."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pack:
-    """A pack as its files have it."""
+    """A pack of N terrains as its files have it."""
 
     folder: Path
     heights: NDArray[np.float32]
@@ -71,22 +71,13 @@ class Pack:
     """Of ``pack.json``."""
 
     @property
-    def terrains(self) -> list[dict[str, Any]]:
+    def terrains(self) -> list[About]:
         """What is known of each."""
         return self.content["terrains"]
 
     def __len__(self) -> int:
         """N."""
         return len(self.heights)
-
-
-class Candidate(NamedTuple):
-    """A terrain that may be chosen."""
-
-    genes: NDArray[np.float32]
-    """Shape (num_genes,)."""
-    about: dict[str, Any]
-    """What is known of it, as JSON values."""
 
 
 def evaluate_pack(
@@ -110,7 +101,7 @@ def evaluate_pack(
     count, episodes = sizes_for(compute, terrains, episodes, full=full, small=(min(24, len(pack)), 4))
     check_policy(policy, robot, compute.device)
     chosen = pack_set(pack.heights, min(count, len(pack)), seed)
-    abouts = pack.terrains[: len(chosen)]
+    known = pack.terrains[: len(chosen)]
     controller = crosser_name(robot, policy)
 
     def measure() -> dict[str, Any]:
@@ -118,18 +109,17 @@ def evaluate_pack(
             {controller: policy}, {"pack": chosen}, robot=robot, compute=compute, episodes=episodes,
             cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )["pack"][controller]  # fmt: skip
-        rows = rows_of(result)
-        beside = {name: [about["rates"][name] for about in abouts] for name in pack.content["rates"]}
+        abouts = with_rates(known, {"this": result})
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
         return {
             **origin_of(compute.device, seed, compute.workers),
             **identity(robot, policy),
             "episodes": episodes,
             "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": len(pack)},
-            "rates": rates_over_all(rows, abouts, seed),
-            "beside": {name: rates_over_all(of_controller, abouts, seed) for name, of_controller in beside.items()},
-            "by": rates_by_group(abouts, {_TESTED: rows, **beside}),
-            "terrains": [about | {"rates": {_TESTED: row}} for about, row in zip(abouts, rows, strict=True)],
+            "rates": rates_over_all(abouts, "this", seed),
+            "beside": {name: rates_over_all(known, name, seed) for name in pack.content["rates"]},
+            "by": {group: failing_by(group, abouts, "this") for group in GROUPS},
+            "terrains": abouts,
         }
 
     return publish(out or RUNS / f"{controller}-pack.json", measure, show_pack_test)
@@ -178,8 +168,8 @@ def make_pack(
         The content of ``pack.json``.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
-    cfg, body, searched, archive = search.cfg, search.robot, search.policy, search.read_archive()
-    drawn_in = get_space(cfg.space, cfg.space_sha256)
+    body, searched, archive = search.robot, search.policy, search.read_archive()
+    drawn_in = get_space(search.cfg.space, search.cfg.space_sha256)
     controllers = {**(controllers or {"base": str(body.policy_file), **certifiers_of(search)})}
     if not any(is_same(searched, other) for other in controllers.values()):
         controllers = {"searched": searched, **controllers}
@@ -187,13 +177,13 @@ def make_pack(
         check_policy(other, body, compute.device)
     _check_judged(archive, run)
     candidates, not_passable = candidates_of(archive, run)
-    chosen = choose_terrains(candidates, size)
+    chosen = choose_terrains([about for about, _ in candidates], size)
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
     print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
     if drawn_in.ground:
         raise ValueError(f"a pack holds heights alone, got terrains of {drawn_in.name}, which have ground of their own")
-    abouts, genes = [terrain.about for terrain in chosen], np.array([terrain.genes for terrain in chosen], np.float32)
+    genes = np.array([candidates[place][1] for place in chosen], np.float32)
     heights = round_heights(heights_of(genes, drawn_in))
     out = out or RUNS / f"{body.name}-pack"
     prepare_output(out / TERRAINS_FILE)
@@ -203,12 +193,12 @@ def make_pack(
             controllers, {"pack": pack_set(heights, len(heights), seed)}, robot=body, compute=compute,
             episodes=episodes, cache=crossings_folder(body), open_evaluator=open_evaluator,
         )["pack"]  # fmt: skip
-        rows = {controller: rows_of(result) for controller, result in crossed.items()}
+        abouts = with_rates([candidates[place][0] for place in chosen], crossed)
         return {
             **origin_of(compute.device, seed, compute.workers),
             **identity(body, searched),
-            "space": cfg.space,
-            "space_sha256": cfg.space_sha256,
+            "space": search.cfg.space,
+            "space_sha256": search.cfg.space_sha256,
             "episodes": episodes,
             "searched": next(name for name, other in controllers.items() if is_same(other, searched)),
             "iterations": archive.iterations,
@@ -216,13 +206,9 @@ def make_pack(
             "candidates": len(candidates),
             "not_known_to_be_passable": not_passable,
             "controllers": about_controllers(controllers, body),
-            "rates": {name: rates_over_all(of_controller, abouts, seed) for name, of_controller in rows.items()},
-            "by": rates_by_group(abouts, rows),
+            "rates": {name: rates_over_all(abouts, name, seed) for name in controllers},
             "terrains_sha256": write_terrains(out, heights, genes),
-            "terrains": [
-                about | {"rates": {name: of_controller[place] for name, of_controller in rows.items()}}
-                for place, about in enumerate(abouts)
-            ],
+            "terrains": abouts,
         }
 
     return publish(out / PACK_FILE, measure, show_pack)
@@ -240,21 +226,21 @@ def _check_judged(archive: Archive, run: Path) -> None:
         )
 
 
-def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
+def candidates_of(archive: Archive, run: Path) -> tuple[list[tuple[About, NDArray[np.float32]]], int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
     Returns:
-        The terrains, and how many failing elites and minimal terrains are left out: nobody is known to cross them.
+        What is known of each with its genes, and how many failing elites and minimal terrains are left out, since
+        nobody is known to cross them.
     """
     assert archive.fresh is not None
     space, minima = get_space(archive.space, archive.space_sha256), read_minimal(run, archive)
     rate = archive.fresh.goal_rate
     near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
-    passable = archive.certified | (rate >= FAILING_GOAL_RATE)
     families = dict(zip(near.tolist(), families_of(archive.genes[near], space).tolist(), strict=True))
     causes = rank(archive, space, minima).causes if len(near) else ()
 
-    def about(number: int, parts: list[int] | None, verdict: str, **known: Any) -> dict[str, Any]:
+    def about(number: int, parts: list[int] | None, verdict: str, **known: Any) -> About:
         return {
             "name": f"elite-{number}{'' if parts is None else '-minimal'}",
             "kind": "elite" if parts is None else "minimal",
@@ -270,11 +256,11 @@ def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
 
     candidates, not_passable = [], 0
     for number in near.tolist():
-        if passable[number]:
+        if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
             known = {"searched": rate_of(fresh_counts(archive, number)), **judgement(archive, number)}
-            terrain = about(number, None, verdict_of(archive, number), **known)
-            candidates.append(Candidate(archive.genes[number], terrain))
-        not_passable += not passable[number]
+            candidates.append((about(number, None, verdict_of(archive, number), **known), archive.genes[number]))
+        else:
+            not_passable += 1
     for entry in minima.numbers["elites"] if minima else ():
         number = entry["elite"]
         if not archive.failing[number] or len(entry["bumps"]) == entry["of"]:
@@ -282,30 +268,31 @@ def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
         if minima and entry["certificates"]:
             searched = {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")}
             known = {"searched": searched, "resolved": entry["resolved"], "certificates": entry["certificates"]}
-            terrain = about(number, entry["bumps"], entry["verdict"], **known)
-            candidates.append(Candidate(minima.genes[number], terrain))
-        not_passable += not entry["certificates"]
-    return candidates, int(not_passable)
+            candidates.append((about(number, entry["bumps"], entry["verdict"], **known), minima.genes[number]))
+        else:
+            not_passable += 1
+    return candidates, not_passable
 
 
-def choose_terrains(candidates: Sequence[Candidate], size: int) -> list[Candidate]:
-    """Some of the candidates, so that each beginning of the list is spread as well as can be.
+def choose_terrains(abouts: Sequence[About], size: int) -> list[int]:
+    """Places of some candidates, so that each beginning of the list is spread as well as can be.
 
     Next comes a fault before a near-fault, then one of the family that was chosen least often, of the cause that was,
     of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
     """
-    left, chosen = list(candidates), list[Candidate]()
+    left, chosen = list(range(len(abouts))), list[int]()
     counts = {name: Counter[Any]() for name in ("family", "cause", "kind")}
 
-    def turn(candidate: Candidate) -> tuple[Any, ...]:
-        about = candidate.about
+    def turn(place: int) -> tuple[Any, ...]:
+        about = abouts[place]
         often = (count[about[name]] for name, count in counts.items())
         return about["verdict"] != "fault", *often, about["searched"]["goal_rate"], about["elite"], about["kind"]
 
     while left and len(chosen) < size:
-        chosen.append(left.pop(min(range(len(left)), key=lambda place: turn(left[place]))))
+        chosen.append(min(left, key=turn))
+        left.remove(chosen[-1])
         for name, count in counts.items():
-            count[chosen[-1].about[name]] += 1
+            count[abouts[chosen[-1]][name]] += 1
     return chosen
 
 
@@ -315,24 +302,29 @@ def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     return TerrainSet(name="pack", terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
 
 
-def rows_of(result: RolloutResult) -> list[Row]:
-    """What crossings say of each terrain: rates, the goal rate with its interval (Wilson), and valid episodes."""
-    counted, rates = counted_episodes(result.invalid), terrain_rates(result)
-    hits, valid = (result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist()
-    return [
-        {f"{name}_rate": None if np.isnan(values[place]) else float(values[place]) for name, values in rates.items()}
-        | {"goal_interval": list(wilson_interval(hits[place], valid[place])), "valid_episodes": valid[place]}
-        for place in range(len(valid))
-    ]
+def with_rates(abouts: Sequence[About], crossed: Mapping[str, RolloutResult]) -> list[About]:
+    """What is known of terrains with the ``rates`` of controllers, None on an invalid terrain.
+
+    Each controller has three rates, the interval of the goal rate (Wilson), and how many episodes are valid.
+    """
+    of_all: list[dict[str, Any]] = [{} for _ in abouts]
+    for controller, result in crossed.items():
+        counted, rates = counted_episodes(result.invalid), terrain_rates(result)
+        hits, valid = (result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist()
+        for place, row in enumerate(of_all):
+            values = {f"{name}_rate": float(values[place]) if valid[place] else None for name, values in rates.items()}
+            interval = list(wilson_interval(hits[place], valid[place]))
+            row[controller] = values | {"goal_interval": interval, "valid_episodes": valid[place]}
+    return [about | {"rates": rates} for about, rates in zip(abouts, of_all, strict=True)]
 
 
-def _rates(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
+def _rates(abouts: Sequence[About], controller: str, name: str) -> NDArray[np.float64]:
     """A rate on each terrain; NaN on an invalid one."""
-    return np.array([row[f"{name}_rate"] for row in rows], np.float64)
+    return np.array([about["rates"][controller][f"{name}_rate"] for about in abouts], np.float64)
 
 
-def rates_over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
-    """Means over terrains with 95 % intervals, bootstrap over families, as JSON values.
+def rates_over_all(abouts: Sequence[About], controller: str, seed: int) -> dict[str, Any]:
+    """Means of a controller's rates over terrains with 95 % intervals, bootstrap over families, as JSON values.
 
     Returns:
         ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
@@ -340,10 +332,10 @@ def rates_over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: 
     """
     families = np.array([about["family"] for about in abouts], np.int64)
     summary: dict[str, Any] = {}
-    for name in ("goal", "success", "fallen"):
-        values = _rates(rows, name)
+    for name in _RATES:
+        values = _rates(abouts, controller, name)
         summary |= {f"{name}_rate": mean_of(values), f"{name}_interval": interval_of(values, seed, families)}
-    goal = _rates(rows, "goal")
+    goal = _rates(abouts, controller, "goal")
     failing, valid = goal < FAILING_GOAL_RATE, ~np.isnan(goal)
     return summary | {
         "failing": int(failing.sum()),
@@ -353,30 +345,18 @@ def rates_over_all(rows: Sequence[Row], abouts: Sequence[dict[str, Any]], seed: 
     }
 
 
-def rates_by_group(
-    abouts: Sequence[dict[str, Any]], rows: Mapping[str, Sequence[Row]]
-) -> dict[str, list[dict[str, Any]]]:
-    """How controllers fare by :data:`GROUPS`: mean goal rates and how many terrains fail.
+def failing_by(group: str, abouts: Sequence[About], controller: str) -> dict[str, dict[str, int]]:
+    """How many terrains a controller fails by one of :data:`GROUPS`, the most frequent value first.
 
     Returns:
-        Group -> its values, the most frequent first, each with ``terrains`` and, by controller, ``goal_rate`` (None
-        without a valid terrain) and ``failing``.
+        Value -> ``terrains`` and ``failing``.
     """
-    goal = {controller: _rates(of_controller, "goal") for controller, of_controller in rows.items()}
-
-    def part(group: str, value: object) -> dict[str, Any]:
-        member = np.array([about[group] == value for about in abouts])
-        return {
-            group: value,
-            "terrains": int(member.sum()),
-            "goal_rate": {name: mean_of(rates[member]) for name, rates in goal.items()},
-            "failing": {name: int((rates[member] < FAILING_GOAL_RATE).sum()) for name, rates in goal.items()},
-        }
-
-    values = {group: Counter(about[group] for about in abouts) for group in GROUPS}
+    counts = Counter(str(about[group] or "unclear") for about in abouts)
+    fails = _rates(abouts, controller, "goal") < FAILING_GOAL_RATE
+    failing = Counter(str(about[group] or "unclear") for about, fail in zip(abouts, fails, strict=True) if fail)
     return {
-        group: [part(group, value) for value in sorted(counts, key=lambda value: (-counts[value], str(value)))]
-        for group, counts in values.items()
+        value: {"terrains": count, "failing": failing[value]}
+        for value, count in sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
     }
 
 

@@ -142,11 +142,11 @@ def show_pack(report: dict[str, Any]) -> None:
 
 def show_pack_test(report: dict[str, Any]) -> None:
     """Prints what of a pack a controller fails, beside the pack's controllers."""
-    rates = {"this": report["rates"], **report["beside"]}
-    _show_pack_rates(f"pack {report['pack']['folder']} of {report['pack']['robot']}", rates)
+    title = f"pack {report['pack']['folder']} of {report['pack']['robot']}"
+    _show_pack_rates(title, {"this": report["rates"], **report["beside"]})
     for group, parts in report["by"].items():
-        rows = [(part[group] or "not looked for", part["terrains"], *part["failing"].values()) for part in parts]
-        show_table(f"failed, by {group}", ("", "terrains", *rates), rows)
+        rows = [(value, part["failing"], part["terrains"]) for value, part in parts.items()]
+        show_table(f"failed, by {group}", ("", "fails", "of"), rows)
 
 
 def _show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:

@@ -11,17 +11,16 @@ from qd.archive import read_archive, write_archive
 from qd.commands import Evaluate
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
-    Candidate,
     choose_terrains,
     evaluate_pack,
+    failing_by,
     make_pack,
     pack_folder,
     passes,
-    rates_by_group,
     rates_over_all,
     read_pack,
     round_heights,
-    rows_of,
+    with_rates,
     write_terrains,
 )
 from qd.judge import judge
@@ -46,11 +45,10 @@ def crosses(policy, heights):
 
 
 def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=0.0):
-    about = {
+    return {
         "name": f"elite-{elite}", "elite": elite, "kind": kind, "verdict": "fault" if fault else "near-fault",
         "family": family, "cause": cause, "searched": {"goal_rate": rate},
     }  # fmt: skip
-    return Candidate(np.full(64, elite / 100, np.float32), about)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +63,7 @@ def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=
 )
 def test_what_comes_next(candidates, expected):
     for size in (9, 1):  # each beginning of a pack is one
-        assert [chosen.about["elite"] for chosen in choose_terrains(candidates, size)] == expected[:size]
+        assert choose_terrains(candidates, size) == expected[:size]
 
 
 @contextmanager
@@ -139,12 +137,12 @@ def pack(tmp_path, anymal, monkeypatch):
     heights[2, :, 150:] = 0.5
     Path("pack").mkdir()
     chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
-    rows = rows_of(result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]]))
-    abouts = [terrain.about | {"rates": {"base": row}} for terrain, row in zip(chosen, rows, strict=True)]
+    abouts = with_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
+    genes = np.array([np.full(64, about["elite"] / 100) for about in chosen], np.float32)
     content = {
         **identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base", "terrains": abouts,
-        "rates": {"base": rates_over_all(rows, abouts, 0)},
-        "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), np.array([c.genes for c in chosen])),
+        "rates": {"base": rates_over_all(abouts, "base", 0)},
+        "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), genes),
     }  # fmt: skip
     Path("pack/pack.json").write_text(json.dumps(content))
     return heights
@@ -187,19 +185,18 @@ def test_a_pack_of_the_robot_before_it_changed_is_refused(pack, capsys):
 
 
 def test_rates_over_a_pack_are_means_with_families_drawn_together():
-    abouts = [{"family": family, "verdict": "fault", "cause": "ridge", "kind": "elite"} for family in (0, 0, 1)]
-    rows = rows_of(result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]]))
-    rates = rates_over_all(rows, abouts, 0)
+    chosen = [candidate(elite, family=family) for elite, family in enumerate((0, 0, 1))]
+    abouts = with_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
+    rates = rates_over_all(abouts, "this", 0)
     assert rates["goal_rate"] == pytest.approx(2 / 3) and rates["success_rate"] == pytest.approx((1 + 1 + 0.5) / 3)
     assert (rates["failing"], rates["terrains"], rates["failing_families"], rates["families"]) == (1, 3, 1, 2)
     assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
-    (line,) = rates_by_group(abouts, {"this": rows})["cause"]
-    assert (line["terrains"], line["failing"]) == (3, {"this": 1})
-    assert line["goal_rate"]["this"] == pytest.approx(2 / 3)
+    assert failing_by("cause", abouts, "this") == {"ridge": {"terrains": 3, "failing": 1}}
     # An invalid terrain is in no rate.
-    rows = rows_of(result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4]))
-    rates = rates_over_all(rows, abouts, 0)
-    assert (rows[1]["goal_rate"], rates["goal_rate"], rates["terrains"], rates["failing"]) == (None, 0.5, 2, 1)
+    abouts = with_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
+    rates = rates_over_all(abouts, "this", 0)
+    assert abouts[1]["rates"]["this"]["goal_rate"] is None
+    assert (rates["goal_rate"], rates["terrains"], rates["failing"]) == (0.5, 2, 1)
 
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
@@ -213,8 +210,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     assert [about["rates"]["this"]["goal_rate"] for about in report["terrains"]] == [0.0, 1.0]
     assert (report["rates"]["failing"], report["rates"]["terrains"]) == (1, 2)
     assert report["beside"]["base"]["goal_rate"] == 0.5 and report["pack"]["terrains"] == 3
-    by_verdict = {line["verdict"]: line["failing"]["this"] for line in report["by"]["verdict"]}
-    assert by_verdict == {"fault": 1, "near-fault": 0}
+    assert {value: part["failing"] for value, part in report["by"]["verdict"].items()} == {"fault": 1, "near-fault": 0}
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
     assert not crosser.opened[0].reward and not crosser.opened[0].resolved
