@@ -8,6 +8,12 @@ ARGS ?=
 TORCH ?=
 BIN := .venv/bin
 STAMP := .venv/.setup-done
+# The torch that was asked for is kept: a later setup does not put the pinned one back.
+ifneq ($(TORCH),)
+ANEW := anew
+else
+TORCH := $(shell cat .venv/torch 2>/dev/null)
+endif
 PYTEST := $(BIN)/python -m pytest
 ON_TWO_CORES := -n 2 --dist loadfile
 FAULTLINE_DEVICE ?= cuda:0
@@ -38,14 +44,15 @@ help: ## This list
 
 setup: $(STAMP) ## Make .venv with the pinned packages, unless it is up to date
 
-$(STAMP): pyproject.toml constraints.txt
+.PHONY: anew
+$(STAMP): pyproject.toml constraints.txt $(ANEW)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "make setup: PYTHON=$(PYTHON) must be Python 3.11 or newer, got: $$($(PYTHON) --version 2>&1)." >&2; \
 	  echo 'Name another one: make setup PYTHON=python3.12' >&2; exit 1; }
 	@echo 'Installing the pinned packages into .venv. The first time takes some minutes.'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	grep -v $(if $(TORCH),'^torch==','^$$') constraints.txt > .venv/constraints.txt
-	$(if $(TORCH),$(BIN)/python -m pip install $(call quoted,$(TORCH)))
+	$(if $(TORCH),$(BIN)/python -m pip install $(call quoted,$(TORCH)) && echo $(call quoted,$(TORCH)) > .venv/torch)
 	$(BIN)/python -m pip install --quiet -e '.[dev,cluster]' -c .venv/constraints.txt
 	@touch $@
 
