@@ -222,14 +222,12 @@ class Report(ControllerFlags, DeviceFlag, SpaceFlag):
 class View(RobotFlag, EliteFlags):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    On the left is the archive on parallel axes. A click on a line of the plot, or of the list under "Elites", shows
-    that terrain. The list begins with one terrain of each way of failing. It can be sorted and narrowed. Under "Ranges"
-    you drag the ends of an axis: elites outside turn grey and leave the list. On the right is the crossing: play,
-    pause, drag the time, go from mark to mark, choose the episode, the speed and the controller. Arrows at the feet are
-    contact forces (1 m is 1,000 N). The green arrow over the robot is its command. The curves are its penalties.
-    Crossings that are not recorded yet run on the CPU, which takes seconds, and are stored under --cache. Those of the
-    neighbours in the list are recorded ahead. Buttons copy the link to what is shown, and the command that
-    replays it.
+    It opens on the worst terrain of the commonest cause, one second before the robot fails, and plays; the controller
+    that crosses the terrain is shown beside it as a ghost. Under the scene are play, the time with marks where things
+    happen, episode, speed and follow. On the left are the elites, by what stops the robot, as a list and on parallel
+    axes; a click shows one. On the right stand how often the robot arrives, who crosses beside it, its penalties, and a
+    button that films what is shown. Crossings that are not recorded yet run on the CPU, which takes seconds, and are
+    stored under --cache.
 
     Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
     opens just that.
@@ -255,11 +253,21 @@ class View(RobotFlag, EliteFlags):
 
     def execute(self) -> None:
         """Serves the page until Ctrl-C."""
-        from qd.show.view.app import serve
-        from qd.show.view.show import find_show
+        import gc
 
-        show = find_show(
-            self.run, robot=self.robot, elite=self.elite, minimal=self.minimal, policies=self.policies,
-            space=self.space,
-        )  # fmt: skip
-        serve(show, host=self.host, port=self.port, cache=self.cache)
+        from qd.show.view.recorder import Recorder
+
+        recorder = Recorder()  # its process loads the simulation while this one loads the page
+        try:
+            gc.disable()  # else it takes a third of the time
+            from qd.show.view.app import serve
+            from qd.show.view.show import find_show
+
+            show = find_show(
+                self.run, robot=self.robot, elite=self.elite, minimal=self.minimal, policies=self.policies,
+                space=self.space,
+            )  # fmt: skip
+            gc.enable()
+            serve(show, recorder, host=self.host, port=self.port, cache=self.cache)
+        finally:
+            recorder.stop()

@@ -14,7 +14,6 @@ from typing import Any, NoReturn, Protocol
 from numpy.typing import NDArray
 
 from sim.files.command import UserError, with_traceback
-from sim.rollout import RolloutResult
 
 
 class EvaluatorError(UserError):
@@ -32,8 +31,11 @@ class Crosser(Protocol):
         """Let terrains be crossed behind those under way."""
         ...
 
-    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
-        """Wait for the terrains that were put in first; ``progress`` may put in more."""
+    def take(self, progress: Callable[[float], None] | None = None) -> Any:
+        """Wait for the :class:`sim.rollout.RolloutResult` of the terrains that were put in first.
+
+        ``progress`` may put in more.
+        """
         ...
 
 

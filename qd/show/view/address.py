@@ -2,18 +2,15 @@
 
 import json
 import math
-import uuid
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
 import viser
-from viser import _messages
 
-_ANSWER_S = 5.0
-"""How long a browser has to say what its address is."""
+from qd.show.view.bar import run_script
+
 _POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"
 """Viser's own: its page starts with that camera."""
 _MINIMAL = "minimal"
@@ -98,27 +95,9 @@ def _point(text: str | None) -> Point | None:
     return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
 
 
-def ask_query(client: viser.ClientHandle) -> str:
-    """What a browser's address says behind its question mark; empty if the browser does not answer in time.
-
-    Viser's browser does not send it. A script puts it where viser can read it: in the browser's storage, under a name
-    that is made up for this one question, since tabs share that storage.
-    """
-    key = f"faultline-address-{uuid.uuid4()}"
-    client.local_storage.set_item(key, "")
-    run_script(client, f"for (const k of Object.keys(localStorage)) if (k.endsWith({json.dumps(key)})) "
-         "localStorage.setItem(k, location.search);")  # fmt: skip
-    try:
-        return client.local_storage.get_item(key, timeout=_ANSWER_S) or ""
-    except (RuntimeError, TimeoutError):  # it has no storage, or is gone again
-        return ""
-    finally:
-        client.local_storage.remove_item(key)
-
-
-def show_query(client: viser.ClientHandle, query: str) -> None:
-    """Have a browser show another address, without loading anything or an entry in its history."""
-    run_script(client, f"history.replaceState(history.state, '', {json.dumps('?' + query)});")
+def show_query(client: viser.ClientHandle, query: str, *, is_new: bool = False) -> None:
+    """Have a browser show another address, without loading anything; a new one is an entry in its history."""
+    run_script(client, f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
 
 
 def copy_text(client: viser.ClientHandle, text: str | None) -> None:
@@ -126,19 +105,3 @@ def copy_text(client: viser.ClientHandle, text: str | None) -> None:
     source = "location.href" if text is None else json.dumps(text)
     run_script(client, f"const text = {source}, ask = () => window.prompt('Copy this', text);"
          "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip
-
-
-def keep_keys(client: viser.ClientHandle) -> None:
-    """Keep left and right from viser's camera, which would move with them too; the page's commands still get them."""
-    run_script(client, "document.documentElement.addEventListener('keydown', e => "
-         "{ if (['ArrowLeft', 'ArrowRight'].includes(e.code)) e.stopPropagation(); });")  # fmt: skip
-
-
-def let_point(client: viser.ClientHandle) -> None:
-    """Have a browser name the line of the archive's plot under the pointer, and show its elite on a click."""
-    run_script(client, Path(__file__).with_name("pointing.js").read_text(encoding="utf-8"))
-
-
-def run_script(client: viser.ClientHandle, script: str) -> None:
-    """Run a script in a browser; viser does so for its plots, and has no public name for it."""
-    client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))

@@ -9,14 +9,16 @@ from typing import Any
 
 import viser
 
-from qd.show.recordings import Recordings, on_elite
-from qd.show.view.address import ask_query, read_address
+from qd.show.recordings import Recordings
+from qd.show.view.address import read_address
+from qd.show.view.bar import Bar
 from qd.show.view.common import Common
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import first_view_of, shapes_of, sky
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
+from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
 _FRAME_S = 0.04
@@ -40,25 +42,42 @@ class Page(viser.ViserServer):
 class App:
     """The page and its tabs."""
 
-    def __init__(self, show: Show, recordings: Recordings, *, host: str, port: int) -> None:
-        """Open the page."""
+    def __init__(self, show: Show, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
+        """Open the page; the recorder is closed with it."""
         self.tabs: dict[int, Tab] = {}
+        self._bars: dict[int, Bar] = {}
         self._tasks: queue.SimpleQueue[tuple[Hashable, Task]] = queue.SimpleQueue()
-        self.recorder = Recorder(show.robot, lambda report: self.post(self.show_report, report))
+        self._recorders = [recorder]
+        self._adopt(recorder, show)
         skeleton = Skeleton(show.robot)
-        shapes = shapes_of(skeleton, show.robot)
         self._common = Common(
-            show=show, skeleton=skeleton, shapes=shapes, recordings=recordings, recorder=self.recorder, post=self.post
-        )
+            show=show, skeleton=skeleton, shapes=shapes_of(skeleton, show.robot), recordings=recordings,
+            recorder=recorder, films=self._films, post=self.post,
+        )  # fmt: skip
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
         self.page.scene.set_background_image(sky())
         self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
-        # Viser calls this in a thread, which may wait for the browser to answer.
-        self.page.on_client_connect(lambda client: self.post(self.open, client, ask_query(client)))
+        self.page.on_client_connect(self._come)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
+
+    def _adopt(self, recorder: Recorder, show: Show) -> None:
+        recorder.robot, recorder.report = show.robot, lambda report: self.post(self.show_report, report)
+
+    def _films(self) -> Recorder:
+        if len(self._recorders) == 1:
+            self._recorders.append(Recorder())
+            self._adopt(self._recorders[1], self._common.show)
+        return self._recorders[1]
+
+    def _come(self, client: viser.ClientHandle) -> None:
+        def act(name: str, value: Any) -> None:
+            last = (client.client_id, name) if name in ("seek", "resize") else None
+            self.post(self.act, client, name, value, only_last=last)
+
+        self._bars[client.client_id] = Bar(client, act)
 
     def post(self, act: Callable[..., None], *args: Any, only_last: Hashable = None) -> None:
         """Have the loop call ``act(*args)``; from any thread.
@@ -70,34 +89,45 @@ class App:
         """
         self._tasks.put((object() if only_last is None else only_last, (act, args)))
 
-    def open(self, client: viser.ClientHandle, query: str) -> None:
-        """Lay out the page of a new browser, whose address says ``query`` behind its question mark."""
-        if client.client_id in self.page.get_clients():
-            self.tabs[client.client_id] = Tab(client, self._common, *read_address(query))
+    def act(self, client: viser.ClientHandle, name: str, value: Any) -> None:
+        """Do what a visitor did on the bar; at first it says its address and the size of its window."""
+        number = client.client_id
+        if number in self.tabs:
+            self.tabs[number].act(name, value)
+        elif name == "hello" and number in self.page.get_clients():
+            query, width, height = value
+            window = (int(width), int(height))
+            self.tabs[number] = Tab(client, self._bars[number], self._common, window, *read_address(str(query)))
 
     def leave(self, number: int) -> None:
         """Forget a closed tab."""
+        self._bars.pop(number, None)
         tab = self.tabs.pop(number, None)
         if tab is not None:
             tab.leave()
 
     def show_report(self, report: Report) -> None:
         """Store a recording, and tell all tabs how far it is."""
-        if report.recording is not None:
-            self._common.recordings.keep(report.wanted, report.recording)
+        if isinstance(report.result, Recording):
+            self._common.recordings.keep(report.wanted, report.result)
         for tab in self.tabs.values():
             tab.show_report(report)
 
     def close(self) -> None:
-        """End the recording processes and the page."""
-        self.recorder.stop()
+        """End the processes and the page."""
+        for recorder in self._recorders:
+            recorder.stop()
         self.page.stop()
 
     def run(self) -> None:
-        """Serve until interrupted."""
+        """Serve until interrupted; before a visitor comes, the first elite is recorded."""
         show = self._common.show
-        for policy in list(show.controllers.values())[:1]:  # ready before a visitor has chosen an elite
-            self.recorder.warm(on_elite(show.opened_run.archive, 0, policy=policy, replicas=show.replicas))
+        controller = next(iter(show.controllers), None)
+        self._common.recorder.warm(self._common.wanted(0, controller))
+        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
+        wanted = self._common.wanted(first, controller, minimal=show.minimal)
+        if wanted is not None and self._common.recordings.may_keep(wanted):
+            self._common.recorder.record(wanted, tab="first")
         last = time.perf_counter()
         while True:
             self.do_tasks(wait_s=_FRAME_S if self._playing else _IDLE_S)
@@ -127,11 +157,11 @@ class App:
             act(*args)
 
 
-def serve(show: Show, *, host: str, port: int, cache: Path) -> None:
+def serve(show: Show, recorder: Recorder, *, host: str, port: int, cache: Path) -> None:
     """Serves the page until Ctrl-C; recordings are stored in the folder ``cache``."""
     prepare_output(cache / "recording.npz")
     check_port(host, port)
-    app = App(show, Recordings(show.robot, folder=cache), host=host, port=port)
+    app = App(show, Recordings(show.robot, folder=cache), recorder, host=host, port=port)
     try:
         print(f"{show.opened_run.path}: {len(show.opened_run.archive):,} elites of {show.robot.name}.")
         print(f"Open http://{host}:{port} in a browser; Ctrl-C ends.", flush=True)

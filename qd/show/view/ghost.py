@@ -2,11 +2,8 @@
 
 from html import escape
 
-import numpy as np
-from numpy.typing import NDArray
-
 from qd.show.crossed import ending_of
-from qd.show.recordings import Wanted, on_elite
+from qd.show.recordings import Wanted
 from qd.show.view.common import Common
 from qd.show.view.playing import Crossing, crossing_of
 from qd.show.view.recorder import Report
@@ -29,30 +26,28 @@ class Ghost:
         self.recording: Recording | None = None
         self.crossing: Crossing | None = None
         self._wanted: Wanted | None = None
+        self._note = ""
 
     @property
     def choices(self) -> tuple[str, ...]:
         """What can be chosen."""
         return (CERTIFYING, NOBODY, *self._common.show.controllers)
 
-    def load(self, elite: int, beside: str | None, minimal: NDArray[np.float32] | None = None) -> str:
-        """Load the recording of another elite or controller, or ask for it; returns its status as HTML.
+    def load(self, elite: int, beside: str | None, *, minimal: bool = False) -> None:
+        """Load the recording of another elite or controller, or ask for it.
 
         Args:
             elite: Number of the elite.
             beside: The controller that is shown already, which can be no ghost of itself.
-            minimal: Genes of the elite's minimal terrain, if that is shown.
+            minimal: Whether the elite's minimal terrain is shown.
         """
-        show = self._common.show
-        self.recording = self.crossing = self._wanted = None
-        chosen = show.certifying(elite) if self.choice == CERTIFYING else self.choice
-        self.name = chosen if chosen in show.controllers and chosen != beside else None
-        if self.name is not None:
-            archive, policy = show.opened_run.archive, show.controllers[self.name]
-            self._wanted = on_elite(archive, elite, policy=policy, replicas=show.replicas, minimal=minimal)
+        self.recording = self.crossing = None
+        chosen, self._note = self._common.show.certifying(elite) if self.choice == CERTIFYING else (self.choice, "")
+        self.name = chosen if chosen in self._common.show.controllers and chosen != beside else None
+        self._wanted = self._common.wanted(elite, self.name, minimal=minimal)
+        if self._wanted is not None:
             self.recording = self._common.recordings.read(self._wanted)
         self._common.recorder.record(self._wanted if self.recording is None else None, tab=self._key)
-        return self.words(0)
 
     def leave(self) -> None:
         """Ask for nothing more."""
@@ -62,12 +57,10 @@ class Ghost:
         """Take the recording of a report on this ghost; returns its status as HTML, None for another's report."""
         if self._wanted is None or report.wanted != self._wanted or self.recording is not None:
             return None
-        self.recording = report.recording
-        if report.recording is not None:
-            return self.words(0)
+        self.recording = report.result
         if report.failed:
             return f"No ghost: {escape(report.text)}"
-        return f"{self.words(0)} {report.text}, {report.share:.0%}"
+        return self.words(0) if report.result is not None else f"{self.words(0)} {report.share:.0%}"
 
     def show_episode(self, replica: int) -> str:
         """Load the crossing of an episode, counted from 0; returns its status as HTML."""
@@ -79,12 +72,12 @@ class Ghost:
         return self.words(replica)
 
     def words(self, replica: int) -> str:
-        """How its episode ended, as HTML; empty without a ghost."""
+        """How its episode ended, as HTML; without a ghost why there is none, if one might expect it."""
         if self.name is None:
-            return ""
+            return escape(self._note)
         name = f"Ghost, {escape(self.name)}:"
         if self.recording is None:
-            return f"{name} its {self._common.show.replicas} episodes are recorded …"
+            return f"{name} {self._common.show.replicas} episodes are recorded …"
         ending = ending_of(self.recording.outcome[0, replica])
         ended = f'<span style="color:{ending.color}">{ending.words}</span>'
-        return f"{name} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s."
+        return f"{name} {ended} after {float(self.recording.duration_s[0, replica]):.1f} s"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageColor
 
-from qd.show.crossed import ending_of
-from qd.show.figures import label_of
+from kernels.episode import Outcome
+from qd.show.crossed import ending_of, moment_of_failure
 from sim.crossing import FALLEN_TILT_DEG
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
@@ -55,6 +55,8 @@ class Crossing:
     """Whether each recorded geom touches something, shape (F, num_geoms); None if that was not recorded."""
     marks: tuple[Mark, ...]
     """As :func:`marks_of` has them."""
+    moment_s: float
+    """When it went wrong [s], as :func:`qd.show.crossed.moment_of_failure` has it."""
 
     @property
     def num_frames(self) -> int:
@@ -100,6 +102,7 @@ def crossing_of(
         penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
         touching=None if recording.touching is None else recording.touching[0, replica, :frames],
         marks=marks_of(recording, replica),
+        moment_s=moment_of_failure(recording, replica),
     )
 
 
@@ -110,7 +113,7 @@ def ending_words(recording: Recording, replica: int) -> str:
 
 
 def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
-    """First stumble, first collision, fall and end of an episode of one terrain that has frames, in the order of time.
+    """First stumble, first collision, fall, stuck and end of an episode that has frames, in the order of time.
 
     Stumbles and collisions are those that the penalties count; a robot without a penalty for collisions has one
     at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
@@ -123,6 +126,8 @@ def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
         "fall": up < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
     }
     marks = [Mark(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
+    if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
+        marks.append(Mark(moment_of_failure(recording, replica), "stuck"))
     marks.append(Mark(recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
     return tuple(sorted(marks, key=lambda mark: mark.time_s))
 
@@ -149,14 +154,16 @@ def next_mark(marks: Sequence[Mark], time_s: float) -> Mark:
     return next((mark for mark in marks if mark.time_s > time_s + 1e-6), marks[0])
 
 
-def episodes_by_outcome(recording: Recording) -> dict[str, list[int]]:
-    """Episodes of one terrain by what they have in common, in words with their number; all of them first."""
+def episodes_by_ending(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
+    """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
     endings = list(map(ending_of, recording.outcome[0].tolist()))
-    groups = {f"all {len(endings)} episodes": list(range(len(endings)))}
-    for ending, number in Counter(endings).most_common():
-        groups[f"the {number} that ended: {ending.words}"] = [k for k, other in enumerate(endings) if other == ending]
-    fallen = np.flatnonzero(recording.fallen[0]).tolist()
-    return groups | ({f"the {len(fallen)} that fell": fallen} if fallen else {})
+    return [
+        (
+            f"{count} of {len(endings)}: {ending.words}",
+            [(k + 1, f"episode {k + 1}: {ending_words(recording, k)}") for k, e in enumerate(endings) if e == ending],
+        )
+        for ending, count in Counter(endings).most_common()
+    ]
 
 
 def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -190,23 +197,13 @@ def paths_of(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.flo
     return paths
 
 
-def endings(recording: Recording) -> str:
-    """Numbers of episodes of one terrain by ending, such as ``12 out of time, 8 base collision``, coloured, as HTML."""
-    counts = Counter(map(ending_of, recording.outcome[0].tolist()))
-    return ", ".join(
-        f'<span style="color:{ending.color}">{count} {ending.words}</span>' for ending, count in counts.most_common()
-    )
-
-
-def moment_text(crossing: Crossing, frame: int, penalties: Sequence[str], feet: Sequence[str]) -> str:
-    """The numbers of a frame, as Markdown: penalties so far, forces on the feet, command, position of the base."""
+def moment_text(crossing: Crossing, frame: int, feet: Sequence[str]) -> str:
+    """The numbers of a frame in a line: forces on the feet, command, position of the base."""
     v_x, v_y, yaw_rate = crossing.command_values[frame]
     forces = zip(feet, crossing.force_newtons[frame], strict=True)
     force_words = " · ".join(f"{name} {newtons:,.0f}" for name, newtons in forces)
     x, y, z = crossing.positions[frame, 0]
-    sums = zip(penalties, crossing.penalties[frame], strict=True)
-    rows = "".join(f"| {label_of(name)} | {value:.2f} |\n" for name, value in sums)
     return (
-        f"| penalty so far | multiples of its scale |\n|---|---|\n{rows}\nForces on the feet [N]: {force_words}\n\n"
-        f"Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s · base at {x:.2f}, {y:.2f}, {z:.2f} m"
+        f"Forces on the feet [N]: {force_words}. Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s. "
+        f"Base at {x:.2f}, {y:.2f}, {z:.2f} m."
     )

@@ -1,121 +1,83 @@
-"""Records crossings on the CPU in a process of their own, while the page goes on answering."""
+"""Records crossings on the CPU in a process of its own, while the page goes on answering.
+
+The process takes seconds to load the simulation. So it is begun before the page, and this file loads nothing of that.
+"""
 
 import threading
-from collections import deque
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from qd.show.recordings import Simulation, Wanted
 from qd.workers.process import EvaluatorError, WorkerProcess
-from sim.recording.recorder import Recording
-from sim.robots.robot import RobotCfg
 
-MAX_PROCESSES = 3
-"""Controllers whose simulation stays ready, one process each."""
-_PREPARING = "building the simulation (the very first one compiles its kernels: up to some minutes)"
+_PREPARING = "the simulation is built; the very first one compiles its kernels, up to some minutes"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """How the recording of some crossings goes on."""
+    """How a task goes on."""
 
-    wanted: Wanted
+    wanted: Any
+    """The task: :class:`qd.show.recordings.Wanted`, or :class:`qd.show.view.simulator.WantedFilm`."""
     text: str
     """In words."""
     share: float = 0.0
-    recording: Recording | None = None
-    """The result, when it is done."""
+    result: Any = None
+    """The recording or the film's file, when it is done."""
     failed: bool = False
 
 
-class _DroppedError(Exception):
-    """Nobody waits for what is being recorded."""
+def build_simulator(drop: Event, num_terrains: int) -> Any:
+    """What the process works with, called in it."""
+    from qd.show.view.simulator import Simulator
 
-
-class _Simulator:
-    """The work of a recording process: the simulation of a controller, ready to cross."""
-
-    def __init__(self, robot: RobotCfg, first: Wanted, drop: Event) -> None:
-        self._simulation, self._first, self._drop = Simulation(robot, "cpu"), first, drop
-        self._simulation.prepare(first)
-        self._wanted: deque[Wanted] = deque()
-
-    def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Queues one terrain, to be crossed as the first one was."""
-        self._wanted.append(replace(self._first, terrain=terrains[0], terrain_seed=int(seeds[0])))
-
-    def take(self, progress: Callable[[float], None]) -> Recording | None:
-        """Crosses the oldest terrain of the queue; None if it is dropped meanwhile."""
-
-        def report(share: float) -> None:
-            progress(share)
-            if self._drop.is_set():
-                raise _DroppedError
-
-        try:
-            return self._simulation([self._wanted.popleft()], report)[0]
-        except _DroppedError:
-            return None
-
-
-Cfg = tuple[RobotCfg, Wanted, Event]
-"""Of a recording process: the robot, what it crosses at first, and the event that drops its work."""
-
-
-def build_simulator(cfg: Cfg, num_terrains: int) -> Any:
-    """What a recording process works with, called in it."""
-    return _Simulator(*cfg)
+    return Simulator(drop)
 
 
 class Recorder:
-    """Records the crossings that each tab asked for last; earlier wishes that are not begun are dropped.
+    """Does the tasks that each tab asked for last, the oldest first; earlier ones that are not begun are dropped.
 
     While nobody waits it records ahead what a tab may ask for next, and drops that when somebody asks for another one.
 
     Args:
-        robot: Robot settings.
-        report: Called in another thread, with every step forward.
-        build: Makes the simulation; a module-level function, since processes import it by name.
+        build: Makes what works in the process; a module-level function, since the process imports it by name.
     """
 
-    def __init__(
-        self,
-        robot: RobotCfg,
-        report: Callable[[Report], None],
-        *,
-        build: Callable[[Cfg, int], Any] = build_simulator,
-    ) -> None:
-        self._robot, self._report, self._build = robot, report, build
-        self._workers: dict[str, WorkerProcess] = {}  # by controller, the one used last at the end
-        self._wishes: dict[Hashable, Wanted] = {}  # by tab, the oldest first
-        self._ahead: dict[Hashable, list[Wanted]] = {}  # by tab, the likeliest first
-        self._warm: Wanted | None = None
-        self._ahead_now: Wanted | None = None  # what is being recorded while nobody waits for it
+    def __init__(self, *, build: Callable[[Event, int], Any] = build_simulator) -> None:
+        self.robot: Any = None
+        """Whose crossings they are; set before the first task."""
+        self.report: Callable[[Report], None] = lambda report: None
+        """Called in another thread, with every step forward."""
+        self._build = build
         self._drop = get_context("spawn").Event()
+        self._wishes: dict[Hashable, Any] = {}  # by tab, the oldest first
+        self._ahead: dict[Hashable, list[Any]] = {}  # by tab, the likeliest first
+        self._warm: Any = None
+        self._now: Any = None  # the task that is worked on
+        self._awaited = False  # whether a tab waits for it
+        self._is_ahead = False
         self._stopped = False
         self._changed = threading.Condition()
+        self._worker = self._begin()
+        self._is_ready = False
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: Wanted | None, *, tab: Hashable = 0) -> None:
-        """Record these crossings for a tab when its turn comes; with None, nothing more for it."""
+    def record(self, wanted: Any, *, tab: Hashable = 0) -> None:
+        """Do a task for a tab when its turn comes; with None, nothing more for it."""
         with self._changed:
             self._wishes.pop(tab, None)
-            if wanted is not None:
+            if wanted is not None and wanted == self._now:
+                self._awaited = True
+            elif wanted is not None:
                 self._wishes[tab] = wanted
-                if wanted == self._ahead_now:
-                    self._ahead_now = None  # now somebody waits for it
-                elif self._ahead_now is not None:
+                if self._now is not None and not self._awaited:
                     self._drop.set()
             self._changed.notify()
 
-    def record_ahead(self, wanted: Sequence[Wanted], *, tab: Hashable = 0) -> None:
+    def record_ahead(self, wanted: Sequence[Any], *, tab: Hashable = 0) -> None:
         """Record these for a tab, in their order, while nobody waits for others; they replace the tab's former ones."""
         with self._changed:
             self._ahead.pop(tab, None)
@@ -123,20 +85,29 @@ class Recorder:
                 self._ahead[tab] = list(wanted)
             self._changed.notify()
 
-    def warm(self, wanted: Wanted) -> None:
-        """Have the process of these crossings' controller ready before anybody asks."""
+    def warm(self, wanted: Any) -> None:
+        """Have the simulation of these crossings' controller ready before anybody asks."""
         with self._changed:
             self._warm = wanted
             self._changed.notify()
 
+    def cancel(self, wanted: Any) -> None:
+        """Drop a task, also while it is worked on."""
+        with self._changed:
+            self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
+            if self._now is not None and self._now == wanted:
+                self._drop.set()
+
     def stop(self) -> None:
-        """End all processes and the thread at once."""
+        """End process and thread at once."""
         with self._changed:
             self._stopped = True
-            for worker in self._workers.values():
-                worker.stop()
+            self._worker.stop()
             self._changed.notify()
         self._thread.join(timeout=10)
+
+    def _begin(self) -> WorkerProcess:
+        return WorkerProcess(1, self._build, self._drop)
 
     def _run(self) -> None:
         while True:
@@ -144,70 +115,56 @@ class Recorder:
                 self._changed.wait_for(lambda: self._stopped or bool(self._wishes or self._ahead or self._warm))
                 if self._stopped:
                     return
-                wanted, only_warm = self._next()
+                wanted, only_ready = self._next()
+                self._now, self._awaited = wanted, not (only_ready or self._is_ahead)
             try:
-                if only_warm:
-                    self._worker(wanted)
-                    continue
-                report = self._record_now(wanted)
+                result = self._result_of(wanted, only_ready)
+            except (EvaluatorError, OSError) as error:
                 with self._changed:
-                    self._ahead_now = None
-                    self._drop.clear()
-                    if report is not None:  # others may have asked for the same meanwhile
-                        self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
-            except (ValueError, EvaluatorError, OSError) as error:
-                if self._stopped:
-                    return
-                with self._changed:
-                    awaited = not only_warm and self._ahead_now is None
-                    self._ahead_now = None
-                self._dismiss(wanted.policy)
-                report = Report(wanted=wanted, text=str(error), failed=True) if awaited else None
-            if report is not None:
-                self._report(report)
+                    if self._stopped:
+                        return
+                    self._worker.stop()
+                    self._worker, self._is_ready, result = self._begin(), False, error
+            with self._changed:
+                awaited, self._now = self._awaited, None
+                self._drop.clear()
+                if result is not None:  # others may have asked for the same meanwhile
+                    self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
+            if isinstance(result, Exception):
+                if awaited:
+                    self.report(Report(wanted=wanted, text=str(result), failed=True))
+            elif result is not None:
+                self.report(Report(wanted=wanted, text="done", share=1.0, result=result))
 
-    def _next(self) -> tuple[Wanted, bool]:
-        """What to do next, and whether only to have its process ready."""
+    def _next(self) -> tuple[Any, bool]:
+        """What to do next, and whether only to have its simulation ready."""
+        self._is_ahead = False
         if self._wishes:
             return self._wishes.pop(next(iter(self._wishes))), False
         if self._warm is not None:
             warm, self._warm = self._warm, None
             return warm, True
+        self._is_ahead = True
         tab = next(iter(self._ahead))
-        self._ahead_now = self._ahead[tab].pop(0)
+        wanted = self._ahead[tab].pop(0)
         if not self._ahead[tab]:
             del self._ahead[tab]
-        return self._ahead_now, False
+        return wanted, False
 
-    def _record_now(self, wanted: Wanted) -> Report | None:
-        """The last report on it; None if it was recorded ahead and is dropped."""
-        worker = self._worker(wanted)
-        worker.send(wanted.terrain[None], np.array([wanted.terrain_seed], np.uint32))
+    def _result_of(self, wanted: Any, only_ready: bool) -> Any:
+        """What came of a task: its result, an error, or None of one that is dropped or only ready."""
+        if not self._is_ready:
+            self._tell(wanted, _PREPARING, 0.0)
+            self._worker.receive()  # that it is ready
+            self._is_ready = True
+        how: Any = (self.robot, only_ready)
+        self._worker.send(wanted, how)
         while True:
-            message, value = worker.receive()
+            message, value = self._worker.receive()
             if message == "result":
-                return None if value is None else Report(wanted=wanted, text="recorded", share=1.0, recording=value)
-            if self._ahead_now is None:
-                self._report(Report(wanted=wanted, text="crossing", share=float(value)))
+                return value
+            self._tell(wanted, "", float(value))
 
-    def _worker(self, wanted: Wanted) -> WorkerProcess:
-        """The process of a controller, built if there is none; the one longest unused makes room."""
-        worker = self._workers.pop(wanted.policy, None)
-        if worker is not None:
-            self._workers[wanted.policy] = worker
-            return worker
-        if self._ahead_now is None:
-            self._report(Report(wanted=wanted, text=_PREPARING))
-        while len(self._workers) >= MAX_PROCESSES:
-            self._dismiss(next(iter(self._workers)))
-        with self._changed:
-            if self._stopped:
-                raise EvaluatorError("the viewer is stopping")
-            worker = self._workers[wanted.policy] = WorkerProcess(1, self._build, (self._robot, wanted, self._drop))
-        worker.receive()  # that it is ready
-        return worker
-
-    def _dismiss(self, policy: str) -> None:
-        worker = self._workers.pop(policy, None)
-        if worker is not None:
-            worker.stop()
+    def _tell(self, wanted: Any, text: str, share: float) -> None:
+        if self._awaited:
+            self.report(Report(wanted=wanted, text=text, share=share))

@@ -3,18 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 
-from qd.archive import goal_rates
-from qd.judge import panel_of
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
-from qd.show.view.plots import Axes, axes_of
+from qd.show.view.listing import Listing, listing_of
 from qd.workers.evaluator import check_policy
-from sim.policy.spec import ControllerSpec, controller_hash, controllers_of
+from sim.policy.spec import ControllerSpec, controllers_of
 from sim.robots.robot import RobotCfg
 
-SEARCHED = "as searched"
+SEARCHED = "searched controller"
 """What the page calls the controller of the search, if no other is named."""
 
 
@@ -38,32 +37,24 @@ class Show:
     """Whether the first terrain is the elite's minimal one."""
 
     @cached_property
-    def axes(self) -> Axes:
+    def listing(self) -> Listing:
         """All elites, and the orders to list them in."""
-        minimal = () if self.minima is None else tuple(self.minima.genes)
-        return axes_of(self.opened_run.archive, self.opened_run.space, minimal)
-
-    @cached_property
-    def _hashes(self) -> dict[str, str | None]:
-        return {name: controller_hash(policy) for name, policy in self.controllers.items()}
-
-    def certifying(self, number: int) -> str | None:
-        """Name of the controller that crosses a failing elite, the best of several; None if none of these does."""
-        faults = self.opened_run.archive.faults
-        if faults is None or not self.opened_run.archive.certified[number]:
-            return None
-        rows = zip(
-            faults.certifier_sha256, faults.certificates()[number], goal_rates(faults.certifier_outcomes[number]),
-            strict=True,
-        )  # fmt: skip
-        rates = {digest: rate for digest, crosses, rate in rows if crosses}
-        names = [name for name, digest in self._hashes.items() if digest in rates]
-        return max(names, key=lambda name: rates[str(self._hashes[name])], default=None)
+        return listing_of(self.opened_run.archive, self.opened_run.space, self.minima)
 
     @property
     def robot(self) -> RobotCfg:
         """Whose archive it is."""
         return self.opened_run.robot
+
+    def certifying(self, number: int) -> tuple[str | None, str]:
+        """Name of the controller that crosses a failing elite, the best of several, or why there is none to show."""
+        archive, name = self.opened_run.archive, self.opened_run.certifier(number)
+        if name is not None and self.controllers.get(name) == self.opened_run.certifiers()[name]:
+            return name, ""
+        if archive.faults is None or not archive.certified[number]:
+            return None, "No other controller is known to cross it." if archive.failing[number] else ""
+        names = compress(archive.faults.certifiers, archive.faults.certificates()[number].tolist())
+        return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."
 
 
 def find_show(
@@ -82,7 +73,7 @@ def find_show(
         robot: Name or settings file of the robot.
         elite: Number of the elite to show first.
         minimal: Number of the elite whose minimal terrain to show first, or ``all``.
-        policies: Controllers to choose from, ``NAME=FILE`` each; those of the search and its certifiers if empty.
+        policies: Controllers to choose from, ``NAME=FILE`` each, besides its certifiers; if empty, that of the search.
         space: A user's own terrain space that the run names.
     """
     opened_run = open_run(robot, run, space=space)
@@ -105,11 +96,12 @@ def find_show(
 
 def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dict[str, str], str]:
     """The controllers by name, and why there are none."""
+    certifiers = opened_run.certifiers()
     if any(map(str.strip, policies)):
         controllers = controllers_of(policies, opened_run.robot)
         for policy in controllers.values():
             check_policy(policy, opened_run.robot, "cpu")
-        return controllers, ""
+        return {**controllers, **{name: file for name, file in certifiers.items() if name not in controllers}}, ""
     searched, _ = opened_run.as_searched()
     try:
         if ControllerSpec.parse(searched).runs_code:
@@ -118,14 +110,4 @@ def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dic
         check_policy(policy, opened_run.robot, "cpu")
     except ValueError as error:
         return {}, f"{error}; name a controller with --policies to see crossings"
-    return {SEARCHED: policy, **_panel_of(opened_run)}, ""
-
-
-def _panel_of(opened_run: OpenedRun) -> dict[str, str]:
-    """Those of the robot's panel that crossed the archive, by their names in it."""
-    faults = opened_run.archive.faults
-    if faults is None:
-        return {}
-    names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
-    files = panel_of(opened_run.robot).values()
-    return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
+    return {SEARCHED: policy, **certifiers}, ""

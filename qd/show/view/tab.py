@@ -1,30 +1,23 @@
 """A browser tab: what it shows, and what happens when its visitor does something. No tab knows of another."""
 
+import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from html import escape
+from typing import Any
 
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
-from qd.show.crossed import crossed_of
-from qd.show.recordings import Wanted, on_elite
-from qd.show.view.address import Address, copy_text, keep_keys, let_point, show_query
+from qd.show.crossed import crossed_of, typical_episode
+from qd.show.view.address import Address, copy_text, read_address, show_query
+from qd.show.view.bar import Bar
 from qd.show.view.common import Common
+from qd.show.view.filming import Filming
 from qd.show.view.ghost import CERTIFYING, Ghost
+from qd.show.view.listing import Column, column_of
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.playing import (
-    Crossing,
-    crossing_of,
-    ending_words,
-    endings,
-    episodes_by_outcome,
-    moment_text,
-    next_mark,
-    paths_of,
-)
-from qd.show.view.plots import Curves
+from qd.show.view.playing import Crossing, crossing_of, episodes_by_ending, moment_text, next_mark, paths_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
@@ -32,41 +25,78 @@ from sim.bank import terrains_of
 from sim.files.command import command_line
 from sim.recording.recorder import Recording
 
-_NUMBERS_S = 0.2
-"""Real time from one update of curves and numbers to the next, while playing."""
+_BAR_S, _NUMBERS_S = 0.1, 0.25
+"""Real time from one update of the bar's time, and of the numbers, to the next, while playing."""
 _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
+_BEFORE_S = 1.0
+"""How long before the robot fails an episode begins to be shown."""
 
 
 class Tab:
     """What one tab shows; all methods are called by the loop."""
 
-    def __init__(self, client: viser.ClientHandle, common: Common, address: Address, refused: list[str]) -> None:
-        """Lay out the page and show what its address asks for; ``refused`` says what of the address means nothing."""
-        self.client, self.common = client, common
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        bar: Bar,
+        common: Common,
+        window: tuple[int, int],
+        address: Address,
+        refused: list[str],
+    ) -> None:
+        """Lay out the page and show what its address asks for.
+
+        Args:
+            client: The browser.
+            bar: Its player bar.
+            common: What all tabs share.
+            window: Width and height of the window [CSS pixels].
+            address: What the address asks for.
+            refused: What of the address means nothing, in words.
+        """
+        self.client, self.bar, self.common, self.window = client, bar, common, window
         show = common.show
         self._archive, self._others = show.opened_run.archive, address.others
-        self.selection, self.clock = Selection(show.axes), Clock()
+        self.selection, self.clock = Selection(show.listing), Clock()
         self.controller = next(iter(show.controllers), None)
         self._minimal = False  # whether the elite's minimal terrain is wanted, where it has one
-        self.replica = 0
-        self._begin_s = address.time_s or 0.0  # where the next crossing begins
+        self.replica: int | None = None  # the typical one of the recording that comes
+        self._begin_s: float | None = None  # where the next crossing begins; just before the robot fails if None
         self.recording: Recording | None = None
-        self._groups: dict[str, list[int]] = {}
-        self._group = ""  # of the episodes to choose from
         self.crossing: Crossing | None = None
-        self._curves: Curves | None = None
-        self.query, self._numbers_at, self._address_at = "", 0.0, time.perf_counter()
+        self.query, self._bar_at, self._numbers_at, self._address_at = "", 0.0, 0.0, time.perf_counter()
         self.ghost = Ghost(common, client.client_id)
         self.scene = Scene(client, common.shapes)
         title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
         self.list = ArchivePanel(client, self.selection, title, self)
         self.panel = CrossingPanel(client, list(show.controllers), self)
-        keep_keys(client)
-        let_point(client)
-        self._open(address, refused)
+        self._filming = Filming(client, common, self.panel.show_film)
+        self.go_to(address, refused)
 
-    def _open(self, address: Address, refused: list[str]) -> None:
+    def act(self, name: str, value: Any) -> None:
+        """Do what a visitor did on the bar, by a key or with an elite; what makes no sense is left out."""
+        tasks: dict[str, tuple[type, Callable[..., None]]] = {
+            "seek": (float, self.seek), "go_on": (float, self.go_on), "speed": (float, self.set_speed),
+            "follow": (bool, self.set_follow), "pick": (str, self.pick_typed), "pick_typed": (str, self.pick_typed),
+            "step": (int, self.step), "episode": (int, lambda number: self.choose_replica(number - 1)),
+            "open": (str, lambda query: self.go_to(*read_address(query))),
+        }  # fmt: skip
+        simple = {"play": self.play, "mark": self.go_to_next_mark, "overview": self.overview,
+                  "toggle_follow": self.toggle_follow}  # fmt: skip
+        if name in simple:
+            simple[name]()
+        with suppress(TypeError, ValueError, OverflowError):
+            if name == "resize":
+                self.window = (int(value[0]), int(value[1]))
+            elif name in tasks:
+                kind, method = tasks[name]
+                value = kind(value)
+                if not isinstance(value, float) or math.isfinite(value):
+                    method(value)
+
+    def go_to(self, address: Address, refused: list[str]) -> None:
+        """Show what an address asks for; one that names no time opens just before the robot fails, and plays."""
         show = self.common.show
         for words in refused:
             self.refuse(words)
@@ -80,22 +110,21 @@ class Tab:
                 self.refuse(f"There is no controller '{name}' here: there are {', '.join(show.controllers) or 'none'}.")
         if address.controller in show.controllers:
             self.controller = address.controller
+            self.panel.controller.value = address.controller
         if address.ghost in self.ghost.choices:
             self.ghost.choice = address.ghost
         self._minimal = address.minimal or (address.elite is None and show.minimal)
-        if address.minimal and (show.minima is None or elite not in show.minima.genes):
+        if address.minimal and self.common.genes(elite, True) is None:
             self.refuse(f"Elite {elite} has no minimal terrain here.")
+        self.replica, self._begin_s, self.clock.playing = None, address.time_s, address.time_s is None
         if address.episode is not None:
-            self.choose_replica(address.episode - 1, self._begin_s)
+            self.choose_replica(address.episode - 1, address.time_s, playing=self.clock.playing)
         if address.camera is None:
             self.look(first_view_of)
-        self.selection.pick(elite)
+        self.selection.picked = elite
         self.list.show()
-        if self.controller is not None:
-            self.panel.controller.value = self.controller
         self._show_elite()
-        if address.follow:
-            self.set_follow(True)
+        self.set_follow(address.follow or (address.time_s is None and address.camera is None))
 
     @property
     def playing(self) -> bool:
@@ -108,8 +137,8 @@ class Tab:
         if self.playing:
             self.clock.tick(real_s)
             self._show_frame()
-            if now - self._numbers_at > _NUMBERS_S or not self.clock.playing:
-                self._numbers_at = now
+            if now - self._bar_at > _BAR_S or not self.clock.playing:
+                self._bar_at = now
                 self._show_moment()
         if now - self._address_at > _ADDRESS_S:
             self.show_address()
@@ -123,8 +152,8 @@ class Tab:
             elite=self.selection.picked,
             controller=self.controller,
             ghost=None if self.ghost.choice == CERTIFYING else self.ghost.choice,
-            minimal=self.genes is not None,
-            episode=self.replica + 1,
+            minimal=self.minimal,
+            episode=None if self.replica is None else self.replica + 1,
             time_s=self.clock.time_s if self.crossing is not None else self._begin_s,
             follow=self.scene.follow,
             camera=(position, look_at),
@@ -132,8 +161,10 @@ class Tab:
         )
         query = address.query()
         if query != self.query:
+            before, _ = read_address(self.query)
+            is_new = before.elite not in (None, address.elite)
             self.query = query
-            show_query(self.client, query)
+            show_query(self.client, query, is_new=is_new)
 
     def copy_link(self) -> None:
         """Have the browser copy the link to what the tab shows."""
@@ -144,26 +175,46 @@ class Tab:
     def copy_command(self) -> None:
         """Have the browser copy the command that replays what the tab shows."""
         show, name, space = self.common.show, self.controller, self.common.show.opened_run.space
-        terrain = {"elite" if self.genes is None else "minimal": self.selection.picked}
         text = command_line(
             "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None,
             policy=None if name is None or name == SEARCHED else show.controllers[name], replicas=show.replicas,
-            **terrain,
+            **{"minimal" if self.minimal else "elite": self.selection.picked},
         )  # fmt: skip
         copy_text(self.client, text)
         self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
 
+    def film(self) -> None:
+        """Have the shown episode filmed in a process of its own."""
+        if self.recording is None or self.replica is None:
+            return
+        suffix = "" if self.controller in (None, SEARCHED) else f"-{self.controller}"
+        stem = f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}{suffix}"
+        name, ghost = self.ghost.name, self.ghost.recording
+        beside = None if name is None or ghost is None else (name, ghost)
+        self._filming.begin(self.recording, self.replica, self._scales, stem, by=suffix[1:], beside=beside)
+
+    def cancel_film(self) -> None:
+        """Make the film no further."""
+        self._filming.cancel()
+
     @property
-    def genes(self) -> NDArray[np.float32] | None:
-        """Of the minimal terrain that is shown; None while the whole terrain is shown."""
-        minima = self.common.show.minima
-        return None if minima is None or not self._minimal else minima.genes.get(self.selection.picked)
+    def minimal(self) -> bool:
+        """Whether a minimal terrain is shown."""
+        return self.common.genes(self.selection.picked, self._minimal) is not None
+
+    @property
+    def _scales(self) -> dict[str, float]:
+        return dict(zip(self._archive.penalties, self._archive.scales, strict=True))
 
     def choose_terrain(self, minimal: bool) -> None:
         """Show the elite's minimal terrain, or the whole one."""
         if minimal != self._minimal:
-            self._minimal, self._begin_s = minimal, 0.0
+            self._minimal = minimal
+            self._begin_anew()
             self._show_elite()
+
+    def _begin_anew(self) -> None:
+        self.replica, self._begin_s, self.clock.playing = None, None, True
 
     def refuse(self, words: str) -> None:
         """Say at the top of the page what does not exist here."""
@@ -173,20 +224,13 @@ class Tab:
         return f"There is no elite {number} here: there are 0 to {len(self._archive) - 1}."
 
     def look(self, view_of: Callable[[int, int], View]) -> None:
-        """Move the camera to a view that depends on the picture's width and height."""
-        camera = self.client.camera
-        self.scene.go_to(view_of(camera.image_width, camera.image_height))
+        """Move the camera to a view that depends on the window's width and height."""
+        self.scene.go_to(view_of(*self.window))
 
     def overview(self) -> None:
         """Show the whole terrain, and stop following."""
         self.set_follow(False)
         self.look(overview_of)
-
-    def pick_line(self, line: int) -> None:
-        """Show the elite on a line of the list."""
-        listed = self.selection.listed
-        if line < len(listed):  # else the list was drawn anew while the click was on its way
-            self.pick(listed[line])
 
     def step(self, by: int) -> None:
         """Show the next (1) or previous (-1) elite of the list."""
@@ -199,20 +243,20 @@ class Tab:
             self.pick(number)
         else:
             self.refuse(self._no_elite(f"'{text}'"))
-            self.list.show()
 
     def pick(self, number: int) -> None:
-        """Show an elite."""
-        changed = self.selection.pick(number)
-        self.list.show()
-        if changed:
-            self._begin_s = 0.0
+        """Show an elite, just before the robot fails."""
+        if number != self.selection.picked:
+            self.selection.picked = number
+            self._begin_anew()
+            self.list.show()
             self._show_elite()
 
     def choose_controller(self, name: str) -> None:
         """Show the crossings of another controller."""
         if name in self.common.show.controllers and name != self.controller:
-            self.controller, self._begin_s = name, 0.0
+            self.controller = name
+            self._begin_s, self.clock.playing = None, True
             self._show_crossings()
 
     def choose_ghost(self, name: str) -> None:
@@ -220,29 +264,13 @@ class Tab:
         if name in self.ghost.choices and name != self.ghost.choice:
             self.ghost.choice = name
             self._load_ghost()
-            self._show_ghost()
 
-    def choose_group(self, name: str) -> None:
-        """Choose from the episodes that have something in common."""
-        if name in self._groups:
-            self._group = name
-            if self.replica not in self._groups[name]:
-                self.choose_replica(self._groups[name][0])
-            self._show_episodes()
-
-    def step_replica(self, by: int) -> None:
-        """Show the next (1) or previous (-1) episode of those to choose from; the first follows the last."""
-        episodes = self._groups.get(self._group, [])
-        if episodes:
-            place = episodes.index(self.replica) if self.replica in episodes else -1
-            self.choose_replica(episodes[(place + by) % len(episodes)])
-
-    def choose_replica(self, replica: int, begin_s: float = 0.0) -> None:
-        """Show another episode, counted from 0, from a time [s]."""
+    def choose_replica(self, replica: int, begin_s: float | None = None, *, playing: bool = True) -> None:
+        """Show another episode, counted from 0, from a time [s]; from just before the robot fails if None."""
         if not 0 <= replica < self.common.show.replicas:
             self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.replicas}.")
             return
-        self.replica, self._begin_s = replica, begin_s
+        self.replica, self._begin_s, self.clock.playing = replica, begin_s, playing
         if self.recording is not None:
             self._show_episode()
 
@@ -272,12 +300,13 @@ class Tab:
 
     def set_speed(self, speed: float) -> None:
         """Play at a speed in simulated seconds a real one."""
-        self.clock.speed = speed
+        self.clock.speed = min(max(speed, 0.01), 100.0)
+        self.bar.show({"speed": self.clock.speed})
 
     def set_follow(self, follow: bool) -> None:
         """Go along with the robot, or stay."""
         self.scene.set_follow(follow)
-        self.panel.follow.value = follow
+        self.bar.show({"follow": follow})
 
     def toggle_follow(self) -> None:
         """Follow the robot, or stop following."""
@@ -294,22 +323,23 @@ class Tab:
         self._show_frame()
 
     def show_report(self, report: Report) -> None:
-        """Say how far a recording is, and show it, if it is one of this tab."""
+        """Say how far a recording or film is, and show it, if it is one of this tab."""
+        self._filming.take_report(report)
         ghost_words = self.ghost.take_report(report)
         if ghost_words is not None:
             self.panel.show_ghost(self.ghost.choice, ghost_words)
-            if report.recording is not None:
-                self._show_details()
+            if report.result is not None:
                 self._show_ghost()
-        if report.wanted != self._wanted(self.selection.picked, self.genes) or self.recording is not None:
+                self._show_rates()
+        wanted = self.common.wanted(self.selection.picked, self.controller, minimal=self._minimal)
+        if report.wanted != wanted or self.recording is not None:
             return
-        if report.recording is not None:
-            self._show_recording(report.recording)
+        if report.result is not None:
+            self._show_recording(report.result)
         elif report.failed:
-            self.panel.show_status(f"No crossing: {escape(report.text)}")
+            self.bar.show({"share": None, "status": f"No crossing: {escape(report.text)}"})
         else:
-            text = f"Recording {report.wanted.replicas} episodes of {escape(str(self.controller))}: {report.text} …"
-            self.panel.show_status(text, report.share)
+            self._show_progress(report.text, report.share)
 
     def leave(self) -> None:
         """Ask for nothing more; the browser is gone."""
@@ -317,126 +347,119 @@ class Tab:
         self.common.recorder.record(None, tab=self.client.client_id)
         self.common.recorder.record_ahead([], tab=self.client.client_id)
         self.ghost.leave()
-
-    def _wanted(self, number: int, genes: NDArray[np.float32] | None = None) -> Wanted | None:
-        """The chosen controller's crossings of an elite, or of genes of its minimal terrain; None without one."""
-        show = self.common.show
-        if self.controller is None:
-            return None
-        policy = show.controllers[self.controller]
-        return on_elite(self._archive, number, policy=policy, replicas=show.replicas, minimal=genes)
+        self._filming.cancel()
 
     def _record_ahead(self) -> None:
         """Have the crossings of the neighbours in the list recorded while nobody waits."""
         near = dict.fromkeys(self.selection.step(by) for by in (1, -1))
-        crossings = [wanted for wanted in map(self._wanted, near) if wanted is not None]
-        missing = [wanted for wanted in crossings if self.common.recordings.may_keep(wanted)]
+        crossings = [self.common.wanted(number, self.controller, minimal=self._minimal) for number in near]
+        missing = [wanted for wanted in crossings if wanted is not None and self.common.recordings.may_keep(wanted)]
         self.common.recorder.record_ahead(missing, tab=self.client.client_id)
 
     def _show_elite(self) -> None:
-        show, elite, genes = self.common.show, self.selection.picked, self.genes
-        self.panel.show_terrain(show.minima is not None and elite in show.minima.genes, genes is not None)
+        show, elite, listing = self.common.show, self.selection.picked, self.common.show.listing
+        name, verdict = listing.ranking.name(elite), listing.verdict(elite)
+        known = f"elite {elite} of {len(self._archive):,}{f' · {verdict}' * bool(verdict)}"
+        self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
+        self.panel.show_elite(
+            f"<b>{escape(name)}</b><br>{known}",
+            listing.details(elite),
+            has_minimal=self.common.genes(elite, True) is not None,
+            minimal=self.minimal,
+        )
+        genes = self.common.genes(elite, self._minimal)
         shown = self._archive.genes[elite] if genes is None else genes
         heights, ground = terrains_of(shown[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 
-    def _show_details(self) -> None:
-        """Say what is known of the elite, with the rates of the crossings that are shown."""
-        minima, number = self.common.show.minima, self.selection.picked
-        rates = {
-            f"{name} ({role})": crossed_of(recording, self._archive.penalties, self._archive.scales).rates
-            for name, recording, role in (
-                (self.controller, self.recording, "shown"),
-                (self.ghost.name, self.ghost.recording, "ghost"),
-            )
-            if recording is not None
-        }
-        details = self.common.show.axes.details(number, rates)
-        if minima is not None and number in minima.genes:
-            details += f"\n\n**Minimal terrain**: {minima.words(number)}."
-        self.panel.details.content = details
+    def _show_rates(self) -> None:
+        """Show how episodes end: what is known of the whole terrain, and what is recorded of others than that."""
+
+        def recorded(name: str | None, recording: Recording | None) -> list[Column]:
+            if recording is None:
+                return []
+            return [column_of(str(name), crossed_of(recording, self._archive.penalties, self._archive.scales))]
+
+        if self.minimal:
+            columns = recorded(self.controller, self.recording) + recorded(self.ghost.name, self.ghost.recording)
+        else:
+            columns = [*self.common.show.listing.columns(self.selection.picked)]
+            columns += recorded(self.controller, self.recording) if self.controller != SEARCHED else []
+        self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
-        """Load the ghost's recording of the elite that is shown, or ask for it."""
-        words = self.ghost.load(self.selection.picked, self.controller, self.genes)
-        self.panel.show_ghost(self.ghost.choice, words)
-        self._show_details()
+        """Load the ghost's recording of the elite that is shown, or ask for it, and show what there is."""
+        self.ghost.load(self.selection.picked, self.controller, minimal=self._minimal)
+        self._show_ghost()
+        self._show_rates()
 
     def _show_ghost(self) -> None:
         """Show the ghost's crossing of the episode beside the robot's; time lasts as long as the longer one."""
-        words = self.ghost.show_episode(self.replica)
+        words = self.ghost.show_episode(self.replica or 0)
+        self.panel.show_ghost(self.ghost.choice, words)
         crossing, ghost = self.crossing, self.ghost.crossing
         self.scene.hide_ghost()
         if crossing is not None:
             self.clock.duration_s = max(crossing.duration_s, 0.0 if ghost is None else ghost.duration_s)
             self.clock.seek(self.clock.time_s)
-            self.panel.show_ghost(self.ghost.choice, words)
-            self.panel.show_controls(self.clock, enabled=True)
+            self.panel.stretch_curves(self.clock.duration_s)
+            self.bar.show({"duration": self.clock.duration_s, "status": self._status(words)})
             self._show_frame()
+
+    def _status(self, ghost_words: str) -> str:
+        """How the episode and the ghost's ended, as HTML."""
+        if self.crossing is None:
+            return "This episode broke at once."
+        return f"{self.crossing.ending} after {self.crossing.duration_s:.1f} s{f' · {ghost_words}' * bool(ghost_words)}"
+
+    def _show_progress(self, words: str, share: float) -> None:
+        task = f"Recording {self.common.show.replicas} episodes of {self.controller}: {words or f'{share:.0%}'}"
+        self.bar.show({"share": share, "task": task})
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings if they are recorded, else have them recorded."""
-        self.recording = self.crossing = self._curves = None
-        self._groups = {}
+        self.recording = self.crossing = None
         self.scene.hide_crossing()
-        self._load_ghost()
         self.clock.load(0.0)
-        self.panel.show_controls(self.clock, enabled=False)
-        self.panel.curves.content = self.panel.numbers.content = ""
-        wanted = self._wanted(self.selection.picked, self.genes)
+        self.panel.show_curves(None)
+        self.panel.numbers.content = ""
+        self.bar.show({"enabled": False, "status": "", "marks": [], "episodes": [], "share": None})
+        wanted = self.common.wanted(self.selection.picked, self.controller, minimal=self._minimal)
         recording = None if wanted is None else self.common.recordings.read(wanted)
         self.common.recorder.record(None if recording is not None else wanted, tab=self.client.client_id)
+        self._load_ghost()
         if recording is not None:
             self._show_recording(recording)
         elif wanted is None:
-            self.panel.show_status(f"No crossing: {escape(self.common.show.note)}")
+            self.bar.show({"status": f"No crossing: {escape(self.common.show.note)}"})
         else:
-            self.panel.show_status(f"Recording {wanted.replicas} episodes of {escape(str(self.controller))} …", 0.0)
+            self._show_progress("", 0.0)
 
     def _show_recording(self, recording: Recording) -> None:
         self.recording = recording
-        self._groups = episodes_by_outcome(recording)
-        self._group = next(iter(self._groups))
-        self._show_details()
+        self.replica = typical_episode(recording, self._scales) if self.replica is None else self.replica
+        self.bar.show({"share": None, "episodes": episodes_by_ending(recording)})
+        self._show_rates()
         self.scene.set_paths(paths_of(recording))
         self._show_episode()
         self._record_ahead()
 
-    def _show_episodes(self) -> None:
-        """Offer the episodes to choose from, and say which is shown."""
-        recording = self.recording
-        if recording is not None:
-            words = {k: f"{k + 1}: {ending_words(recording, k)}" for k in self._groups[self._group]}
-            self.panel.show_episodes(list(self._groups), self._group, words, self.replica)
-
     def _show_episode(self) -> None:
-        assert self.recording is not None
-        archive, recording, number = self._archive, self.recording, self.replica + 1
-        if self.replica not in self._groups[self._group]:
-            self._group = next(iter(self._groups))
-        crossing = crossing_of(recording, self.replica, self.common.skeleton, archive.penalties, archive.scales)
-        self.crossing = crossing
-        date, commit = (str(recording.origin.get(name, "")) for name in ("date", "commit"))
-        status = (
-            f"All {recording.num_episodes}: {endings(recording)} ({escape(f'recorded {date[:10]} at {commit[:8]}')})."
+        assert self.recording is not None and self.replica is not None
+        archive = self._archive
+        self.crossing = crossing = crossing_of(
+            self.recording, self.replica, self.common.skeleton, archive.penalties, archive.scales
         )
-        if crossing is None:
-            self.clock.load(0.0)
-            status = f"<b>Episode {number} broke at once.</b> {status}"
-        else:
-            self.clock.load(crossing.duration_s)
-            self._show_ghost()
-            self.clock.seek(self._begin_s)
-            self._curves = Curves(crossing, archive.penalties)
-            status = f"<b>Episode {number}: {crossing.ending} after {crossing.duration_s:.1f} s.</b> {status}"
-            if crossing.touching is None:
-                status += " It was recorded before touches of bodies were kept."
+        self.clock.load(0.0 if crossing is None else crossing.duration_s)
+        self.panel.show_curves(crossing)
+        self._show_ghost()
+        if crossing is not None:
+            self.clock.seek(max(0.0, crossing.moment_s - _BEFORE_S) if self._begin_s is None else self._begin_s)
             self._show_frame()
-            self._show_moment()
-        self.panel.show_status(status)
-        self._show_episodes()
-        self.panel.show_controls(self.clock, enabled=crossing is not None)
+        marks = [] if crossing is None else list(crossing.marks)
+        self.bar.show({"enabled": crossing is not None, "marks": marks, "episode": self.replica + 1})
+        self._show_moment()
 
     def _show_frame(self) -> None:
         if self.crossing is not None:
@@ -445,9 +468,9 @@ class Tab:
                 self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames), self.ghost.name or "")
 
     def _show_moment(self) -> None:
-        crossing, curves = self.crossing, self._curves
-        if crossing is not None and curves is not None:
+        crossing, now = self.crossing, time.perf_counter()
+        if crossing is not None and (not self.clock.playing or now - self._numbers_at > _NUMBERS_S):
+            self._numbers_at = now
             frame = self.clock.frame(crossing.dt, crossing.num_frames)
-            numbers = moment_text(crossing, frame, self._archive.penalties, self.common.shapes.feet)
-            self.panel.curves.content, self.panel.numbers.content = curves.at(self.clock.time_s), numbers
-        self.panel.show_time(self.clock)
+            self.panel.show_numbers(moment_text(crossing, frame, self.common.shapes.feet))
+        self.bar.show({"time": round(self.clock.time_s, 3), "playing": self.clock.playing})

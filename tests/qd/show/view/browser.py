@@ -1,6 +1,5 @@
 """A real browser without a screen, chromium driven by playwright: for tests of the page, and for its screenshots."""
 
-import re
 import shutil
 import time
 from contextlib import contextmanager
@@ -36,16 +35,13 @@ def wait_until(page, true):
         page.wait_for_timeout(100)
 
 
-def see(page, text):
-    """Waits until a text is to be seen."""
-    page.get_by_text(re.compile(text)).first.wait_for(timeout=LIMIT_MS)
+def wait_for(page, script):
+    """Waits until a script, such as ``time() > 3``, is true; it may name ``time`` and ``button`` of the player bar."""
+    bar = "const button = document.querySelector('#faultline [data-do=play]')?.ariaLabel, "
+    bar += "time = () => Number(document.querySelector('#faultline input[type=range]').value);"
+    page.wait_for_function(f"() => {{ {bar} return {script}; }}", timeout=LIMIT_MS)
 
 
-def click_another(page, shown):
-    """Clicks a line of the list that is not the one shown; returns its number."""
-    for line in page.get_by_role("button", name=re.compile(r"^\d+: .*goal")).all():
-        number = line.inner_text().split(":")[0]
-        if number != shown:
-            line.click()
-            return number
-    raise AssertionError("the list has no other elite")
+def until_it_plays(page):
+    """Waits until the robot plays."""
+    wait_for(page, "button === 'Pause'")

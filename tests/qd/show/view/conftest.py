@@ -6,16 +6,16 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from qd.show.view.plots import axes_of
+from qd.show.view.listing import listing_of
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
-_NEED_VISER = ("test_app.py", "test_panels.py", "test_address.py", "test_browser.py", "test_show.py")
+_NEED_VISER = ("test_app.py", "test_listing.py", "test_address.py", "test_browser.py", "test_show.py")
 collect_ignore = [] if find_spec("viser") else list(_NEED_VISER)
 
 
 @pytest.fixture
-def axes():
+def listing():
     """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
     numbers = np.arange(20)
     archive = dataclasses.replace(
@@ -25,4 +25,4 @@ def axes():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return axes_of(archive, SUPER_GAUSSIAN)
+    return listing_of(archive, SUPER_GAUSSIAN)

@@ -9,26 +9,27 @@ class Instant:
     Policy `droppable` takes long and can be dropped.
     """
 
-    def __init__(self, policy, drop):
-        if policy == "refused":
-            raise ValueError("no such controller")
-        self.policy, self.terrains, self.drop = policy, [], drop
+    def __init__(self, drop):
+        self.wanted, self.drop = [], drop
 
-    def put(self, terrains, seeds):
-        self.terrains.append(terrains[0, 0])
+    def put(self, wanted, how):
+        self.wanted.append((wanted, *how))
 
     def take(self, progress):
-        terrain = self.terrains.pop(0)
-        if terrain == 13.0:
+        wanted, robot, only_ready = self.wanted.pop(0)
+        if wanted.policy == "refused":
+            return ValueError("no such controller")
+        if only_ready:
+            return None
+        if wanted.terrain_seed == 13:
             raise RuntimeError("broken")
         progress(0.5)
-        if self.policy == "slow":
+        if wanted.policy == "slow":
             time.sleep(1.0)
-        if self.policy == "droppable" and self.drop.wait(1.0):
+        if wanted.policy == "droppable" and self.drop.wait(1.0):
             return None
-        return f"{self.policy} on {terrain:.0f}"
+        return f"{robot}: {wanted.policy} on {wanted.terrain_seed}"
 
 
-def build(cfg, num_terrains):
-    _, first, drop = cfg
-    return Instant(first.policy, drop)
+def build(drop, num_terrains):
+    return Instant(drop)

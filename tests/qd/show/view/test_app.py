@@ -11,6 +11,7 @@ import pytest
 from kernels.episode import Outcome
 from qd.archive import read_archive
 from qd.minimise import MinimalTerrains
+from qd.show.crossed import moment_of_failure, typical_episode
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.recorder import Report
@@ -32,16 +33,36 @@ def show(anymal, run):
     return find_show(run, elite="0", policies=policies)
 
 
+class Asked:
+    """A recorder that records nothing; what it was asked for is kept."""
+
+    def __init__(self):
+        self.wanted, self.cancelled = [], []
+
+    def record(self, wanted, *, tab=0):
+        self.wanted.append(wanted)
+
+    def record_ahead(self, wanted, *, tab=0):
+        pass
+
+    warm = cancel = lambda self, wanted: self.cancelled.append(wanted)
+
+    def stop(self):
+        pass
+
+
 class Shown:
     """A viewer with one tab, and what its visitor does; what it would record is kept in ``asked``."""
 
     def __init__(self, show, recordings, query=""):
-        self.app = App(show, recordings, host="127.0.0.1", port=free_port())
-        self.asked = []
-        self.app.recorder.record = lambda wanted, tab=0: self.asked.append(wanted)
-        self.app.recorder.record_ahead = lambda wanted, tab=0: None
+        self.recorder = Asked()
+        self.app = App(show, recordings, self.recorder, host="127.0.0.1", port=free_port())
         self.visitors = []
         self.tab = self.come(query)
+
+    @property
+    def asked(self):
+        return [wanted for wanted in self.recorder.wanted if wanted is not None and "panel" not in wanted.policy]
 
     def come(self, query="") -> Tab:
         """The tab of another visitor, whose address says so."""
@@ -86,7 +107,7 @@ def tab(shown):
 
 
 def status(tab) -> str:
-    return re.sub(r"<.*?>", "", tab.panel.status.content)
+    return re.sub(r"<.*?>", "", tab.bar.shown["status"])
 
 
 def wait_until(true):
@@ -102,31 +123,63 @@ def notes(shown, count, visitor=0):
     return shown.visitors[visitor].notes
 
 
-def test_the_worst_elite_is_there_with_its_crossing(tab):
-    assert "Elite 0" in tab.panel.details.content
-    assert status(tab).startswith("Episode 1: base collision after 6.2 s. All 20: 19 base collision, 1 out of time")
-    assert tab.scene.robot.visible and not tab.panel.play.disabled
-    place = tab.selection.listed.index(0)
-    assert tab.list.lines[place].label.startswith("0: fault · goal 2% ")
-    assert tab.clock.duration_s == pytest.approx(6.19)
+def test_an_elite_opens_a_second_before_the_robot_fails_and_plays(shown, show, worst_crossed):
+    tab, (_, recording) = shown.tab, worst_crossed
+    archive = show.opened_run.archive
+    typical = typical_episode(recording, dict(zip(archive.penalties, archive.scales, strict=True)))
+    moment = moment_of_failure(recording, typical)
+    assert tab.replica == typical and tab.bar.shown["episode"] == typical + 1
+    assert tab.clock.time_s == pytest.approx(max(0.0, moment - 1.0)) and tab.playing and tab.scene.follow
+    name = show.listing.ranking.name(0)
+    assert tab.bar.shown["title"] == name and name in tab.panel.head.content and "elite 0 " in tab.panel.head.content
+    assert tab.scene.robot.visible and tab.bar.shown["enabled"]
+    assert status(tab).startswith("base collision") and tab.bar.shown["episodes"][0][0] == "19 of 20: base collision"
+    shown.do((tab.choose_replica, 0))
+    assert tab.clock.duration_s == pytest.approx(6.19) and tab.bar.shown["duration"] == tab.clock.duration_s
+    assert tab.clock.time_s == pytest.approx(max(0.0, moment_of_failure(recording, 0) - 1.0)) and tab.playing
+    shown.do((tab.choose_replica, 16), (tab.pick, 7), (tab.pick, 0))
+    assert tab.replica == typical and tab.playing  # as at first
+
+
+def test_what_a_visitor_does_on_the_bar_is_done(shown):
+    tab, visitor = shown.tab, shown.visitors[0]
+    shown.do((tab.play,))
+    for name, value, true in (
+        ("seek", 2.5, lambda: tab.clock.time_s == 2.5),
+        ("speed", 0.25, lambda: tab.clock.speed == 0.25),
+        ("follow", False, lambda: not tab.scene.follow),
+        ("episode", 17, lambda: tab.replica == 16),
+        ("play", None, lambda: not tab.playing),
+        ("go_on", -0.1, lambda: not tab.playing),
+        ("mark", None, lambda: tab.clock.time_s == tab.crossing.marks[0].time_s or tab.clock.time_s > 0.0),
+        ("pick", 171, lambda: tab.selection.picked == 171),
+        ("step", -1, lambda: tab.selection.picked != 171),
+        ("open", "?elite=0&t=3", lambda: (tab.selection.picked, tab.clock.time_s) == (0, 3.0)),
+        ("resize", [390, 844], lambda: tab.window == (390, 844)),
+    ):
+        visitor.act(**{name: value})
+        wait_until(lambda true=true: shown.app.do_tasks(wait_s=0.1) or true())
+    for name, value in (("seek", "far"), ("seek", float("inf")), ("resize", 3), ("episode", None), ("nothing", 1)):
+        shown.do((tab.act, name, value))  # what makes no sense is left out
+    assert tab.clock.time_s == 3.0 and tab.window == (390, 844)
 
 
 def test_what_one_tab_does_no_other_tab_sees(shown):
     first, second = shown.tab, shown.come("?elite=171&t=3")
-    assert "Elite 0" in first.panel.details.content and "Elite 171" in second.panel.details.content
-    before = second.list.count.content
+    assert first.selection.picked == 0 and second.selection.picked == 171
+    before = second.list.list.content
     shown.do(
         (first.choose_replica, 16),
         (first.seek, 2.0),
-        (first.list.change, first.selection.brush, "goal_rate", 0.9, 1.0),
         (first.set_follow, True),
     )
-    shown.do((first.play,))
+    first.selection.choose(kind="not failing")
+    first.list.show()
     assert first.playing and not second.playing and not second.scene.follow
-    assert second.list.count.content == before and second.selection.picked == 171 and second.replica == 0
+    assert second.list.list.content == before != first.list.list.content and second.selection.picked == 171
     shown.do((second.pick, 0))
-    assert status(second).startswith("Episode 1: base collision") and second.clock.time_s == 0.0
-    assert status(first).startswith("Episode 17: out of time")
+    assert status(second).startswith("base collision") and second.playing
+    assert status(first).startswith("out of time")
     shown.visitors[1].close()
     wait_until(lambda: shown.app.do_tasks(wait_s=0.1) or len(shown.app.tabs) == 1)
     assert list(shown.app.tabs.values()) == [first] and first.playing  # it is left alone
@@ -144,8 +197,8 @@ def test_a_link_opens_what_it_was_copied_from(shown):
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
     second = shown.come(f"?{query}&darkMode=")
     assert (second.controller, second.replica, second.clock.time_s) == ("other", 16, 1.25)
-    assert second.panel.controller.value == "other" and second.panel.episode.value.startswith("17: out of time")
-    assert second.scene.follow and second.panel.follow.value
+    assert second.panel.controller.value == "other" and status(second).startswith("out of time")
+    assert second.scene.follow and second.bar.shown["follow"] and not second.playing
     second.show_address()
     assert second.query.startswith("darkMode=&elite=0&controller=other&episode=17&t=1.25&follow=1")
     wait_until(lambda: any(second.query in script for script in shown.visitors[1].scripts))
@@ -158,7 +211,7 @@ def test_what_is_not_there_is_refused_in_words(shown):
     shown.do((shown.tab.pick_typed, "99999"), (shown.tab.pick_typed, "-3"), (shown.tab.pick_typed, "17.5"))
     for words, text in zip(notes(shown, 3), ("99999", "-3", "17.5"), strict=True):
         assert f"'{text}'" in words
-    assert shown.tab.selection.picked == 0 and shown.tab.list.number.value == "0"
+    assert shown.tab.selection.picked == 0
     shown.do((shown.tab.pick_typed, " 171 "))
     assert shown.tab.selection.picked == 171
 
@@ -166,6 +219,7 @@ def test_what_is_not_there_is_refused_in_words(shown):
 def test_what_touches_is_coloured_while_it_touches(shown, worst_crossed):
     tab = shown.tab
     touching, names = tab.recording.touching[0, 0], tab.recording.geom_names
+    shown.do((tab.choose_replica, 0), (tab.play,))
     shank = names.index("RF_SHANK")
     for frame in (int(np.argmax(touching[:, shank])), int(np.flatnonzero(~touching[:, shank])[0])):
         shown.do((tab.seek, 0.02 * frame))
@@ -174,18 +228,17 @@ def test_what_touches_is_coloured_while_it_touches(shown, worst_crossed):
         assert columns == set(np.flatnonzero(touching[frame]).tolist())
     shown.do((tab.pick, 7))
     old = dataclasses.replace(worst_crossed[1], touching=None, geom_names=())
-    shown.do((shown.app.show_report, Report(wanted=shown.asked[-1], text="recorded", recording=old)))
+    shown.do((shown.app.show_report, Report(wanted=shown.asked[-1], text="", result=old)))
     assert tab.scene.robot.visible and not any(handle.visible for handle in tab.scene.touched)
 
 
 def test_playing_and_dragging_move_the_robot(shown):
     tab = shown.tab
+    shown.do((tab.play,), (tab.seek, 0.0))
     before = tab.scene.bodies[0].position.copy()
-    shown.do((tab.seek, 5.0))
+    shown.do((tab.seek, 5.0), (tab.play,))
     assert tab.scene.bodies[0].position[0] > before[0] + 1.0
-    assert tab.panel.time.value == 5.0
-    shown.do((tab.play,))
-    assert tab.clock.playing and tab.panel.play.label == "Pause"
+    assert tab.bar.shown["time"] >= 5.0 and tab.bar.shown["playing"]
     shown.do(
         (tab.play,),
         (tab.set_speed, 0.25),
@@ -214,33 +267,44 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
         tab = shown.tab
         assert tab.panel.terrain.visible and tab.panel.terrain.value == "whole"
         assert "**Minimal terrain**: 1 of 8 parts; goal reached 10% (3 to 25%)" in tab.panel.details.content
+        assert "fresh" in tab.panel.rates.content
         shown.do((tab.choose_terrain, True))
         assert shown.asked[-1].label == "minimal terrain of elite 0 of anymal" and not tab.scene.robot.visible
         np.testing.assert_array_equal(shown.asked[-1].terrain, genes)
         tab.show_address()
-        assert "terrain=minimal" in tab.query and shown.come(f"?{tab.query}").genes is genes
+        assert "terrain=minimal" in tab.query and shown.come(f"?{tab.query}").minimal
+        assert tab.panel.rates.content == ""  # what is known is of the whole terrain
         shown.do((tab.pick, 7))
-        assert tab.genes is None and not tab.panel.terrain.visible
+        assert not tab.minimal and not tab.panel.terrain.visible
         shown.come("?elite=7&terrain=minimal")
         assert notes(shown, 1, visitor=2) == ["Elite 7 has no minimal terrain here."]
 
 
 def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     tab = shown.tab
-    assert not tab.scene.ghost.visible and tab.panel.ghost.value == "who certifies it"  # nobody does here
-    assert "0% (0 to 16%)" in tab.panel.details.content  # none of 20 reached the goal: Wilson
+    shown.do((tab.choose_ghost, "none"))
+    assert not tab.scene.ghost.visible
     shown.do((tab.choose_ghost, "other"), (tab.seek, 5.0))  # the same file, so the same crossing
-    assert tab.panel.details.content.count("95% (76 to 99%)") == 2  # 19 base collisions of 20, of both
     assert tab.scene.ghost.visible and tab.scene.robot.visible
     np.testing.assert_array_equal(tab.scene.ghost_bodies[0].position, tab.scene.bodies[0].position)
-    assert "Ghost, other: " in tab.panel.ghost_status.content
+    assert "Ghost, other: " in tab.panel.ghost_status.content and "Ghost, other: base collision" in status(tab)
     tab.show_address()
     assert "&ghost=other" in tab.query
     assert shown.come(f"?{tab.query}").scene.ghost.visible
     shown.do((tab.choose_controller, "other"))  # none is its own ghost
     assert not tab.scene.ghost.visible and tab.panel.ghost_status.content == ""
+    assert tab.panel.rates.content.count("<th>other") == 1  # another controller than the search's has a column
     shown.do((tab.choose_controller, "base"), (tab.choose_ghost, "none"))
     assert not tab.scene.ghost.visible
+
+
+def test_the_ghost_is_who_certifies_it_or_words_say_why_there_is_none(show):
+    certified = int(np.flatnonzero(show.opened_run.archive.certified)[0])
+    name, words = show.certifying(certified)
+    assert (name, words) == (show.opened_run.certifier(certified), "") and name in ("C-G", "S")
+    lost = dataclasses.replace(show, controllers={"base": "shipped"})
+    name, words = lost.certifying(certified)
+    assert name is None and "--policies" in words
 
 
 def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
@@ -249,16 +313,33 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
     shown.do((tab.pick, 7))
     wanted = shown.asked[-1]
     assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
-    assert not tab.scene.robot.visible and tab.panel.play.disabled
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="crossing", share=0.4)))
-    assert status(tab) == "Recording 20 episodes of base: crossing …" and tab.panel.progress.value == 40.0
+    assert not tab.scene.robot.visible and not tab.bar.shown["enabled"]
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="", share=0.4)))
+    assert tab.bar.shown["task"] == "Recording 20 episodes of base: 40%" and tab.bar.shown["share"] == 0.4
     other = dataclasses.replace(wanted, terrain_seed=8)
     shown.do((shown.app.show_report, Report(wanted=other, text="no", failed=True)))
-    assert "crossing" in status(tab)  # of what is not shown nothing is said
+    assert tab.bar.shown["share"] == 0.4  # of what is not shown nothing is said
     shown.do((shown.app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
-    assert status(tab) == "No crossing: it &lt;broke&gt;"
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="recorded", recording=recording)))
-    assert status(tab).startswith("Episode 1: base collision") and tab.scene.robot.visible
+    assert status(tab) == "No crossing: it &lt;broke&gt;" and tab.bar.shown["share"] is None
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="", result=recording)))
+    assert status(tab).startswith("base collision") and tab.scene.robot.visible
+
+
+def test_a_film_is_made_and_offered_or_cancelled(shown, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tab, films = shown.tab, Asked()
+    tab._filming._common = dataclasses.replace(tab.common, films=lambda: films)
+    shown.do((tab.film,))
+    (wanted,) = films.wanted
+    assert wanted.file.name == f"elite-0-base-episode-{tab.replica + 1}.mp4" and wanted.recording is tab.recording
+    shown.do((shown.app.show_report, Report(wanted=wanted, text="", share=0.4)))
+    assert "40%" in tab.panel.film_status.content
+    shown.do((tab.cancel_film,), (tab.film,))
+    assert films.cancelled == [wanted] and len(films.wanted) == 2
+    made = tmp_path / "film.mp4"
+    made.write_bytes(bytes(1_500_000))
+    shown.do((shown.app.show_report, Report(wanted=films.wanted[1], text="", result=made)))
+    assert "film.mp4 (1.5 MB)" in tab.panel.film_status.content
 
 
 def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
@@ -266,7 +347,7 @@ def test_without_a_controller_terrains_are_shown_all_the_same(show, tmp_path):
     with closing(Shown(bare, Recordings(show.robot, folder=tmp_path))) as shown:
         tab = shown.tab
         shown.do((tab.pick, 3), (tab.play,), (tab.seek, 1.0), (tab.choose_replica, 2), (tab.set_follow, True))
-        assert status(tab) == "No crossing: it is &lt;lost&gt;" and "Elite 3" in tab.panel.details.content
+        assert status(tab) == "No crossing: it is &lt;lost&gt;" and "elite 3 " in tab.panel.head.content
 
 
 @pytest.mark.slow

@@ -7,8 +7,7 @@ from kernels.episode import Outcome
 from qd.show.view.playing import (
     Mark,
     crossing_of,
-    endings,
-    episodes_by_outcome,
+    episodes_by_ending,
     marks_of,
     moment_text,
     next_mark,
@@ -63,9 +62,9 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
     np.testing.assert_allclose(begin[:2], [2.0, 4.0], atol=1e-6)
-    text = moment_text(crossing, 0, (), recording.foot_names)
+    text = moment_text(crossing, 0, recording.foot_names)
     assert f"{recording.foot_names[0]} 0 · {recording.foot_names[1]} 0" in text
-    assert "Command: 0.75, 0.25 m/s, 0.50 rad/s" in text and "base at 2.00, 4.00, 0.00 m" in text
+    assert "Command: 0.75, 0.25 m/s, 0.50 rad/s" in text and "Base at 2.00, 4.00, 0.00 m" in text
 
 
 def test_an_episode_that_broke_at_once_has_nothing_to_show(skeleton, recording):
@@ -73,12 +72,10 @@ def test_an_episode_that_broke_at_once_has_nothing_to_show(skeleton, recording):
     assert crossing_of(recording, 2, skeleton, (), ()) is None
 
 
-def test_ways_and_endings_of_all_episodes(recording):
+def test_paths_of_all_episodes(recording):
     paths = paths_of(recording, every=2)
     assert [len(points) for points, _ in paths] == [4, 3, 0]  # frames 0 2 4 5, and 0 2 3
     np.testing.assert_allclose(paths[1][0][:, 0], [2.0, 2.2, 2.3], atol=1e-6)
-    assert "1 base collision" in endings(recording) and "1 out of time" in endings(recording)
-    assert "goal" not in endings(recording)
 
 
 def test_marks_stand_where_things_happen_first():
@@ -98,13 +95,20 @@ def test_marks_stand_where_things_happen_first():
     assert next_mark(marks, 0.4) == marks[0]  # round again
 
 
-def test_episodes_are_chosen_by_what_they_have_in_common():
+def test_a_robot_that_gets_stuck_has_a_mark_where_it_stays():
+    made = recording_of([Outcome.TIME_OUT], [6.0], penalties=np.zeros((1, 6)))  # 0.2 m a frame, from 2 m to 6 m
+    crossing = marks_of(made, 0)
+    assert [mark.words for mark in crossing] == ["stuck", "end: out of time"]
+    np.testing.assert_allclose(
+        [mark.time_s for mark in crossing], [0.38, 0.40]
+    )  # frame 19 lies within 0.3 m of the end
+
+
+def test_episodes_are_offered_by_how_they_ended():
     outcomes = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT, Outcome.BASE_COLLISION]
     made = recording_of(outcomes, [6.0] * 4, fallen=[False, False, True, True])
-    assert episodes_by_outcome(made) == {
-        "all 4 episodes": [0, 1, 2, 3],
-        "the 2 that ended: out of time": [0, 2],
-        "the 1 that ended: reached the goal": [1],
-        "the 1 that ended: base collision": [3],
-        "the 2 that fell": [2, 3],
-    }
+    assert episodes_by_ending(made) == [
+        ("2 of 4: out of time", [(1, "episode 1: out of time"), (3, "episode 3: out of time · fallen")]),
+        ("1 of 4: reached the goal", [(2, "episode 2: reached the goal")]),
+        ("1 of 4: base collision", [(4, "episode 4: base collision · fallen")]),
+    ]

@@ -22,9 +22,10 @@ def reports():
 
 
 @pytest.fixture(scope="module")
-def recorder(anymal, reports):
-    """One for all tests, since every process of a controller takes seconds to begin."""
-    recorder = Recorder(anymal, reports.put, build=build)
+def recorder(reports):
+    """One for all tests, since its process takes seconds to begin."""
+    recorder = Recorder(build=build)
+    recorder.robot, recorder.report = "spot", reports.put
     yield recorder
     recorder.stop()
 
@@ -32,7 +33,7 @@ def recorder(anymal, reports):
 def last_of(reports):
     """Reports up to the one that ends a recording."""
     received = []
-    while not received or not (received[-1].recording or received[-1].failed):
+    while not received or not (received[-1].result or received[-1].failed):
         received.append(reports.get(timeout=60))
     return received
 
@@ -41,7 +42,7 @@ def test_progress_comes_before_the_recording(recorder, reports):
     recorder.record(wish(2))
     received = last_of(reports)
     assert [report.share for report in received] == [0.0, 0.5, 1.0]
-    assert "building" in received[0].text and received[-1].recording == "fast on 2"
+    assert "built" in received[0].text and received[-1].result == "spot: fast on 2"
     recorder.record(wish(3))
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
@@ -52,8 +53,8 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
         pass
     for number in (2, 3, 4):
         recorder.record(wish(number, "slow"))
-    assert last_of(reports)[-1].recording == "slow on 1"
-    assert last_of(reports)[-1].recording == "slow on 4"
+    assert last_of(reports)[-1].result == "spot: slow on 1"
+    assert last_of(reports)[-1].result == "spot: slow on 4"
     recorder.record(wish(5))
     recorder.record(None)
     time.sleep(0.5)
@@ -66,13 +67,13 @@ def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, r
     time.sleep(0.5)  # it may be at the first
     recorder.record(wish(7, "droppable"))
     received = last_of(reports)  # of what nobody waits for nothing is told but the end
-    assert received[-1].recording == "droppable on 7" and {report.wanted.terrain_seed for report in received} <= {
+    assert received[-1].result == "spot: droppable on 7" and {report.wanted.terrain_seed for report in received} <= {
         0,
         1,
         7,
     }
-    later = last_of(reports)[-1].recording
-    assert later in ("droppable on 1", "droppable on 2")  # the other one is dropped, or done before
+    later = last_of(reports)[-1].result
+    assert later in ("spot: droppable on 1", "spot: droppable on 2")  # the other one is dropped, or done before
     recorder.record_ahead([wish(13)])  # it breaks, and nobody waits for it
     recorder.record(None)
     time.sleep(0.3)
@@ -89,9 +90,19 @@ def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
     failed = last_of(reports)[-1]
     assert failed.failed and "RuntimeError: broken" in failed.text
     recorder.record(wish(14))
-    assert last_of(reports)[-1].recording == "fast on 14"
+    assert last_of(reports)[-1].result == "spot: fast on 14"
     recorder.record(wish(1, "refused"))
     assert last_of(reports)[-1].text == "no such controller"
+
+
+def test_what_is_worked_on_can_be_cancelled(recorder, reports):
+    recorder.record(task := wish(1, "droppable"))
+    while reports.get(timeout=60).share == 0.0:  # until it is crossing
+        pass
+    began = time.perf_counter()
+    recorder.cancel(task)
+    recorder.record(wish(2))
+    assert last_of(reports)[-1].result == "spot: fast on 2" and time.perf_counter() - began < 0.9
 
 
 def test_stopping_does_not_wait_for_a_recording(recorder, reports):
@@ -105,14 +116,14 @@ def test_stopping_does_not_wait_for_a_recording(recorder, reports):
 
 @pytest.mark.slow
 def test_a_simulation_is_recorded(anymal):
-    reports = queue.SimpleQueue()
-    recorder = Recorder(anymal, reports.put)
+    reports, recorder = queue.SimpleQueue(), Recorder()
+    recorder.robot, recorder.report = anymal, reports.put
     try:
         received = []
         for seed in (1, 2):  # it falls on the spike at once, every time from another start
             stands = {"terrain": spike(), "policy": "tests.sim.policies:stand"}
             recorder.record(Wanted(label="", **stands, replicas=4, terrain_seed=seed))
-            received.append(last_of(reports)[-1].recording)
+            received.append(last_of(reports)[-1].result)
     finally:
         recorder.stop()
     assert [recording.seeds.tolist() for recording in received] == [[1], [2]]

@@ -1,5 +1,6 @@
 """A browser's part of viser's protocol, as far as a tab needs it: it comes, answers, and looks somewhere."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -47,7 +48,7 @@ class Visitor:
     def __init__(self, port: int, query: str = "") -> None:
         protocol = f"viser-v{viser.__version__}"
         self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None, compression=None)
-        self._query = query
+        self._query, self._channel = query, ""
         self.scripts: list[str] = []
         """What the page had it run."""
         self.notes: list[str] = []
@@ -81,14 +82,16 @@ class Visitor:
         except ConnectionClosed:
             pass
 
+    def act(self, **done) -> None:
+        """Do something on the player bar."""
+        self._send(type="GuiUpdateMessage", uuid=self._channel, updates={"value": json.dumps([0, done])})
+
     def _take(self, message) -> None:
         if message["type"] == "RunJavascriptMessage":
             self.scripts.append(message["source"])
+            if "hello" in message["source"]:
+                self.act(hello=[self._query, WIDTH, HEIGHT])
         elif message["type"] == "NotificationShowMessage":
             self.notes.append(message["props"]["body"])
-        elif message["type"] == "LocalStorageGetItemRequestMessage":
-            asked = any(message["key"] in script and "location.search" in script for script in self.scripts)
-            self._send(
-                type="LocalStorageGetItemResponseMessage", value=self._query if asked else None, error=None,
-                request_uuid=message["request_uuid"],
-            )  # fmt: skip
+        elif message["type"] == "GuiTextMessage":
+            self._channel = message["uuid"]

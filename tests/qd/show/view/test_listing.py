@@ -1,0 +1,103 @@
+import dataclasses
+import re
+
+import numpy as np
+
+from qd.show.crossed import crossed_of
+from qd.show.view.listing import KINDS, Choice, column_of, listing_of, table_html
+from qd.show.view.panels import Clock, Selection
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import fresh_values, judged_archive, small_archive
+from tests.qd.recordings import recording_of
+
+
+def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(listing):
+    selection, ranking = Selection(listing), listing.ranking
+    assert selection.picked == ranking.worst(1)[0]
+    assert selection.matching.tolist() == ranking.order("cause").tolist()
+    selection.choose(order="collision_rate")
+    assert selection.matching.tolist() == [*range(1, 20, 2), *range(0, 20, 2)]
+    selection.choose(order="goal_rate")
+    selection.picked = 3
+    assert selection.matching.tolist() == list(range(20)) and selection.step(1) == 4
+    selection.choose(kind="not failing", order="fitness")
+    assert selection.matching.tolist() == list(range(10, 20)) and selection.step(1) == 10  # on from where it was
+    selection.choose(kind="faults")
+    assert selection.matching.tolist() == [] and selection.step(-1) == selection.picked == 3
+    cause, rows = next(iter(ranking.by_cause().items()))
+    selection.choose(kind="all", cause=cause)
+    assert selection.matching.tolist() == sorted(rows.tolist())  # by fitness, so as they are numbered
+
+
+def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(listing):
+    members = {cause: len(rows) for cause, rows in listing.ranking.by_cause().items()}
+    assert sum(members.values()) == 10  # those with a goal rate below .5
+    assert list(listing.causes()) == ["all", *(f"{cause} ({count})" for cause, count in members.items())]
+    rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', listing.rows_html([12, 0]))
+    assert rows == [("12", "crossed, 12 of 20"), ("0", listing.ranking.name(0))]
+
+
+def test_faults_come_before_certified_confirmed_and_other_failing_elites():
+    listing = listing_of(judged_archive(), SUPER_GAUSSIAN)  # fault, confirmed, certified, failing, not failing
+    assert listing.listed(Choice(order="fault")).tolist() == [0, 2, 1, 3, 4]
+    listed = {kind: sorted(listing.listed(Choice(kind=kind)).tolist()) for kind in KINDS}
+    assert listed == {
+        "all": [0, 1, 2, 3, 4], "faults": [0], "certified": [0, 2], "confirmed": [0, 1], "failing": [0, 1, 2, 3],
+        "not failing": [4],
+    }  # fmt: skip
+    assert list(listing.kinds()) == ["all (5)", "faults (1)", "certified (2)", "confirmed (2)", "failing (4)",
+                                     "not failing (1)"]  # fmt: skip
+    assert "It is a fault" in listing.details(0)
+
+
+def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
+    listing = listing_of(judged_archive(), SUPER_GAUSSIAN)
+    fresh, resolved, certifier = listing.columns(0)
+    assert fresh[:2] == ("fresh", 40) and fresh[2]["goal_rate"] == 0
+    # 9 at the goal, 6 base collisions and 5 others with contact resolved; S crosses it 10 times, C-G 9
+    assert resolved == ("contact resolved", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
+    assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
+    recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
+    recorded = column_of("here", crossed_of(recording, (), ()))
+    assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
+    table = table_html([resolved, recorded])
+    assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]
+    # Wilson, z^2 = 3.8415, of 9 of 20: .4587 +- .1998
+    assert "<b>45%</b> <small>26 to 66%</small>" in table
+
+
+def test_numbers_of_fresh_episodes_come_first():
+    archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
+    fresh = fresh_values(archive)
+    fresh = dataclasses.replace(
+        fresh, collision_rate=np.array([0.5, 0.25, 0.0]), invalid_episodes=np.array([0, 0, 39]), fitness=np.zeros(3)
+    )
+    listing = listing_of(dataclasses.replace(archive, fresh=fresh), SUPER_GAUSSIAN)
+    (column,), (other,) = listing.columns(0), listing.columns(2)
+    assert (column[0], column[1], column[2]["collision_rate"]) == ("fresh", 40, 20)
+    assert (other[0], other[1], other[2]["collision_rate"]) == ("as found", 4, 4)
+
+
+def test_time_goes_by_at_its_speed():
+    clock = Clock()
+    clock.load(2.0)
+    clock.tick(1.0)
+    assert clock.time_s == 0.0  # it does not play yet
+    clock.toggle()
+    clock.speed = 0.5
+    clock.tick(1.0)
+    assert clock.time_s == 0.5
+    clock.speed = 4.0
+    clock.tick(1.0)
+    assert (clock.time_s, clock.playing) == (2.0, False)  # at its end
+    clock.toggle()
+    assert (clock.time_s, clock.playing) == (0.0, True)  # from the beginning
+    clock.toggle()
+    clock.seek(1.23)
+    assert clock.frame(0.02, 101) == 62  # 61.5, to the even one
+    clock.seek(99.0)
+    assert clock.time_s == 2.0 and clock.frame(0.02, 90) == 89
+    clock.seek(-1.0)
+    assert clock.frame(0.02, 90) == 0
+    clock.load(1.0)
+    assert clock.duration_s == 1.0
