@@ -25,10 +25,6 @@ ARCHIVE_FILE = "archive.npz"
 class FreshValues(Evaluation):
     """What fresh episodes say of N elites, free of the luck that made them elites; a collision bit as searched."""
 
-    collision_low: NDArray[np.float64]
-    """Lower limit of the 95 % interval of the collision rate, shape (N,); 0 of an invalid elite."""
-    collision_high: NDArray[np.float64]
-    """Upper limit, shape (N,); 1 of an invalid elite."""
     reproduced: NDArray[np.bool_]
     """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
 
@@ -64,8 +60,6 @@ class FaultCounts:
 
     resolved_outcomes: NDArray[np.int64]
     """By the controller that was searched, with contact resolved, shape (N, 4)."""
-    mujoco_c_outcomes: NDArray[np.int64]
-    """The same in plain MuJoCo C, shape (N, 4)."""
     certifiers: tuple[str, ...] = ()
     """Names of C other controllers."""
     certifier_sha256: tuple[str, ...] = ()
@@ -79,12 +73,7 @@ class FaultCounts:
     def none_of(cls, num_elites: int) -> "FaultCounts":
         """Of elites that nobody has crossed yet."""
         none, nobody = np.zeros((num_elites, 4), np.int64), np.zeros((num_elites, 0, 4), np.int64)
-        return cls(
-            resolved_outcomes=none,
-            mujoco_c_outcomes=none,
-            certifier_outcomes=nobody,
-            certifier_resolved_outcomes=nobody,
-        )
+        return cls(resolved_outcomes=none, certifier_outcomes=nobody, certifier_resolved_outcomes=nobody)
 
     def rows(self, chosen: NDArray[np.int64]) -> "FaultCounts":
         """Those of some of the elites alone, in the order given."""
@@ -238,8 +227,7 @@ _SHAPES = {
     **dict.fromkeys(("penalties", "scales"), "P"),
     **dict.fromkeys(_CERTIFIERS, "C"),
     "genes": "NG", "end_position": "N2", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
-    **dict.fromkeys(("resolved_outcomes", "mujoco_c_outcomes"), "N4"),
-    **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
+    "resolved_outcomes": "N4", **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
 }  # fmt: skip
 """Dimensions of arrays in N elites, G genes, P penalties and C certifiers; N alone of all others."""
 PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))

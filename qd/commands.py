@@ -128,19 +128,17 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
     if under half of the robots reach the goal. resolved: those that fail are crossed in 20 episodes with contact
     resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
     controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
-    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. mujoco_c: up to
-    100 of those that fail are crossed in plain MuJoCo C. Crossings are kept, so the same command goes on after Ctrl-C.
+    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. Crossings are
+    kept, so the same command goes on after Ctrl-C.
     """
 
     run: Path | None = None
     """Run directory; the newest of the robot under runs/."""
-    stages: tuple[Literal["fresh", "resolved", "others", "mujoco_c"], ...] = ("fresh", "resolved", "others")
+    stages: tuple[Literal["fresh", "resolved", "others"], ...] = ("fresh", "resolved", "others")
     """What to do, in this order."""
     certifiers: tuple[str, ...] = ()
     """The other controllers, each NAME=FILE; if left out, RUN/certifiers/*.pt and the robot's panel:
     sim/robots/<robot>/panel/*.pt, of a robot of your own <robot>/panel/*.pt beside its settings."""
-    seed: NonNegativeInt | None = None
-    """Seed of the fresh episodes; the search's if left out."""
 
     def execute(self) -> None:
         """Judges the run."""
@@ -161,7 +159,6 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
             robot=self.robot,
             policy=self.policy,
             space=self.space,
-            seed=self.seed,
         )
         say_what_stops_the_robot(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 

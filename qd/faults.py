@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import OUTCOMES, Archive, FaultCounts, FreshValues, goal_rates
-from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR
+from qd.fitness import FITNESS_FLOOR
 from sim.files.intervals import bootstrap_interval, rate_words, wilson_interval
 
 FRESH_EPISODES = 40
@@ -74,13 +74,9 @@ def fault_numbers(
     }
     if faults is None or not failing.any():
         return numbers
-    resolved, in_c = failing & faults.resolved_outcomes.any(axis=1), failing & faults.mujoco_c_outcomes.any(axis=1)
+    resolved = failing & faults.resolved_outcomes.any(axis=1)
     certificates = faults.certificates() & failing[:, None]
     numbers["crossed_resolved"] = int(resolved.sum())
-    numbers["mujoco_c"] = {
-        "crossed": int(in_c.sum()),
-        "failing": int((goal_rates(faults.mujoco_c_outcomes[in_c]) < FAILING_GOAL_RATE).sum()),
-    }
     numbers["certificates"] = [
         {
             "controller": name,
@@ -133,9 +129,6 @@ def fault_words(archive: Archive) -> list[str]:
             f"{_counted(numbers['failing'], 'failing elite')}; with contact resolved the controller fails on {rate} of "
             "those that it crossed so: they are confirmed."
         )
-    if numbers["mujoco_c"]["crossed"]:
-        rate = rate_words(numbers["mujoco_c"]["failing"], numbers["mujoco_c"]["crossed"])
-        sentences.append(f"In plain MuJoCo C it fails on {rate} of those that it crossed there.")
     if faults.certifiers:
         if (count := count_faults(archive)) is not None:
             terrains = f"{_counted(count, 'fault')}: terrains that {any_of(faults.certifiers)} crosses"
@@ -149,10 +142,7 @@ def fault_words(archive: Archive) -> list[str]:
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
     faults = archive.faults or FaultCounts.none_of(len(archive))
-    kinds = [
-        ("With contact resolved", faults.resolved_outcomes[number]),
-        ("In MuJoCo C", faults.mujoco_c_outcomes[number]),
-    ]
+    kinds = [("With contact resolved", faults.resolved_outcomes[number])]
     for column, name in enumerate(faults.certifiers):
         kinds.append((name, faults.certifier_outcomes[number, column]))
         kinds.append((f"{name} with contact resolved", faults.certifier_resolved_outcomes[number, column]))

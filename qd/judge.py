@@ -24,7 +24,7 @@ from qd.archive import (
     write_archive,
 )
 from qd.evaluate.marks import marks_of, recorded_marks
-from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fault_words, fresh_numbers
+from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import (
@@ -40,7 +40,6 @@ from qd.show import figures
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.files.atomic import read_json, to_json, write_atomically
-from sim.files.intervals import wilson_interval
 from sim.files.records import identity
 from sim.policy.spec import ControllerSpec, certifier_hash, spec_of
 from sim.robots.find import robot_of
@@ -48,7 +47,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, load_space
 
-Stage = Literal["fresh", "resolved", "others", "mujoco_c"]
+Stage = Literal["fresh", "resolved", "others"]
 STAGES: tuple[Stage, ...] = ("fresh", "resolved", "others")
 """Fresh episodes of all elites; of those that fail, crossings with contact resolved, and by other controllers."""
 CROSSINGS_FOLDER = "crossings"
@@ -57,9 +56,8 @@ CERTIFIERS_FOLDER = "certifiers"
 """Folder of a run that holds its own certifiers, such as its specialist, ``<name>.pt``."""
 
 _BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
-_MOST_IN_MUJOCO_C = 100  # failing elites
 _FRESH_STREAM = 1
-_CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _MUJOCO_C_STREAM = 5, 6, 7, 8
+_CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM = 5, 6, 7
 
 
 def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
@@ -98,9 +96,7 @@ def fresh_values(
     """
     if not len(archive):
         empty = {name: getattr(archive, name) for name in Evaluation.__dataclass_fields__}
-        return FreshValues(
-            **empty, collision_low=archive.fitness, collision_high=archive.fitness, reproduced=np.zeros(0, bool)
-        )
+        return FreshValues(**empty, reproduced=np.zeros(0, bool))
     times = -(-FRESH_EPISODES // num_replicas)
     seeds = elite_seeds(archive, seed, times, stream=_FRESH_STREAM)
     result = evaluate(archive.genes.repeat(times, axis=0), seeds)
@@ -110,15 +106,8 @@ def fresh_values(
     fresh = evaluation_of(result, cells, fitness)
     collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
     cell = cells.cell_of(fresh.ratios, collided)
-    counted = np.where(fresh.valid, fresh.episodes - fresh.invalid_episodes, 0)  # an invalid terrain says nothing
-    hits = np.rint(fresh.collision_rate * counted).astype(int)
-    limits = np.array([wilson_interval(*row) for row in zip(hits.tolist(), counted.tolist(), strict=True)])
-    return FreshValues(
-        **{**vars(fresh), "cell": cell},
-        collision_low=limits[:, 0],
-        collision_high=limits[:, 1],
-        reproduced=fresh.valid & cells.are_neighbours(archive.cell, cell),
-    )
+    reproduced = fresh.valid & cells.are_neighbours(archive.cell, cell)
+    return FreshValues(**{**vars(fresh), "cell": cell}, reproduced=reproduced)
 
 
 def outcome_counts(result: RolloutResult) -> NDArray[np.int64]:
@@ -199,32 +188,18 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
             raise ValueError(f"certifier {name} does not fit {search.robot.name}: {error}") from error
 
 
-def confirm(
-    archive: Archive,
-    rows: NDArray[np.int64],
-    search: Search,
-    crossings: Crossings,
-    how: Literal["resolved", "mujoco_c"] = "resolved",
-) -> Archive:
-    """The archive after its controller has crossed some elites with contact resolved, or in MuJoCo C.
+def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
+    """The archive after its controller has crossed some elites with contact resolved.
 
     Args:
         archive: With fresh values.
-        rows: Numbers of the elites. Up to 100 of them, which the seed draws, are crossed in MuJoCo C.
+        rows: Numbers of the elites.
         search: The search that found them.
         crossings: What crosses terrains.
-        how: The episodes begin alike.
     """
-    faults, label = archive.faults or FaultCounts.none_of(len(archive)), "contact resolved"
-    if how == "mujoco_c":
-        order, label = elite_seeds(archive, search.cfg.seed, stream=_MUJOCO_C_STREAM)[rows], "MuJoCo C"
-        rows = np.sort(rows[np.argsort(order, kind="stable")][:_MOST_IN_MUJOCO_C])
-    counts = _cross(archive, rows, search, crossings, search.policy, how, _CONFIRM_STREAM, label)
-    if how == "resolved":
-        faults = replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts))
-    else:
-        faults = replace(faults, mujoco_c_outcomes=_put(faults.mujoco_c_outcomes, rows, counts))
-    return replace(archive, faults=faults)
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    counts = _cross(archive, rows, search, crossings, search.policy, "resolved", _CONFIRM_STREAM, "contact resolved")
+    return replace(archive, faults=replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts)))
 
 
 def certify(
@@ -319,7 +294,6 @@ def judge(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
-    seed: int | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Archive:
     """Judges the elites of a search, and writes the run's archive, numbers and figures after each stage.
@@ -332,16 +306,12 @@ def judge(
         robot: The robot, if its settings file must be named.
         policy: The controller that was searched, if it has moved or is code.
         space: The terrain space, if it is code.
-        seed: Seed of the fresh episodes; the search's if None.
         open_evaluator: Opens what crosses terrains.
 
     Returns:
         The judged archive.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
-    if seed is not None and seed < 0:
-        raise ValueError(f"seed must be at least 0, got {seed}")
-    fresh_seed = search.cfg.seed if seed is None else seed
     check_policy(search.policy, search.robot, compute.device)
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if "others" in stages:
@@ -362,24 +332,19 @@ def judge(
         for stage in stages:
             failing = np.flatnonzero(archive.failing)
             if stage == "fresh":
-                fresh = fresh_values(
-                    archive, cross_fresh, search.cfg.fitness, num_replicas=FRESH_EPISODES, seed=fresh_seed
-                )
-                archive = archive.corrected_by(fresh)
+                cfg, kinds = search.cfg, {"num_replicas": FRESH_EPISODES, "seed": search.cfg.seed}
+                archive = archive.corrected_by(fresh_values(archive, cross_fresh, cfg.fitness, **kinds))
             elif stage == "others":
                 archive = certify(archive, failing, certifiers, search, crossings)
             else:
-                archive = confirm(archive, failing, search, crossings, stage)
+                archive = confirm(archive, failing, search, crossings)
             if families is None or stage == "fresh":
                 space_now = get_space(search.cfg.space, search.cfg.space_sha256)
                 families = families_of(archive.genes, space_now)
                 causes = causes_of(elites_of(archive), archive, space_now)
                 archive = replace(archive, family=families, cause=causes)
-            origin = origin_of(compute.device, fresh_seed, compute.workers) | identity(search.robot, search.policy)
+            origin = origin_of(compute.device, search.cfg.seed, compute.workers) | identity(search.robot, search.policy)
             _write(archive, families, search, certifiers, {stage: origin})
-    print(f"{run}: {len(archive):,} elites, of which {archive.failing.sum():,} fail by their fresh episodes.")
-    for line in fault_words(archive):
-        print(line)
     return archive
 
 

@@ -75,8 +75,7 @@ def fresh_values(archive: Archive) -> FreshValues:
     """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
     same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
     changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
-    limits = {"collision_low": archive.collision_rate / 2, "collision_high": np.ones(len(archive))}
-    return FreshValues(**same | changed | limits, reproduced=np.arange(len(archive)) % 2 == 0)
+    return FreshValues(**same | changed, reproduced=np.arange(len(archive)) % 2 == 0)
 
 
 def judged_archive() -> Archive:
@@ -90,7 +89,6 @@ def judged_archive() -> Archive:
     never, much = [0, 0, 0, 0], [20, 0, 0, 0]
     faults = FaultCounts(
         resolved_outcomes=np.array([under, under, half, half, under]),
-        mujoco_c_outcomes=np.array([under, half, never, never, never]),
         certifiers=("C-G", "S"),
         certifier_sha256=("a" * 64, "b" * 64),
         certifier_outcomes=np.array([[under, half], [half, never], [much, under], [under, under], [much, much]]),

@@ -142,7 +142,7 @@ def test_faults_are_counted_where_other_controllers_crossed_what_fails(run, repo
     # everybody fails with contact resolved; C-G crosses the first ten elites in both settings, and none of the others
     under, over = np.tile([9, 11, 0, 0], (20, 1)), np.where(np.arange(20)[:, None] < 10, [20, 0, 0, 0], [0, 20, 0, 0])
     faults = FaultCounts(
-        resolved_outcomes=under, mujoco_c_outcomes=0 * under, certifiers=("C-G",), certifier_sha256=("a" * 64,),
+        resolved_outcomes=under, certifiers=("C-G",), certifier_sha256=("a" * 64,),
         certifier_outcomes=over[:, None], certifier_resolved_outcomes=over[:, None],
     )  # fmt: skip
     write_archive(run / "archive.npz", dataclasses.replace(archive, faults=faults))
