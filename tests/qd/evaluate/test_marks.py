@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.evaluate.marks import TRAINED_ON, check_untrained, marks_of, recorded_marks
+from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from tests.train.archives import make_archive
 from tests.train.starts import write_actor, write_trained
 
@@ -40,10 +40,3 @@ def test_a_file_of_another_kind_has_no_marks(tmp_path):
     (tmp_path / "text.pt").write_text("no weights")
     for file in tmp_path.iterdir():
         assert recorded_marks(str(file)) == set()
-
-
-def test_a_controller_is_not_tested_on_what_it_was_trained_on(tmp_path):
-    controllers = {"base": "some.module:walk", "C-G": str(write_trained(tmp_path, GENES[:8]))}
-    check_untrained(controllers, GENES[8:], "run")
-    with pytest.raises(ValueError, match=r"C-G .* 2 of the 14"):
-        check_untrained(controllers, GENES[6:], "run")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from qd.evaluate.measures import (
-    count_outcomes,
     interval_of,
     mean_of,
     measure,
@@ -21,8 +20,6 @@ def test_rates_of_a_terrain():
     result = result_of([[GOAL, GOAL, HIT, LATE], [OUT, LATE, LATE, GOAL]], fallen=[[0, 0, 1, 0], [0, 0, 0, 0]])
     rates = {name: values.tolist() for name, values in terrain_rates(result).items()}
     assert rates == {"success": [0.75, 1.0], "goal": [0.5, 0.25], "fallen": [0.25, 0.0]}
-    counts = {"running": 0, "goal": 3, "base_collision": 1, "time_out": 3, "out": 1, "invalid": 0}
-    assert count_outcomes(result) == counts
 
 
 def test_everything_is_a_mean_over_valid_episodes():

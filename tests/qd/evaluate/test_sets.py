@@ -9,6 +9,7 @@ import pytest
 
 from qd.archive import Archive, write_archive
 from qd.evaluate.labels import SETS
+from qd.evaluate.marks import marks_of
 from qd.evaluate.sets import (
     far_third,
     generated_set,
@@ -81,11 +82,11 @@ def test_sets_are_what_they_were():
 
 
 def test_a_set_is_the_same_whenever_it_is_made():
-    given = {"archive": make_archive(60), "independent": make_archive(20, seed=1)}
-    all_at_once, other = make_sets((), 6, 0, **given), make_sets((), 6, 1, **given)
+    given = {"archive": make_archive(20), "independent": make_archive(20, seed=1)}
+    all_at_once, other = make_sets((), 4, 0, **given), make_sets((), 4, 1, **given)
     assert list(all_at_once) == list(SETS)
     for name in SETS:
-        alone = make_sets([name], 6, 0, **given)[name]
+        alone = make_sets([name], 4, 0, **given)[name]
         for field in ("terrains", "seeds", "numbers"):
             np.testing.assert_array_equal(getattr(alone, field), getattr(all_at_once[name], field))
         assert (other[name].seeds != all_at_once[name].seeds).all()
@@ -97,35 +98,28 @@ def test_a_set_is_the_same_whenever_it_is_made():
             make_sets(names, 6, 0)
 
 
-def test_validation_sets_have_other_terrains_and_starts():
+def test_validation_sets_have_other_terrains_and_starts_and_hard_random_ones_are_of_a_space():
     archive, names = make_archive(60), ("hand_crafted", "hard_random", "generated")
-    test, validation = (make_sets(names, 6, 0, archive=archive, part=part) for part in PARTS)
+    test, validation = (make_sets(names, 6, 0, archive=archive, part=part, space=COURSE) for part in PARTS)
     for name in names:
         assert (validation[name].seeds[:5] != test[name].seeds[:5]).all()
+    assert test["hard_random"].terrains.shape == (6, 36) and test["hard_random"].space == "course"
     assert (validation["hard_random"].terrains != test["hard_random"].terrains).any()
     assert validation["generated"].numbers.tolist() == split_elites(archive).validation.tolist()
     with pytest.raises(ValueError, match="validation"):
         make_sets((), 6, 0, archive=archive, independent=make_archive(9, seed=1), part="validation")
 
 
-def test_hard_random_terrains_are_of_the_space_that_is_named():
-    course, usual = (
-        make_sets(["hand_crafted", "hard_random"], 4, 0, space=space) for space in (COURSE, SUPER_GAUSSIAN)
-    )
-    assert course["hard_random"].terrains.shape == (4, 36) and course["hard_random"].space == "course"
-    np.testing.assert_array_equal(course["hand_crafted"].terrains, usual["hand_crafted"].terrains)
-
-
 def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
-    archive = make_archive(60)
-    few, many = (generated_set(archive, count, 0) for count in (5, 300))
-    assert len(few) == 5 and many.numbers.tolist() == split_elites(archive).test.tolist()
-    np.testing.assert_array_equal(few.seeds, many.seeds[:5])
+    archive = make_archive(10)
+    many = generated_set(archive, 300, 0)
+    assert many.numbers.tolist() == split_elites(archive).test.tolist() and many.families.tolist() == [0, 1]
     np.testing.assert_array_equal(many.terrains, archive.genes[many.numbers])
-    small = make_archive(10)
-    assert generated_set(small, 300, 0).families.tolist() == [0, 1]
-    alike = replace(small, genes=np.repeat(small.genes[:2], 5, axis=0))
+    alike = replace(archive, genes=np.repeat(archive.genes[:2], 5, axis=0))
     assert np.unique(random_elites("elites", alike, 9, 0).families).tolist() == [0, 1]
+    # Elites that somebody was trained on are left out.
+    left = random_elites("elites", archive, 9, 0, {*marks_of(archive.genes[:7])})
+    assert sorted(left.numbers) == [7, 8, 9]
 
 
 def test_elites_carry_the_certificates_of_their_rows():
@@ -141,22 +135,18 @@ def test_elites_carry_the_certificates_of_their_rows():
 
 def test_the_far_third_is_the_farthest():
     training = SUPER_GAUSSIAN.hard_random(60, 0)  # more than are compared at once
-    genes = SUPER_GAUSSIAN.hard_random(7, 1)
-    genes[2], genes[5] = training[1], training[58]  # trained on: distance 0
+    genes = SUPER_GAUSSIAN.hard_random(4, 1)
+    genes[2] = training[58]  # trained on: distance 0
     distance = nearest_distance(genes, training)
     maps, others = (heights_of(some, SUPER_GAUSSIAN).astype(np.float64) for some in (genes, training))
     by_hand = [min(np.sqrt(((terrain - other) ** 2).mean()) for other in others) for terrain in maps]
     np.testing.assert_allclose(distance, by_hand, atol=1e-6)
-    whole = replace(plain_set("hard_random", 7, 0), numbers=np.arange(100, 107))
-    far = far_third(whole, distance)  # a third of seven, rounded up
-    places = np.sort(np.argsort(by_hand)[-3:])
+    whole = replace(plain_set("hard_random", 4, 0), numbers=np.arange(100, 104))
+    far = far_third(whole, distance)  # a third of four, rounded up
+    places = np.sort(np.argsort(by_hand)[-2:])
     assert far.numbers.tolist() == (100 + places).tolist() and far.name == "generated_far"
     for field in ("seeds", "terrains"):
         np.testing.assert_array_equal(getattr(far, field), getattr(whole, field)[places])
-    archive = make_archive(60)
-    sets = make_sets(["generated", "generated_far"], 6, 0, archive=archive)
-    nearest = nearest_distance(sets["generated"].terrains, archive.genes[split_elites(archive).train])
-    assert set(sets["generated_far"].numbers) == set(sets["generated"].numbers[np.argsort(nearest)[-2:]])
 
 
 def write_run(folder: Path, archive: Archive, robot, seed: int | None = None) -> Path:

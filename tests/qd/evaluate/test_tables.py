@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from qd.evaluate.figures import draw_tables
-from qd.evaluate.labels import FATES, MEASURES
+from qd.evaluate.labels import FATES
 from qd.evaluate.measures import measure
 from qd.evaluate.sets import Certificates
 from qd.evaluate.show import show_tables
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
 from sim.files.records import robot_identity
-from tests.qd.evaluate.made import make_measured, make_report, make_set
+from tests.qd.evaluate.made import make_measured, make_set
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 ABOUT = {who: {"policy": f"{who}.pt", "sha256": sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))}
@@ -28,9 +28,7 @@ def report(anymal):
     none = result_of([[GOAL] * 4, [BAD] * 4, [LATE] * 4], reward=[[20] * 4, [0] * 4, [8] * 4])
     crossed = {"hand_crafted": {"base": good, "C-G": good}, "generated": {"base": poor, "C-G": none}}
     measured = {name: {who: measure(row[who], (1.0, 1.0)) for who in row} for name, row in crossed.items()}
-    sets = {"hand_crafted": make_set("hand_crafted", 3), "generated": make_set("generated", 3, 100)}
-    controllers = {who: ABOUT[who] for who in ("base", "C-G")}
-    return make_tables(measured, sets, anymal, controllers=controllers, episodes=4, seed=0)
+    return tables_of(anymal, measured, {"generated": make_set("generated", 3, 100)})
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +37,15 @@ def certified(anymal):
     given = Certificates(("C-G", "S"), ("a", "b"), np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool), "f")
     goals = {"base": [4, 1, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
     row = {who: make_measured(counts, of=4) for who, counts in goals.items()}
-    sets = {
-        "generated": replace(make_set("generated", 4, 10), certificates=given, families=np.arange(4)),
-        "hard_random": make_set("hard_random", 4),
-    }
-    return make_tables(dict.fromkeys(sets, row), sets, anymal, controllers=ABOUT, episodes=4, seed=0)
+    elites = replace(make_set("generated", 4, 10), certificates=given, families=np.arange(4))
+    return tables_of(anymal, {"generated": row, "hard_random": row}, {"generated": elites})
+
+
+def tables_of(robot, measured, sets):
+    """Tables of crossings on some sets; others are of hard-random terrains."""
+    sets = {name: make_set(name, len(next(iter(row.values())).goals)) for name, row in measured.items()} | sets
+    about = {who: ABOUT[who] for who in next(iter(measured.values()))}
+    return make_tables(measured, sets, robot, controllers=about, episodes=4, seed=0)
 
 
 def test_values_are_means_over_terrains(report):
@@ -54,27 +56,17 @@ def test_values_are_means_over_terrains(report):
     assert report["penalties"]["generated"]["base"] == {"yaw_rate": 0.0, "vel_x": 0.0}
     assert report["outcomes"]["generated"]["C-G"]["invalid"] == 4
     assert report["terrains"] == {"hand_crafted": 3, "generated": 3}
-    for name in MEASURES:
-        for chosen, row in report[name].items():
-            for who, value in row.items():
-                low, high = report["intervals"][name][chosen][who]
-                assert low <= value <= high
     # Of goal rates 1, .25, 0 a resample of 3 is all 0 in 1 of 27 cases, and all 1 in another: more than 2.5 %.
     assert report["intervals"]["goal"]["generated"]["base"] == [0.0, 1.0]
 
 
 def test_intervals_over_elites_are_over_families_of_kin(anymal):
     measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 8 + [0] * 2, of=4))}
-    alone = make_set("generated", 10)
-    kin = replace(alone, families=np.array([0] * 4 + [1] * 4 + [2, 3]))
-    of_terrains, of_kin = (
-        make_tables(measured, {"generated": chosen}, anymal, controllers=ABOUT, episodes=4, seed=0)
-        for chosen in (alone, kin)
-    )
+    kin = replace(make_set("generated", 10), families=np.array([0] * 4 + [1] * 4 + [2, 3]))
+    of_terrains, of_kin = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
     # Of four families 1 of 16 resamples has nothing but the two that fail; of ten terrains hardly any has 6 that do.
     assert of_kin["intervals"]["goal"]["generated"]["base"][0] == 0.0
     assert of_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
-    assert of_kin["differences"]["generated"]["base -> C-G"]["gain"]["goal"]["interval"] == [0.0, 0.0]
 
 
 def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
@@ -146,8 +138,7 @@ def test_one_training_is_not_several(tmp_path):
 
 
 def test_tables_are_read_as_they_were_written(certified, report, anymal, tmp_path):
-    for tables in (certified, report):
-        assert as_tables(json.loads(json.dumps(tables))) == tables
+    assert as_tables(json.loads(json.dumps(certified))) == certified
     (tmp_path / "tables.json").write_text(json.dumps({**report, **robot_identity(anymal), "part": "validation"}))
     for file, error in (("tables.json", ValueError), ("none.json", FileNotFoundError)):
         with pytest.raises(error, match=file):
@@ -187,14 +178,9 @@ def test_the_figure_shows_the_tables(report):
     np.testing.assert_allclose(points.get_ydata(), [report["reward"][name]["C-G"] for name in report["reward"]])
 
 
-def test_little_can_be_shown_too(anymal, capsys):
-    alone = make_report({"hard_random": {"base": [4]}})
-    assert alone["differences"] == {"hard_random": {}}
-    bad = {"generated": {"base": make_measured([0, 0], of=4, bad=[0, 1])}}
-    sets, about = {"generated": make_set("generated", 2)}, {"base": ABOUT["base"]}
-    nothing = make_tables(bad, sets, anymal, controllers=about, episodes=4, seed=0)
-    assert nothing["success"]["generated"]["base"] is None
-    for tables in (alone, {**nothing, "paper": None}):
-        show_tables(tables)
-        draw_tables(tables).canvas.draw()
+def test_tables_without_a_valid_terrain_are_shown_too(anymal, capsys):
+    nothing = tables_of(anymal, {"generated": {"base": make_measured([0, 0], of=4, bad=[0, 1])}}, {})
+    assert nothing["success"]["generated"]["base"] is None and nothing["differences"] == {"generated": {}}
+    show_tables({**nothing, "paper": None})
+    draw_tables(nothing).canvas.draw()
     assert "base" in capsys.readouterr().out
