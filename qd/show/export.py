@@ -1,6 +1,5 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +7,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.groups import VERDICTS, Ranking, rank
 from qd.minima import read_minimal
 from qd.run.directory import RUNS, folder_for
+from qd.run.progress import share_bar
 from qd.show.elites import OpenedRun
 from sim.bank import terrains_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -119,7 +118,7 @@ def export_terrains(
     origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     files, index, count = [], [], len(source.stems)
-    with tqdm(total=count, desc="exporting", unit="terrain", file=sys.stderr, disable=None) as bar:
+    with share_bar("exporting") as progress:
         for first in range(0, count, _AT_ONCE):
             part = slice(first, min(first + _AT_ONCE, count))
             grids, maps = source.heights(part)
@@ -131,7 +130,7 @@ def export_terrains(
                 )  # fmt: skip
                 files += write_terrain(folder, terrain, formats=formats, about={**about, **origin})
                 index.append({**about, "files": stem})
-                bar.update()
+                progress(len(index) / count)
     files += [folder / README_FILE, folder / INDEX_FILE]
     write_atomically(files[-2], readme_of(source.stems[0], formats).encode())
     write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
