@@ -1,6 +1,6 @@
 # The doors of the project. Every target works in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive train finetune harden evaluate report view bench docs test test-all test-gpu lint
+.PHONY: help setup archive train finetune harden evaluate report view bench docs pictures test test-all test-gpu lint
 
 PYTHON ?= python3
 ROBOT ?=
@@ -82,6 +82,9 @@ bench: setup ## Time every kernel against torch and against the device's ceiling
 
 docs: setup ## Write the tables of README and docs/ anew from the results
 	$(BIN)/python -m results.make.docs
+
+pictures: setup ## Make the pictures of README and docs/ anew: some minutes, a browser
+	$(BIN)/python -m results.make.pictures
 
 test: setup ## Run the quick tests: about three minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray' $(ARGS)

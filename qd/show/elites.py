@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, goal_rates, read_archive
+from qd.causes import UNCLEAR
 from qd.fitness import FitnessCfg
+from qd.groups import rank
 from qd.judge import CERTIFIERS_FOLDER, panel_of
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
@@ -137,12 +139,21 @@ class OpenedRun:
         """
         if minimal is None:
             numbers = chosen_elites(elite, len(self.archive), self.path)
-            return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}") for n in numbers]
+            return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}{self._why(n)}") for n in numbers]
         minima = self.minima()
         return [
-            Terrain(n, minima.genes[n], f"minimal-{n}", f"minimal terrain {n}", minima.entry(n), minima.words(n))
+            Terrain(
+                n, minima.genes[n], f"minimal-{n}", f"minimal terrain {n}{self._why(n)}", minima.entry(n),
+                minima.words(n),
+            )
             for n in minima.chosen(minimal, self.path)
-        ]
+        ]  # fmt: skip
+
+    def _why(self, number: int) -> str:
+        """What stops the robot on an elite, in brackets; nothing where that is not known."""
+        minima, numbers = read_minimal(self.folder, self.archive), np.array([number])
+        (cause,) = rank(self.archive, self.space, minima, numbers=numbers).causes
+        return f" ({cause})" if cause not in ("", UNCLEAR) else ""
 
     def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
         """The terrain that a command line names, where only one makes sense."""

@@ -35,11 +35,11 @@ SIZE, GIF_SIZE = (1280, 720), (480, 270)
 """Width and height [pixels]."""
 MOST_BYTES = 2_000_000
 """The largest GIF."""
-_COLORS = (256, 128, 64, 32, 16)  # of a GIF; fewer where it would be too large
+_COLORS = (256, 128, 96, 64, 48, 32, 16)  # of a GIF; fewer where it would be too large
 _FINER = 2  # than a GIF its pictures are rendered
-_BEFORE_S, _AFTER_S, _SLOW_S, _SLOWNESS = 3.0, 1.0, 1.0, 4.0  # of the moment of failure
-_GHOSTS = 2  # other episodes shown
-_DISTANCE = 2.8  # of the camera, in heights or lengths of the robot
+_SLOW_S = 1.0  # before the moment of failure
+_GHOSTS, _PALE = 2, 0.15  # other episodes shown, and their opacity
+_DISTANCE = 2.5  # of the camera, in heights or lengths of the robot
 _SMOOTH_S = 0.8  # over which the camera follows the base
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
 _CLEARANCE = 0.05  # of the line of sight over the ground [m]
@@ -94,18 +94,20 @@ class Shot:
             name, other = self.beside
             return [Ghost(other.qpos(0, self.episode), OTHER_CONTROLLER, name)]
         others = [k for k in range(self.recording.num_episodes) if k != self.episode]
-        return [Ghost(self.recording.qpos(0, k)) for k in others[:_GHOSTS]]
+        return [Ghost(self.recording.qpos(0, k), opacity=_PALE) for k in others[:_GHOSTS]]
 
-    def times(self, fps: float, *, whole: bool = False) -> NDArray[np.float64]:
-        """Time of each picture [s], from 3 s before the robot fails to 1 s after it, slower by four just before it.
+    def times(
+        self, fps: float, *, whole: bool = False, before_s: float = 3.0, after_s: float = 1.0, slowness: float = 4.0
+    ) -> NDArray[np.float64]:
+        """Time of each picture [s]: from before the robot fails to after it, the second before it slower.
 
-        The whole of the episode, or one in which the robot arrives, is shown to 1 s after its end.
+        The whole of the episode, or one in which the robot arrives, is shown to ``after_s`` after its end.
         """
         moment = self.end if self.moment is None else self.moment
         whole = whole or self.moment is None
-        begin, stop = (0.0, self.end + _AFTER_S) if whole else (max(0.0, moment - _BEFORE_S), moment + _AFTER_S)
+        begin, stop = (0.0, self.end + after_s) if whole else (max(0.0, moment - before_s), moment + after_s)
         slow = moment if self.moment is None else max(begin, moment - _SLOW_S)
-        played = np.cumsum([0.0, slow - begin, _SLOWNESS * (moment - slow), stop - moment])
+        played = np.cumsum([0.0, slow - begin, slowness * (moment - slow), stop - moment])
         return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, [begin, slow, moment, stop])
 
     def second_line(self) -> str:
@@ -148,30 +150,42 @@ def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Came
 
 
 def pictures_of(
-    shot: Shot, renderer: Renderer, cameras: Sequence[Camera], times: NDArray[np.float64], size: tuple[int, int]
+    shot: Shot,
+    robot: RobotCfg,
+    times: NDArray[np.float64],
+    size: tuple[int, int] = GIF_SIZE,
+    *,
+    shadows: bool = True,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Picture]:
-    """The pictures of a film, each at a time of the episode [s] by a camera, of a size [pixels]."""
+    """The pictures of a film, each at a time of the episode [s], of a size [pixels].
+
+    Small ones are rendered twice as fine. ``progress`` is called with the share that is done.
+    """
     recording, dt = shot.recording, shot.recording.dt
+    cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
     poses, ghosts, chart = recording.qpos(0, shot.episode), shot.ghosts, map_of(shot, size[0] // 5)
-    is_slow = np.diff(times, append=np.inf) < 0.9 * np.diff(times).max(initial=0.0)
-    for time_s, slow, camera in zip(times.tolist(), is_slow.tolist(), cameras, strict=True):
-        frame = min(time_s / dt, float(len(poses) - 1))
-        pose, marks = pose_at(poses, frame), ("touching", "foot_force")
-        view = renderer.render(
-            pose,
-            camera,
-            ghosts=[ghost._replace(qpos=pose_at(ghost.qpos, time_s / dt)) for ghost in ghosts],
-            **{name: getattr(recording, name)[0, shot.episode, int(frame + 0.5)] for name in marks},
-        )
-        picture = Image.fromarray(view).resize(size, Image.Resampling.BOX)
-        _letter(picture, shot, time_s, "  1/4 speed" * slow)
-        here = chart.copy()
-        ImageDraw.Draw(here).circle(_on_map(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
-        picture.paste(here, (size[0] - chart.width, 0))
-        yield np.asarray(picture)
+    steps = np.diff(times, append=np.inf)
+    slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
+    width, height = (side * (1 if size[0] > GIF_SIZE[0] else _FINER) for side in size)
+    look: dict[str, Any] = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
+    with Renderer(robot, recording.heights[0], **look) as renderer:
+        for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
+            frame = min(time_s / dt, float(len(poses) - 1))
+            pose, here = pose_at(poses, frame), (0, shot.episode, int(frame + 0.5))
+            others = [ghost._replace(qpos=pose_at(ghost.qpos, time_s / dt)) for ghost in ghosts]
+            touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
+            picture = Image.fromarray(renderer.render(pose, camera, ghosts=others, **touch))
+            picture = picture.resize(size, Image.Resampling.BOX)
+            _letter(picture, shot, time_s, slowness[number])
+            inset = chart.copy()
+            ImageDraw.Draw(inset).circle(_on_map(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
+            picture.paste(inset, (size[0] - chart.width, 0))
+            yield np.asarray(picture)
+            progress((number + 1) / len(times))
 
 
-def _letter(picture: Image.Image, shot: Shot, time_s: float, speed: str) -> None:
+def _letter(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> None:
     """Writes the title at the top of a picture, the time at its bottom, and from it on the moment of failure."""
     unit, draw = picture.height / 540, ImageDraw.Draw(picture)
     width = picture.width / unit
@@ -180,8 +194,9 @@ def _letter(picture: Image.Image, shot: Shot, time_s: float, speed: str) -> None
         font, edge = ImageFont.load_default(size * unit), max(1, round(2 * unit))
         draw.text((place[0] * unit, place[1] * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
 
-    write((10, 32), shot.title, 26, "black")
-    write((10, 60), shot.second_line(), 20, "#0b6e62" if shot.beside else "#303030")
+    write((10, 32), shot.title, 28, "black")
+    write((10, 62), shot.second_line(), 24, "#0b6e62" if shot.beside else "#303030")
+    speed = f"  1/{slowness} speed" if slowness > 1 else ""
     write((width - 10, 528), f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
         outcome, fallen = shot.recording.outcome[0, shot.episode], shot.recording.fallen[0, shot.episode]
@@ -239,18 +254,8 @@ def film(
     title = title_of(recording, by)
     shot = Shot(recording=recording, episode=episode, scales=scales, title=title, beside=beside)
     times = shot.times(GIF_FPS if cfg.gif else FPS, whole=cfg.whole)
-    cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
-    size, finer = (GIF_SIZE, _FINER) if cfg.gif else (SIZE, 1)
-    look: dict[str, Any] = {"shadows": cfg.shadows, "ground": recording.ground}
-
-    def reported() -> Iterator[Picture]:
-        for count, picture in enumerate(pictures_of(shot, renderer, cameras, times, size), 1):
-            yield picture
-            progress(count / len(times))
-
-    with Renderer(robot, recording.heights[0], width=finer * size[0], height=finer * size[1], **look) as renderer:
-        content = as_gif(list(reported())) if cfg.gif else as_mp4(reported())
-    save(out, content, "Film")
+    pictures = pictures_of(shot, robot, times, GIF_SIZE if cfg.gif else SIZE, shadows=cfg.shadows, progress=progress)
+    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures), "Film")
 
 
 def as_mp4(pictures: Iterable[Picture], fps: int = FPS) -> bytes:
@@ -277,7 +282,7 @@ def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
         images = [Image.fromarray(picture) for picture in pictures[::step]]
         sample = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)]))
         for colors in _COLORS:
-            palette = sample.quantize(colors, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+            palette = sample.quantize(colors, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
             first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
             content = io.BytesIO()
             duration = round(1000 * step / GIF_FPS)
