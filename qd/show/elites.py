@@ -151,8 +151,8 @@ class OpenedRun:
 
     def _why(self, number: int) -> str:
         """What stops the robot on an elite, in brackets; nothing where that is not known."""
-        minima, numbers = read_minimal(self.folder, self.archive), np.array([number])
-        (cause,) = rank(self.archive, self.space, minima, numbers=numbers).causes
+        minima = read_minimal(self.folder, self.archive)
+        (cause,) = rank(self.archive, self.space, minima, numbers=[number]).causes
         return f" ({cause})" if cause not in ("", UNCLEAR) else ""
 
     def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
