@@ -249,9 +249,9 @@ def _legend(crossed: Crossed) -> list[Any]:
     handles += [Line2D([], [], **look) for look in (START, GOAL)]
     ground = crossed.recording.ground
     if ground is not None and (ground.friction < 1.0).any():
-        handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
+        handles.append(Patch(facecolor="none", edgecolor=SLIPPERY, hatch="\\\\\\", label="slippery"))
     if ground is not None and ground.time_constant_s.any():
-        handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
+        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="///", label="soft"))
     return handles
 
 

@@ -20,13 +20,13 @@ from qd.show.crossed import crossed_of, ending_of, moment_of_failure, title_of, 
 from qd.show.replay import RECORDING, Source, save
 from qd.workers.evaluator import check_policy
 from sim.crossing import CrossingCfg
-from sim.maps.picture import LENGTH
+from sim.maps.picture import LENGTH, height_colors
 from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import label_suffix, spec_of
 from sim.recording.file import write_recording
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Ghost, Renderer, open_context
-from sim.recording.scene import OTHER_CONTROLLER, height_colors
+from sim.recording.scene import OTHER_CONTROLLER
 from sim.robots.robot import RobotCfg
 
 FPS, GIF_FPS = 25, 12.5

@@ -37,10 +37,10 @@ def draw_minimal(
     grid = figure.add_gridspec(rows + 1, _COLUMNS, height_ratios=(1.3, *[1.0] * rows))
     _draw_histogram(figure.add_subplot(grid[0, :]), numbers)
     heights, maps = terrains_of(np.array([genes[entry["elite"]] for entry in shown]), space)
-    limits = (float(heights.min()), float(heights.max()))
+    most = float(np.abs(heights).max())
     panels = [figure.add_subplot(grid[1 + place // _COLUMNS, place % _COLUMNS]) for place in range(len(shown))]
     for place, (axes, entry) in enumerate(zip(panels, shown, strict=True)):
-        image = draw_heights(axes, heights[place], limits, None if maps is None else maps[place : place + 1])
+        image = draw_heights(axes, heights[place], most, None if maps is None else maps[place : place + 1])
         kind = entry["cause"]["kind"] if entry["cause"] else "no part"
         parts = f"{len(entry['bumps'])} of {entry['of']} parts"
         axes.set_title(f"elite {entry['elite']}: {parts}, {kind}, {entry['goal_rate']:.0%} arrive", fontsize=9)

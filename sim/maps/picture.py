@@ -17,52 +17,70 @@ _WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linesty
 START: dict[str, Any] = {"marker": ">", "markersize": 11, "label": "start", **_WHITE}
 GOAL: dict[str, Any] = {"marker": "*", "markersize": 16, "label": "goal", **_WHITE}
 """How start and goal are marked."""
+_PALE = 0.6  # opacity of a map
 
-SLIPPERY, SOFT = (0.0, 0.68, 0.68), (0.55, 0.25, 0.75)
-"""RGB (0 to 1) that slippery and soft patches are tinted with."""
-_TINT = 0.5  # share of the tint where a patch is as slippery or soft as can be
+HEIGHTS = LinearSegmentedColormap.from_list("heights", [(0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)])
+"""Blue below the level of the start, brown above."""
+_LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
+
+SLIPPERY, SOFT = (0.0, 0.55, 0.60), (0.55, 0.25, 0.75)
+"""RGB (0 to 1) of the lines over slippery and over soft patches."""
+_LINES_EVERY, _LINE = 8, 2  # nodes from line to line, and of a line
+_FAINT, _STRONG, _WASH = 0.35, 0.85, 0.1  # opacity of lines over nearly usual and over the worst ground, and between
 
 
-def _ground_tint(ground: GroundMaps) -> NDArray[np.float64]:
-    """Tint of a terrain's patches, the stronger the more slippery or soft they are; RGBA, shape (rows, cols, 4)."""
+def height_colors(heights: NDArray[np.floating], most: float | None = None) -> NDArray[np.float64]:
+    """RGB (0 to 1) of heights [m], the strongest at ``most``; a last axis of 3 more than theirs."""
+    return HEIGHTS(0.5 + 0.5 * heights / _range_of(heights, most))[..., :3]
+
+
+def _range_of(heights: NDArray[np.floating], most: float | None) -> float:
+    return max(float(np.abs(heights).max()) if most is None else most, _LEAST_RANGE)
+
+
+def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -> NDArray[np.float64]:
+    """Diagonal lines over slippery patches, across them over soft ones: RGBA of nodes or cells, (rows, columns, 4).
+
+    They are the stronger the more slippery or soft a patch is, and leave its height to be seen. ``margin`` nodes on
+    each side are not of the terrain.
+    """
+    patch_row, patch_column = (
+        patches_at(np.arange(count) - margin, nodes - 1, patches)
+        for count, patches, nodes in zip((rows, columns), PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
+    )
     slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)
     tau = np.maximum(ground.time_constant_s[0].astype(np.float64), LEAST_TIME_CONSTANT_S)
     soft = np.log(tau / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S)
-    both = np.stack([slippery, soft], axis=-1)
-    share = both / np.maximum(both.sum(axis=-1, keepdims=True), 1e-9)
-    return np.concatenate([share @ np.array([SLIPPERY, SOFT]), _TINT * both.max(axis=-1, keepdims=True)], axis=-1)
+    strength = np.stack([slippery, soft], axis=-1)[patch_row[:, None], patch_column]
+    row, column = np.ogrid[:rows, :columns]
+    on_line = np.stack([(row + column) % _LINES_EVERY < _LINE, (row - column) % _LINES_EVERY < _LINE], axis=-1)
+    opacity = np.where(on_line, _FAINT + (_STRONG - _FAINT) * strength, _WASH) * (strength > 0.0)
+    share = opacity / np.maximum(opacity.sum(axis=-1, keepdims=True), 1e-9)
+    return np.concatenate([share @ np.array([SLIPPERY, SOFT]), opacity.max(axis=-1, keepdims=True)], axis=-1)
 
 
 def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> NDArray[np.float64]:
-    """Colours of a terrain's nodes or cells, RGB (0 to 1), shape (rows, columns, 3), with the tint of its ground.
-
-    ``margin`` nodes of them on each side are not of the terrain.
-    """
-    row, col = (
-        patches_at(np.arange(count) - margin, nodes - 1, patches)
-        for count, patches, nodes in zip(colors.shape[:2], PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
-    )
-    tint = _ground_tint(ground)[row[:, None], col]
-    return colors + tint[..., 3:] * (tint[..., :3] - colors)
+    """Colours of nodes or cells, RGB (0 to 1), shape (rows, columns, 3), under the lines of their ground."""
+    lines = ground_lines(ground, colors.shape[0], colors.shape[1], margin)
+    return colors + lines[..., 3:] * (lines[..., :3] - colors)
 
 
 def draw_heights(
     axes: Axes,
     heights: NDArray[np.float32],
-    limits: tuple[float, float] | None = None,
+    most: float | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
-    """Heights [m], shape (nrow, ncol), from above with start and goal, tinted by the ground; returns the image.
+    """Heights [m], shape (nrow, ncol), from above with start and goal, and the lines of its ground; returns the image.
 
-    The limits are the heights of the darkest and the lightest grey [m]; the terrain's if left out.
+    Colours are those of the ground in other pictures, paler, so that paths are seen on them; ``most`` is the height of
+    the strongest [m], that of the terrain if left out.
     """
-    low, high = limits or (float(heights.min()), float(heights.max()))
-    greys = LinearSegmentedColormap.from_list("greys", ["0.45", "1.0"])  # light enough for every colour of a path
-    image = axes.imshow(
-        heights, origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), cmap=greys, vmin=low, vmax=max(high, low + 0.05)
-    )
+    most = _range_of(heights, most)
+    where: dict[str, Any] = {"origin": "lower", "extent": (0.0, LENGTH, 0.0, WIDTH)}
+    image = axes.imshow(heights, cmap=HEIGHTS, vmin=-most, vmax=most, alpha=_PALE, **where)
     if ground is not None:
-        axes.imshow(_ground_tint(ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH), interpolation="nearest")
+        axes.imshow(ground_lines(ground, heights.shape[0], heights.shape[1]), interpolation="nearest", **where)
     for place, look in ((CrossingCfg.start, START), (CrossingCfg.goal, GOAL)):
         axes.plot(*place, **look)
     axes.set_ylabel("y [m]")

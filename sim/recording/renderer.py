@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.recording.scene import FOOT_TOUCH, OTHER_EPISODE, TOUCH, Color, scene_model
+from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_EPISODE, TOUCH, Color, scene_model
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import touches_of
 
@@ -99,6 +99,7 @@ class Renderer:
         geoms = {name: _mj.mj_name2id(self.model, kind, name) for name in robot.geom_names}
         self._feet = [geoms[name] for name in robot.foot_geoms]
         self._touches, self._first_foot = touches_of(self.model, robot), len(geoms) - len(robot.foot_geoms)
+        self._ground = _mj.mj_name2id(self.model, kind, GROUND)
         self._data = [_mj.MjData(self.model)]
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
@@ -151,8 +152,7 @@ class Renderer:
         self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
         everything = _mj.mjtCatBit.mjCAT_ALL.value
         _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
-        if touching is not None:
-            self._color_touching(touching)
+        self._dress(touching)
         others = [ghost if isinstance(ghost, Ghost) else Ghost(*ghost) for ghost in ghosts]
         for number, ghost in enumerate(others, 1):
             self._add_ghost(number, ghost)
@@ -176,10 +176,15 @@ class Renderer:
         _mj.mj_camlight(self.model, data)
         return data
 
-    def _color_touching(self, touching: NDArray[np.bool_]) -> None:
+    def _dress(self, touching: NDArray[np.bool_] | None) -> None:
+        """Colours what touches, and has the ground cast no shadow: it would speckle slopes."""
         for geom in self._scene.geoms[: self._scene.ngeom]:
-            columns = self._touches.get(geom.objid, ()) if geom.objtype == _mj.mjtObj.mjOBJ_GEOM.value else ()
-            if touching[list(columns)].any():
+            if geom.objtype != _mj.mjtObj.mjOBJ_GEOM.value:
+                continue
+            if geom.objid == self._ground:
+                geom.category = _mj.mjtCatBit.mjCAT_DECOR.value
+            columns = self._touches.get(geom.objid, ())
+            if touching is not None and touching[list(columns)].any():
                 geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
                 geom.matid = -1
 

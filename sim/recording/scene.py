@@ -8,11 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.maps.hfield import as_hfield
-from sim.maps.picture import tinted
+from sim.maps.picture import height_colors, tinted
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, robot_spec
 from sim.terrain import SPACING
@@ -28,18 +28,11 @@ OTHER_CONTROLLER, OTHER_EPISODE = (0.05, 0.62, 0.55), (0.88, 0.89, 0.90)
 
 MARGIN_NODES = 40
 """Edge height shown on each side: a crossing may leave the terrain by 2 m."""
-_GROUND = "faultline_ground"
+GROUND = "faultline_ground"
+"""Name of its geom."""
 _PIXELS = 4  # of the paint a cell, along each side
-_LOW, _LEVEL, _HIGH = (np.array(color) for color in ((0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)))
-_LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
-_SHADOWED = 3.0  # half side of the square about the robot that shadows fall in [m]
+_SHADOWED = 2.0  # half side of the square about the robot that shadows fall in [m]
 _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
-
-
-def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
-    """RGB (0 to 1) of heights [m], blue below 0 and brown above; a last axis of 3 more than theirs."""
-    share = (heights / max(float(np.abs(heights).max()), _LEAST_RANGE))[..., None]
-    return np.where(share < 0, _LEVEL + (_LEVEL - _LOW) * share, _LEVEL + (_HIGH - _LEVEL) * share)
 
 
 def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
@@ -53,7 +46,7 @@ def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None
     color = color if ground is None else tinted(color, ground, MARGIN_NODES)
     rise_y, rise_x = np.gradient(cells, SPACING)
     color *= (0.75 + 0.25 / np.sqrt(1.0 + rise_x**2 + rise_y**2))[..., None]
-    paint = color.repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
+    paint = np.asarray(zoom(color, (_PIXELS, _PIXELS, 1), order=1, mode="nearest", grid_mode=True))
     metre = round(1.0 / SPACING) * _PIXELS
     for axis in (0, 1):
         on_line = np.arange(paint.shape[axis]) % metre < _PIXELS // 2
@@ -84,31 +77,43 @@ def scene_model(
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     model = robot_model(spec, robot)
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
-    texture = model.texture(_GROUND)
-    first = int(texture.adr[0])
-    # The asset lies on its side (sim.maps.hfield): the rows of its texture run along x, its columns along y.
-    model.tex_data[first : first + paint.size] = paint.swapaxes(0, 1).ravel()
+    first = int(model.texture(GROUND).adr[0])
+    model.tex_data[first : first + paint.size] = paint.ravel()
     return model
 
 
+def surface_of(heights: NDArray[np.floating], margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The ground that robots walk on: vertices [m], row by row, and two triangles a cell, cut as the physics cuts it.
+
+    Heights [m] have shape (nrow, ncol), node (0, 0) at x = y = 0; ``margin`` more nodes continue each edge.
+    """
+    grid = np.pad(heights, margin, mode="edge")
+    nrow, ncol = grid.shape
+    y, x = (SPACING * (np.arange(count) - margin) for count in grid.shape)
+    vertices = np.stack([*np.meshgrid(x, y), grid], axis=-1).reshape(-1, 3)
+    low = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
+    # Each cell is cut from its (low x, high y) to its (high x, low y) corner.
+    faces = np.stack([low, low + 1, low + ncol, low + 1, low + ncol + 1, low + ncol], axis=1)
+    return vertices.astype(np.float64), faces.reshape(-1, 3)
+
+
 def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]) -> None:
-    field = as_hfield(heights, margin=MARGIN_NODES)
-    rows, columns = field.data.shape
-    data = field.data.ravel().tolist()
-    spec.add_hfield(name=_GROUND, nrow=rows, ncol=columns, size=list(field.size), userdata=data)
-    flat = {"type": _mj.mjtTexture.mjTEXTURE_2D, "builtin": _mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
-    spec.add_texture(name=_GROUND, width=paint[0], height=paint[1], **flat)
-    material = spec.add_material(name=_GROUND, specular=0.0, shininess=0.0, reflectance=0.0)
-    material.textures[_mj.mjtTextureRole.mjTEXROLE_RGB] = _GROUND
-    spec.worldbody.add_geom(
-        name=_GROUND,
-        type=_mj.mjtGeom.mjGEOM_HFIELD,
-        hfieldname=_GROUND,
-        pos=list(field.position),
-        quat=list(field.quaternion),
-        material=_GROUND,
-        group=0,
+    """A mesh, not a height field, whose facets MuJoCo shows."""
+    vertices, faces = surface_of(heights, MARGIN_NODES)
+    places = vertices[:, :2] - vertices[0, :2]
+    spec.add_mesh(
+        name=GROUND,
+        uservert=vertices.ravel(),
+        userface=faces.ravel(),
+        usertexcoord=(places / places[-1]).ravel(),
+        inertia=_mj.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
+    flat = {"type": _mj.mjtTexture.mjTEXTURE_2D, "builtin": _mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
+    spec.add_texture(name=GROUND, width=paint[1], height=paint[0], **flat)
+    material = spec.add_material(name=GROUND, specular=0.0, shininess=0.0, reflectance=0.0)
+    material.textures[_mj.mjtTextureRole.mjTEXROLE_RGB] = GROUND
+    kind = {"type": _mj.mjtGeom.mjGEOM_MESH, "meshname": GROUND, "material": GROUND}
+    spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
 
 
 def _add_goal(spec: Any, heights: NDArray[np.floating], cfg: CrossingCfg) -> None:

@@ -10,9 +10,8 @@ from qd.show.crossed import Crossed, ending_of, typical_episode
 from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.maps.picture import tinted
+from sim.maps.picture import height_colors, tinted
 from sim.recording.renderer import Camera, Ghost, Renderer
-from sim.recording.scene import height_colors
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.terrain import SPACING

@@ -8,8 +8,7 @@ from matplotlib.colors import to_hex
 
 from qd.show.crossed import ENDINGS
 from qd.show.view.scene import COMMAND_COLOR, FOOT_TOUCH_COLOR, FORCE_COLOR, GHOST_COLOR, TOUCH_COLOR
-from sim.maps.picture import SLIPPERY, SOFT
-from sim.recording.scene import height_colors
+from sim.maps.picture import SLIPPERY, SOFT, height_colors
 
 
 def legend_html(controllers: Sequence[str]) -> str:
@@ -18,7 +17,8 @@ def legend_html(controllers: Sequence[str]) -> str:
     bar = f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {ramp})"></span>'
     rows = {
         "Ground": f"low {bar} high; grey is the level of the start, and a line stands every metre; "
-        + _swatches({"slippery": to_hex(SLIPPERY), "soft": to_hex(SOFT)}),
+        + _swatches({"slippery": _lines(SLIPPERY, -45), "soft": _lines(SOFT, 45)})
+        + "the stronger the worse, crossed where ground is both",
         "Paths": "of all episodes, by how they ended: "
         + _swatches({ending.words: ending.color for ending in ENDINGS.values()}),
         "Touching": _swatches({"base or limb": _hex(TOUCH_COLOR), "foot": _hex(FOOT_TOUCH_COLOR)}),
@@ -37,6 +37,10 @@ def legend_html(controllers: Sequence[str]) -> str:
 
 def _hex(color: tuple[int, int, int]) -> str:
     return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def _lines(color: tuple[float, float, float], degrees: int) -> str:
+    return f"repeating-linear-gradient({degrees}deg, {to_hex(color)} 0 2px, transparent 2px 5px)"
 
 
 def _swatches(colors: dict[str, str]) -> str:

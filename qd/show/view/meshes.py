@@ -10,8 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from sim.ground import GroundMaps
-from sim.maps.picture import tinted
-from sim.recording.scene import height_colors
+from sim.maps.picture import height_colors, tinted
+from sim.recording.scene import surface_of
 from sim.robots.skeleton import Geom, Skeleton
 from sim.terrain import SPACING
 
@@ -51,19 +51,13 @@ def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None
 
     Friction and softness of the ``ground`` tint it. The height grid [m] has shape (nrow, ncol), row along y.
     """
-    nrow, ncol = heights.shape
-    y, x = np.meshgrid(SPACING * np.arange(nrow), SPACING * np.arange(ncol), indexing="ij")
-    near = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
-    # Each cell is cut from its (low x, high y) to its (high x, low y) corner, as the physics has it.
-    lower = np.stack([near, near + 1, near + ncol], axis=1)
-    upper = np.stack([near + 1, near + ncol + 1, near + ncol], axis=1)
+    vertices, faces = surface_of(heights)
     color = height_colors(heights)
     color = 255.0 * (color if ground is None else tinted(color, ground))
     every = round(_LINE_EVERY / SPACING)
     color[::every] *= _LINE_DARKNESS
     color[:, ::every] *= _LINE_DARKNESS
-    vertices = np.stack([x, y, heights], axis=-1).reshape(-1, 3)
-    return _mesh(vertices, np.concatenate([lower, upper]), color.reshape(-1, 3).astype(np.uint8))
+    return _mesh(vertices, faces, color.reshape(-1, 3).astype(np.uint8))
 
 
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
