@@ -251,7 +251,7 @@ def _legend(crossed: Crossed) -> list[Any]:
     if ground is not None and (ground.friction < 1.0).any():
         handles.append(Patch(facecolor="none", edgecolor=SLIPPERY, hatch="\\\\\\", label="slippery"))
     if ground is not None and ground.time_constant_s.any():
-        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="///", label="soft"))
+        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="|||", label="soft"))
     return handles
 
 

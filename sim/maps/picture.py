@@ -26,7 +26,7 @@ _LEAST_RANGE = 0.3  # [m]: lower ground is not painted as if it were mountains
 SLIPPERY, SOFT = (0.0, 0.55, 0.60), (0.55, 0.25, 0.75)
 """RGB (0 to 1) of the lines over slippery and over soft patches."""
 _LINES_EVERY, _LINE = 8, 2  # nodes from line to line, and of a line
-_FAINT, _STRONG, _WASH = 0.35, 0.85, 0.1  # opacity of lines over nearly usual and over the worst ground, and between
+_FAINT, _STRONG, _WASH = 0.3, 0.75, 0.1  # opacity of lines over nearly usual and over the worst ground, and between
 
 
 def height_colors(heights: NDArray[np.floating], most: float | None = None) -> NDArray[np.float64]:
@@ -39,7 +39,7 @@ def _range_of(heights: NDArray[np.floating], most: float | None) -> float:
 
 
 def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -> NDArray[np.float64]:
-    """Diagonal lines over slippery patches, across them over soft ones: RGBA of nodes or cells, (rows, columns, 4).
+    """Diagonal lines over slippery patches, lines along y over soft ones: RGBA of nodes or cells, (rows, columns, 4).
 
     They are the stronger the more slippery or soft a patch is, and leave its height to be seen. ``margin`` nodes on
     each side are not of the terrain.
@@ -53,7 +53,7 @@ def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -
     soft = np.log(tau / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S)
     strength = np.stack([slippery, soft], axis=-1)[patch_row[:, None], patch_column]
     row, column = np.ogrid[:rows, :columns]
-    on_line = np.stack([(row + column) % _LINES_EVERY < _LINE, (row - column) % _LINES_EVERY < _LINE], axis=-1)
+    on_line = np.stack([(row + column) % _LINES_EVERY < _LINE, (0 * row + column) % _LINES_EVERY < _LINE], axis=-1)
     opacity = np.where(on_line, _FAINT + (_STRONG - _FAINT) * strength, _WASH) * (strength > 0.0)
     share = opacity / np.maximum(opacity.sum(axis=-1, keepdims=True), 1e-9)
     return np.concatenate([share @ np.array([SLIPPERY, SOFT]), opacity.max(axis=-1, keepdims=True)], axis=-1)

@@ -17,7 +17,7 @@ def legend_html(controllers: Sequence[str]) -> str:
     bar = f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {ramp})"></span>'
     rows = {
         "Ground": f"low {bar} high; grey is the level of the start, and a line stands every metre; "
-        + _swatches({"slippery": _lines(SLIPPERY, -45), "soft": _lines(SOFT, 45)})
+        + _swatches({"slippery": _lines(SLIPPERY, -45), "soft": _lines(SOFT, 90)})
         + "the stronger the worse, crossed where ground is both",
         "Paths": "of all episodes, by how they ended: "
         + _swatches({ending.words: ending.color for ending in ENDINGS.values()}),
