@@ -24,8 +24,8 @@ from sim.rollout import RolloutResult
 from sim.spaces.base import TerrainSpace
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
-_LOOK = 16  # terrains that are crossed before all others, since a penalty that never occurs shows early
 _ENOUGH = 200  # failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are
+_MOST = 5  # times as many terrains as to begin with
 _FEW = 30  # of those episodes, how many at least a penalty should occur in
 
 
@@ -35,7 +35,6 @@ def calibrate(
     *,
     compute: Compute,
     terrains: int = 1_000,
-    most_terrains: int = 5_000,
     replicas: int = 20,
     space: TerrainSpace = SUPER_GAUSSIAN,
     seed: int = 0,
@@ -49,8 +48,8 @@ def calibrate(
         robot: The robot.
         policy: Its controller; the robot's own if None.
         compute: Where terrains are crossed.
-        terrains: Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal.
-        most_terrains: Largest number of terrains. With fewer failing episodes even then, all episodes give the scales.
+        terrains: Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal,
+            up to five times as many. With fewer failing episodes even then, all episodes give the scales.
         replicas: Episodes a terrain.
         space: What the terrains are drawn from.
         seed: Draws terrains and starts.
@@ -63,10 +62,9 @@ def calibrate(
     """
     if policy is not None and out is None and robot.settings_file is None:
         raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")
-    for name, value in {"terrains": terrains, "most_terrains": most_terrains, "replicas": replicas}.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    policy, out, most = policy or str(robot.policy_file), out or robot.scales_file, max(terrains, most_terrains)
+    if terrains < 1:
+        raise ValueError(f"terrains must be at least 1, got {terrains}")
+    policy, out, most = policy or str(robot.policy_file), out or robot.scales_file, _MOST * terrains
     prepare_output(out)
     check_policy(policy, robot, compute.device)
     # Both are drawn row by row: of 5,000 the first 1,000 are those that 1,000 would be.
@@ -74,26 +72,15 @@ def calibrate(
     seeds = np.random.SeedSequence(seed).generate_state(most, np.uint32)
     results: list[RolloutResult] = []
     with Crossings(robot, compute, cache=cache, open_evaluator=open_evaluator) as crossings:
-        done, count = 0, min(_LOOK, terrains)
-        while count > done:
-            rows = slice(done, count)
+        for first in range(0, most, terrains):
+            rows, label = slice(first, first + terrains), f"hard-random terrains from {first + 1:,}"
             results.append(
-                crossings.cross(
-                    policy, genes[rows], seeds[rows], replicas=replicas, space=space.name, at_most=terrains,
-                    label=f"hard-random terrains {done + 1:,} to {count:,}",
-                )
-            )  # fmt: skip
-            result, done = join_results(results, join=1), count
-            if done < terrains:
-                sums = np.asarray(result.penalties)[~result.invalid].sum(axis=0).tolist()
-                if absent := [name for name, value in zip(result.penalty_names, sums, strict=True) if not value]:
-                    print(
-                        f"In the first {result.invalid.size} episodes {', '.join(absent)} never occurred.", flush=True
-                    )
-                count = terrains
-            elif _failing(result).sum() < _ENOUGH:
-                print(f"{_failing(result).sum()} of {result.invalid.size} episodes did not reach the goal.", flush=True)
-                count = min(done + terrains, most)
+                crossings.cross(policy, genes[rows], seeds[rows], replicas=replicas, space=space.name, label=label)
+            )
+            result = join_results(results, join=1)
+            if (count := _failing(result).sum()) >= _ENOUGH:
+                break
+            print(f"{count} of {result.invalid.size} episodes did not reach the goal.", flush=True)
     origin = {**origin_of(compute.device, seed, compute.workers), **identity(robot, policy), "space": space.name}
     report = {**origin, "crossing": asdict(CrossingCfg()), **measured(result)}
     _print_scales(report)

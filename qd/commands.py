@@ -219,9 +219,8 @@ class Calibrate(ControllerFlags, WorkerFlags):
     """
 
     terrains: PositiveInt = 1_000
-    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal."""
-    most_terrains: PositiveInt = 5_000
-    """Largest number of terrains. With fewer failing episodes even then, all episodes give the scales."""
+    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal, up to five
+    times as many. With fewer failing episodes even then, all episodes give the scales."""
     space: str = "super_gaussian"
     """Terrain space that they are drawn from: super_gaussian, course, or file.py:CLASS."""
     seed: NonNegativeInt = 0
@@ -241,7 +240,6 @@ class Calibrate(ControllerFlags, WorkerFlags):
             self.policy,
             compute=Compute.resolve(self.device, self.workers, self.num_envs),
             terrains=self.terrains,
-            most_terrains=self.most_terrains,
             space=load_space(self.space),
             seed=self.seed,
             out=self.out,
