@@ -28,17 +28,17 @@ def loaded_by(*argv: str) -> tuple[str, set[str]]:
     return text, set(loaded.split())
 
 
-def test_help_names_every_command_and_loads_nothing():
+def test_help_names_every_command_the_six_of_a_newcomer_first_and_loads_nothing():
     text, loaded = loaded_by("--help")
-    assert [name for name in WORDS if f"  {name} " not in text] == []
-    assert loaded == set()
+    named = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
+    assert sorted(named) == sorted(WORDS)
+    assert named[:6] == ["archive", "view", "report", "film", "judge", "export"] and loaded == set()
 
 
 @pytest.mark.parametrize("name", WORDS)
 def test_help_of_a_command_is_quick(name):
     text, loaded = loaded_by(name, "--help")
-    assert f"usage: faultline {name}" in text
-    assert loaded == set()
+    assert f"usage: faultline {name}" in text and loaded == set()
 
 
 @pytest.mark.parametrize("name", WORDS)
@@ -50,18 +50,9 @@ def test_a_command_is_a_frozen_dataclass_whose_help_teaches(name):
     assert command.__doc__ and not command.__doc__.startswith(f"{cls}(")  # what dataclass makes up where there is none
 
 
-def test_no_command_shows_what_there_is(capsys):
-    assert faultline.main([]) == 0
-    assert "usage: faultline COMMAND" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(("given", "meant"), [("achive", "did you mean archive?"), ("xyz", "--help lists them")])
 def test_an_unknown_word_gets_a_suggestion(capsys, given, meant):
     assert faultline.main([given]) == 2
     error = capsys.readouterr().err
     assert f"'{given}'" in error and meant in error
-
-
-def test_a_flag_that_is_none_is_refused(capsys):
-    assert faultline.main(["stand", "--robots", "anymal"]) == 2
-    assert "--robots" in capsys.readouterr().err
+    assert faultline.main([]) == 0 and "usage: faultline COMMAND" in capsys.readouterr().out

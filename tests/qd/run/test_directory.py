@@ -21,21 +21,14 @@ def test_a_run_without_a_name_gets_a_folder_of_its_own(tmp_path, monkeypatch):
         free_path("a").mkdir(parents=True)
 
 
-def test_a_claimed_directory_that_stays_empty_goes_away(tmp_path):
-    with claimed(tmp_path / "a" / "b"):
-        assert (tmp_path / "a" / "b").is_dir()
-    assert not (tmp_path / "a" / "b").exists()
+def test_a_claim_keeps_others_out_and_leaves_no_empty_directory(tmp_path):
     (tmp_path / "mine").mkdir()
-    with claimed(tmp_path / "mine"):
-        pass
-    assert (tmp_path / "mine").exists()
-
-
-def test_a_claim_keeps_others_out_and_ends_with_its_context(tmp_path):
-    with claimed(tmp_path), pytest.raises(ValueError, match="another command works in"), claimed(tmp_path):
-        pass
-    with claimed(tmp_path):
-        pass
+    for path in (tmp_path / "a" / "b", tmp_path / "mine"):
+        with claimed(path), pytest.raises(ValueError, match="another command works in"), claimed(path):
+            pass
+        with claimed(path):
+            assert path.is_dir()
+    assert not (tmp_path / "a" / "b").exists() and (tmp_path / "mine").exists()
 
 
 @pytest.mark.parametrize("name", ["a\nb", os.fsdecode(b"\xff"), "\x1b[31m", "a" * 300])

@@ -15,7 +15,6 @@ from sim.files.settings import NonNegativeInt
 NothingError = type("NothingError", (UserError,), {"status": 1})
 ERRORS = {
     "value": (ValueError("two\nlines"), 2, "error: two lines\n"),
-    "user": (UserError("a worker is lost"), 2, "error: a worker is lost\n"),
     "own status": (NothingError("nothing is valid"), 1, "error: nothing is valid\n"),
     "file": (OSError("a/b cannot be written"), 2, "error: a/b cannot be written\n"),
     "number": (FloatingPointError("not finite"), 2, "error: not finite\n"),
@@ -33,6 +32,8 @@ class Toy:
     """What to raise."""
     status: NonNegativeInt | None = None
     """What to return."""
+    size: tuple[float, float] | None = None
+    """Of nothing."""
 
     def execute(self) -> int | None:
         """Raises or returns what its flags say; "term" waits for a signal that arrives while code is compiled."""
@@ -60,12 +61,20 @@ def test_errors_become_one_line_and_an_exit_status(capsys, how):
 def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsys):
     assert (run(), run("--status", "1")) == (0, 1)
     assert run("--status", "-1") == 2 and "status" in capsys.readouterr().err
-    assert run("--status", "x") == run("--nobody") == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2 and "--status" in lines[0] and "--nobody" in lines[1]
+    assert run("--size", "3") == run("--status=z") == run("--nobody") == 2
+    size, status, nobody = capsys.readouterr().err.splitlines()
+    assert "--size must be FLOAT FLOAT, got 3;" in size and "--status must be INT, got z;" in status
+    assert "--nobody" in nobody
+
+
+def test_help_fits_the_terminal_and_says_no_none(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "46")
     with pytest.raises(SystemExit):
         run("--help")
-    assert "usage: faultline toy" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert text.startswith("Fail as told.") and "usage: faultline toy" in text and "--status INT" in text
+    assert "None" not in text and "(default: )" not in text
+    assert max(len(line) for line in text.splitlines() if not line.startswith("usage")) <= 46
 
 
 def test_sigterm_in_the_midst_of_compiling_is_not_lost():
@@ -84,8 +93,6 @@ def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatc
     monkeypatch.setenv("FAULTLINE_DEBUG", "1")
     with pytest.raises(ValueError, match="two"):
         run("--how", "value")
-    monkeypatch.setenv("FAULTLINE_DEBUG", "0")
-    assert run("--how", "value") == 2
 
 
 def test_a_command_line_can_be_typed():
@@ -105,14 +112,12 @@ def test_a_report_is_shown_and_written_and_where_is_tried_before_the_work(tmp_pa
 
 
 def test_elites_are_named_by_numbers_or_all():
-    assert chosen_elites("2 0, 2", 3, "a run") == [2, 0]
-    assert chosen_elites("all", 3, "a run") == [0, 1, 2]
-    for text, count in (("3", 3), ("-1", 3), ("", 3), ("0 all", 3), ("²", 3), ("all", 0)):
+    assert chosen_elites("2 0, 2", 3, "a run") == [2, 0] and chosen_elites("all", 3, "a run") == [0, 1, 2]
+    for text, count in (("3", 3), ("-1", 3), ("", 3), ("0 all", 3), ("all", 0)):
         with pytest.raises(ValueError, match="a run"):
             chosen_elites(text, count, "a run")
 
 
 @pytest.mark.parametrize(("line", "value"), [("--seed 3 --a wide", "wide"), ("--a=b=c", "b=c"), ("--a b --a=", "")])
 def test_a_flag_is_looked_at_before_the_others_are_parsed(line, value):
-    assert peek(line.split(), "--a") == value
-    assert peek(line.split(), "--b") is None
+    assert peek(line.split(), "--a") == value and peek(line.split(), "--b") is None
