@@ -74,7 +74,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     if saved is not None:
         check_settings(run_dir, saved, settings)
         if is_finished(run_dir, cfg.iterations, run.export):
-            print(f"{run_dir} is finished: all {cfg.iterations} iterations are done, more go on.")
+            print(f"{run_dir} is finished: all {cfg.iterations} iterations are done. A larger --iterations goes on.")
             return run_dir / POLICY
     with run_directory(run_dir, run.export, overwrite=run.overwrite):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"

@@ -63,9 +63,7 @@ def measure_dose(
             how="resolved" if resolved else "searched", cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )  # fmt: skip
         rows = {
-            (name, controller): [
-                {**row, "resolved": resolved} for row in rows_of(name, dose, controller, results[name][controller])
-            ]
+            (name, controller): rows_of(name, dose, controller, results[name][controller])
             for name, dose in doses.items()
             for controller in controllers
         }
@@ -78,7 +76,7 @@ def measure_dose(
             "episodes": episodes,
             "controllers": about_controllers(controllers, robot),
             "titles": {name: dose.describe() for name, dose in doses.items()},
-            "dose": [row for of_dose in rows.values() for row in of_dose],
+            "dose": [{**row, "resolved": resolved} for of_dose in rows.values() for row in of_dose],
             "half": [half_of(doses[name], of_dose) for (name, _), of_dose in rows.items()],
         }
 
@@ -110,9 +108,9 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
     def by_value(array: NDArray[Any]) -> NDArray[Any]:
         return array.reshape(-1, len(dose.values), array.shape[1]).swapaxes(0, 1).reshape(len(dose.values), -1)
 
-    outcome, fallen = by_value(result.outcome), by_value(result.fallen)
-    goal, counted = hits_of(outcome, "goal")
-    success, _ = hits_of(outcome, "success")
+    outcome = by_value(result.outcome)
+    (goal, counted), (success, _) = hits_of(outcome, "goal"), hits_of(outcome, "success")
+    hits = {"goal": goal, "success": success, "fallen": by_value(result.fallen) & counted}
     rows = []
     for number, value in enumerate(dose.values):
         count = int(counted[number].sum())
@@ -120,11 +118,10 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
             "element": name, "parameter": dose.parameter, "value": value, "unit": dose.unit, "at": dict(dose.others),
             "controller": controller, "episodes": count, "left_out": outcome.shape[1] - count,
         }  # fmt: skip
-        for rate, hits in {"goal": goal, "success": success, "fallen": fallen & counted}.items():
-            number_of_hits = int(hits[number].sum())
+        for rate, of_rate in hits.items():
+            number_of_hits, interval = int(of_rate[number].sum()), "interval" if rate == "goal" else f"{rate}_interval"
             row[f"{rate}_rate"] = number_of_hits / count if count else None
-            limits = list(wilson_interval(number_of_hits, count)) if count else None
-            row["interval" if rate == "goal" else f"{rate}_interval"] = limits
+            row[interval] = list(wilson_interval(number_of_hits, count)) if count else None
         rows.append(row)
     return rows
 

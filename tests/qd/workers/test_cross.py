@@ -12,6 +12,7 @@ from qd.workers import cross as service
 from qd.workers.cross import Cache, Crossings, cross
 from qd.workers.evaluator import Compute
 from qd.workers.invalid import AllInvalidError
+from sim.files.command import Interrupted
 from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
@@ -77,7 +78,7 @@ def test_cached_crossings_are_the_same_bit_for_bit_and_take_no_time(tmp_path):
 
 def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_another_order(tmp_path):
     stopped = StandIn(stop=5)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted, match="the same command goes on"):
         cross_all(stopped, tmp_path)
     assert stopped.crossed == [0, 1, 2, 3]  # two lots of a terrain a worker
     order = np.array([8, 3, 5, 0, 7])
