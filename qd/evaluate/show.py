@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, SETS
+from qd.evaluate.labels import COMPARED, MEASURES, SETS
 from qd.evaluate.tables import is_regression
 from sim.files.command import say
 from sim.files.intervals import value_words
@@ -16,11 +16,6 @@ from sim.files.intervals import value_words
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 _RATES = ("goal", "success", "fallen")
-_BIASED = {
-    None: "",
-    "searched": "too low, since the terrains were chosen by its failures",
-    "certifier": "too high, since some terrains were chosen by its successes",
-}
 
 
 def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -64,47 +59,17 @@ def show_rates(report: dict[str, Any]) -> None:
 
 
 def show_tables(report: dict[str, Any]) -> None:
-    """Prints ``tables.json``: every set with every controller, and what became of terrains."""
-
-    def cell(measure: str, name: str, controller: str) -> str:
-        limits = report["intervals"][measure][name][controller]
-        return value_words(report[measure][name][controller], limits, _FORMS.get(measure, ".3f"))
-
+    """Prints the means of every set with every controller, and what became of terrains."""
     if report.get("part") == "validation":
         print("\nValidation terrains, to choose settings by. Rates to report are of part test.")
-    controllers, paper = report["controllers"], report["paper"] or {}
     for name, count in report["terrains"].items():
-        published = [(_FORMS[key], paper.get(key, {}).get(name, {})) for key in ("success", "reward")]
+        limits = {measure: report["intervals"][measure][name] for measure in _FORMS}
         rows = [
-            (
-                controller,
-                *(cell(measure, name, controller) for measure in _FORMS),
-                ", ".join(format(values[controller], form) for form, values in published if controller in values),
-            )
-            for controller in controllers
+            (who, *(value_words(report[key][name][who], limits[key][who], form) for key, form in _FORMS.items()))
+            for who in report["controllers"]
         ]
         title = f"{SETS.get(name, name)}: {count} terrains x {report['episodes']} episodes"
-        show_table(title, (*_heads(_FORMS), "paper: success, reward"), rows)
-    for name, about in report["certified"].items():
-        certifiers = ", ".join(f"{certifier} {count}" for certifier, count in about["certifiers"].items())
-        title = f"{SETS.get(name, name)}, certified: {about['terrains']} of {report['terrains'][name]} ({certifiers})"
-        rows = [
-            (
-                controller,
-                *(cell(measure, name, controller) for measure in CERTIFIED),
-                _BIASED[about["chosen_by"].get(controller)],
-            )
-            for controller in controllers
-        ]
-        show_table(title, (*_heads(CERTIFIED.values()), "biased"), rows if about["terrains"] else [])
-    rows = [
-        (f"{name}, {kind}, {measure.replace('_', ' ')}", value_words(summary["mean"], summary["interval"]))
-        for measure, sets in report["over_seeds"].items()
-        for name, kinds in sets.items()
-        for kind, summary in kinds.items()
-    ]
-    if rows:
-        show_table("several controllers of a kind: mean, 95 % t interval over them", ("", "mean"), rows)
+        show_table(title, _heads(_FORMS), rows)
     rows = []
     for name, pairs in report["differences"].items():
         for pair, change in pairs.items():

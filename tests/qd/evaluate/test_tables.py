@@ -158,18 +158,14 @@ def test_what_are_no_tables_is_refused(report, change, field):
         as_tables(changed)
 
 
-def test_the_terminal_shows_the_numbers(report, certified, capsys):
+def test_the_terminal_shows_the_numbers(report, capsys):
     show_tables(report)
     lines = capsys.readouterr().out.splitlines()
-    row = next(line for line in lines if line.startswith("C-G"))
-    assert "0.833 (" in row and "0.980, 25.4" in row  # ours, and the paper's
+    assert "0.833 (" in next(line for line in lines if line.startswith("C-G"))
     # C-G fails terrain 102, as base does; terrain 101 is not compared.
     (row,) = (line.split() for line in lines if line.startswith("generated, base -> C-G"))
     assert row[4:] == ["0", "(0)", "0", "(0)", "1", "2", "+0.000", "(+0.000", "to", "+0.000)"]
     assert any("C-G on generated: 4 episodes are invalid (33.3%)" in line for line in lines)
-    show_tables(certified)
-    shown = capsys.readouterr().out
-    assert "certified: 2 of 4 (C-G 2, S 0)" in shown and "too low" in shown and "too high" in shown
 
 
 def test_the_figure_shows_the_tables(report):
@@ -181,6 +177,6 @@ def test_the_figure_shows_the_tables(report):
 def test_tables_without_a_valid_terrain_are_shown_too(anymal, capsys):
     nothing = tables_of(anymal, {"generated": {"base": make_measured([0, 0], of=4, bad=[0, 1])}}, {})
     assert nothing["success"]["generated"]["base"] is None and nothing["differences"] == {"generated": {}}
-    show_tables({**nothing, "paper": None})
+    show_tables(nothing)
     draw_tables(nothing).canvas.draw()
     assert "base" in capsys.readouterr().out
