@@ -6,11 +6,14 @@ terrains that it asks for next, with as many robots and the same solver.
 
 import json
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -127,7 +130,39 @@ def time_cpu(script: Script) -> dict[str, Any]:
     shutil.rmtree(run, ignore_errors=True)
     words = ("archive", "--robot", script.robot.name, "--preset", "small", "--device", "cpu", "--run-dir", str(run))
     subprocess.run([sys.executable, "-m", "faultline", *words], check=True)
-    return {"archive_wall_s": time.perf_counter() - began, "view_to_failure_s": None}
+    return {"archive_wall_s": time.perf_counter() - began, **time_view(script.robot.name, script.runs / "speed")}
+
+
+def time_view(robot: str, folder: Path) -> dict[str, float | None]:
+    """What a user waits for from `faultline view` to the page and to a failure that plays in it, with warm kernels.
+
+    The archive is the published one, no recording of it is stored, and a browser without a screen opens the page.
+    """
+    browser_file = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser_file is None or find_spec("playwright") is None:
+        return {"view_to_page_s": None, "view_to_failure_s": None}
+    from playwright.sync_api import sync_playwright
+
+    cache = folder / "recordings"
+    shutil.rmtree(cache, ignore_errors=True)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    words = ("view", "--run", f"results/{robot}/archive", "--port", port, "--cache", str(cache))
+    with sync_playwright() as started:
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        page = started.chromium.launch(executable_path=browser_file, args=flags).new_page()
+        began = time.perf_counter()
+        with subprocess.Popen([sys.executable, "-m", "faultline", *words], stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            next(line for line in server.stdout if line.startswith("Open "))
+            served_s = time.perf_counter() - began
+            page.goto(f"http://127.0.0.1:{port}")
+            page.wait_for_function("document.querySelector('#faultline [aria-label=Pause]')", timeout=300_000)
+            plays_s = time.perf_counter() - began
+            server.send_signal(signal.SIGINT)
+            server.communicate()
+    return {"view_to_page_s": served_s, "view_to_failure_s": plays_s}
 
 
 def training_rates(file: Path) -> dict[str, float | None]:

@@ -22,7 +22,7 @@ _GREY, _PICKED = "#d8d8d8", "#d55e00"
 _WIDTH, _HEIGHT = 460, 320
 _TOP, _BOTTOM, _LEFT, _RIGHT = 16, 104, 58, 14
 _MANY = 400  # lines, beyond which they are drawn thinner
-RATES = {"goal_rate": "reached the goal", "collision_rate": "base collision", "other_rate": "out of time or off it",
+RATES = {"goal_rate": "reached the goal", "collision_rate": "base collision", "other_rate": "out of time, off it",
          "fallen_rate": "fallen"}  # fmt: skip
 FITNESS_WORDS = (
     "what the search looks for: mean scaled penalties, less their spread over episodes, less a share of episodes "
@@ -125,7 +125,7 @@ class Listing:
         head = "fresh" if elites.fresh[number] else "as found"
         columns = [(head, count, {name: elites.hits(name, number) for name in RATES})]
         if faults is not None:
-            counts = {"contact resolved": faults.resolved_outcomes[number]}
+            counts = {"resolved": faults.resolved_outcomes[number]}
             crossed = zip(faults.certifiers, faults.certifier_outcomes[number], strict=True)
             counts |= dict(sorted(crossed, key=lambda pair: -int(pair[1][0]))[:1])
             columns += [(head, *_counts_of(outcomes)) for head, outcomes in counts.items() if outcomes.any()]
@@ -170,7 +170,7 @@ def column_of(head: str, crossed: Crossed) -> Column:
 
 def table_html(columns: Sequence[Column]) -> str:
     """How episodes ended, a row a way and a column a controller, with 95 % intervals (Wilson)."""
-    heads = "".join(f"<th>{escape(head)}<br><small>{count} episodes</small></th>" for head, count, _ in columns)
+    heads = "".join(f"<th>{escape(head)}<small>{count} episodes</small></th>" for head, count, _ in columns)
     rows = []
     for name, words in RATES.items():
         cells = []

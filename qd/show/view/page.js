@@ -51,9 +51,11 @@ window.faultline = (() => {
     .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100vw !important; }
     body:not(.unfolded) .mantine-Paper-root[style*="position: fixed"] { max-height: 3.5em !important; overflow: hidden; }
     [data-elite] { cursor: pointer; padding: 2px 6px; border-radius: 3px; }
-    .faultline-list { max-height: 46dvh; overflow-y: auto; margin-top: 4px; }
+    .faultline-list { max-height: 30dvh; overflow-y: auto; margin-top: 4px; }
     .faultline-rates { width: 100%; border-collapse: collapse; font-size: .85em; }
-    .faultline-rates th, .faultline-rates td { text-align: left; font-weight: normal; padding: 2px 6px; }
+    .faultline-rates th, .faultline-rates td { text-align: left; font-weight: normal; padding: 2px 6px; line-height: 1.15;
+      white-space: nowrap; }
+    .faultline-rates small { display: block; color: #868e96; }
     .faultline-rates tr + tr { border-top: 1px solid var(--mantine-color-default-border, #ddd); }
     [data-elite]:hover { background: rgba(25, 113, 194, .12); }`;
   document.head.append(style, picked);
@@ -94,13 +96,13 @@ window.faultline = (() => {
       mark.onclick = () => send("seek", time);
       return mark;
     }));
-    let right = 0; // of the words before: those without room are not shown
-    for (const { firstChild: words, offsetLeft, parentElement } of marks.children) {
-      const width = words.offsetWidth, room = parentElement.parentElement.offsetWidth;
-      const left = Math.max(0, Math.min(offsetLeft - width / 2, room - width));
-      words.hidden = left < right + 8 && right > 0;
-      words.style.left = `${left - offsetLeft}px`;
-      if (!words.hidden) right = left + width;
+    let free = Infinity; // from here on there are other words; the last ones matter most
+    for (const mark of [...marks.children].reverse()) {
+      const words = mark.firstChild, room = marks.parentElement.offsetWidth;
+      const left = Math.max(0, Math.min(mark.offsetLeft - words.offsetWidth / 2, room - words.offsetWidth));
+      words.hidden = left + words.offsetWidth + 8 > free;
+      words.style.left = `${left - mark.offsetLeft}px`;
+      if (!words.hidden) free = left;
     }
   };
   const drawTime = () => {
@@ -154,8 +156,7 @@ window.faultline = (() => {
   on(window, "pointerup", () => { dragging = false; range.blur(); });
   on(range, "input", () => send("seek", Number(range.value)));
   on(bar, "click", (event) => {
-    const name = event.target.dataset.do;
-    if (event.target.tagName === "BUTTON") send(name);
+    if (event.target.tagName === "BUTTON") TASKS[event.target.dataset.do]();
     event.target.blur?.();
   });
   on(bar, "change", (event) => {
@@ -163,22 +164,27 @@ window.faultline = (() => {
     if (name) send(name, target.type === "checkbox" ? target.checked : Number(target.value));
     target.blur();
   });
-  const KEYS = { " ": ["play"], ArrowLeft: ["go_on", -0.1], ArrowRight: ["go_on", 0.1], m: ["mark"], n: ["step", 1],
-    p: ["step", -1], f: ["toggle_follow"], o: ["overview"] };
+  const TASKS = {
+    play: () => send("play", !state.playing),
+    mark: () => send("pause_at", (state.marks.find(([time]) => time > state.time + 1e-6) ?? state.marks[0])[0]),
+  };
+  const KEYS = { " ": TASKS.play, m: TASKS.mark, ArrowLeft: () => send("pause_at", state.time - 0.1),
+    ArrowRight: () => send("pause_at", state.time + 0.1), n: () => send("step", 1), p: () => send("step", -1),
+    f: () => send("follow", !state.follow), o: () => send("overview") };
   on(document, "keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const field = event.target.closest("input:not([type=range], [type=checkbox]), textarea, select");
     if (field?.classList.contains("faultline-number") && event.key === "Enter") {
-      send("pick_typed", field.value);
+      send("pick", field.value);
       field.value = "";
       field.blur();
     }
-    const task = KEYS[event.key] ?? (event.key >= "1" && event.key <= "9" ? ["episode", Number(event.key)] : null);
+    const task = KEYS[event.key] ?? (/^[1-9]$/.test(event.key) ? () => send("episode", Number(event.key)) : null);
     if (field || !task) return;
     event.preventDefault(); // neither scrolls a panel nor presses a button in focus
     event.stopPropagation(); // nor moves viser's camera
     document.activeElement?.blur();
-    send(...task);
+    task();
   }, true);
   on(document, "click", (event) => {
     const row = event.target.closest("[data-elite]");

@@ -25,6 +25,7 @@ _WIDTH, _NARROW_WIDTH = 360, 300  # of a panel [pixels]
 _WIDE = 1300  # a window from here on has room for two wide panels; in a narrower one the archive is folded [pixels]
 _TERRAINS = ("whole", "minimal")
 _CURVE_POINTS = 300
+_HOLD_S = 1.5  # real time from the end of a crossing that plays to its next begin
 _KEYS = """- **Space** play or pause
 - **←** **→** 0.1 s back or on, **M** next mark
 - **1** to **9** an episode
@@ -62,33 +63,30 @@ class Selection:
 
 @dataclass(kw_only=True)
 class Clock:
-    """Time within a crossing, run by real time."""
+    """Time within a crossing, run by real time; a crossing that plays begins again after its end."""
 
     duration_s: float = 0.0
+    begin_s: float = 0.0
+    """Where it begins again."""
     time_s: float = 0.0
     speed: float = 1.0
     """Simulated seconds in a real one."""
     playing: bool = False
-
-    def load(self, duration_s: float) -> None:
-        """Begin another crossing; playing goes on."""
-        self.duration_s, self.time_s = duration_s, 0.0
+    _waited_s: float = 0.0
 
     def seek(self, time_s: float) -> None:
         """Show a time, no further than the ends."""
         self.time_s = float(np.clip(time_s, 0.0, self.duration_s))
 
-    def toggle(self) -> None:
-        """Play or pause; at its end a crossing begins anew."""
-        self.playing = not self.playing
-        if self.playing and self.time_s >= self.duration_s:
-            self.time_s = 0.0
-
     def tick(self, real_s: float) -> None:
-        """Let real time go by [s]; at its end a crossing stops."""
-        if self.playing:
+        """Let real time go by [s]."""
+        if self.playing and self.time_s < self.duration_s:
             self.seek(self.time_s + self.speed * real_s)
-            self.playing = self.time_s < self.duration_s
+            self._waited_s = 0.0
+        elif self.playing:
+            self._waited_s += real_s
+            if self._waited_s >= _HOLD_S:
+                self.seek(self.begin_s)
 
     def frame(self, dt: float, num_frames: int) -> int:
         """Frame of the shown time among ``num_frames`` that are ``dt`` [s] apart."""
@@ -116,8 +114,7 @@ class ArchivePanel:
                 "kind": _add_choice(gui, "Only", kinds := listing.kinds(), partial(self._choose, "kind")),
             }  # fmt: skip
             self._options = {"cause": causes, "order": orders, "kind": kinds}
-            self._plot = gui.add_html("")
-            self.list = gui.add_html("")
+            self.list, self._plot = gui.add_html(""), gui.add_html("")
 
     def _choose(self, name: str, value: str) -> None:
         def change() -> None:
@@ -172,12 +169,11 @@ class CrossingPanel:
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
-            self.details, self.numbers = gui.add_markdown(""), gui.add_html("")
+            self.details = gui.add_markdown("")
         with gui.add_folder("Show", expand_by_default=False):
             for label, (switch, value) in {
                 "Foot forces": (tab.set_forces, True),
                 "All paths": (tab.scene.switch_paths, True),
-                "Names of feet": (tab.set_names, False),
             }.items():
                 box = gui.add_checkbox(label, value)
                 _on_visit(box, lambda value, switch=switch: post(switch, value))
@@ -226,10 +222,6 @@ class CrossingPanel:
         """Have the curves' time last as long as the bar's [s]."""
         if self._curves is not None:
             self._curves.scales = {"x": uplot.Scale(time=False, range=(0.0, max(duration_s, 0.02)))}
-
-    def show_numbers(self, words: str) -> None:
-        """Show the numbers of the moment."""
-        self.numbers.content = _small(words)
 
 
 def _small(text: str) -> str:

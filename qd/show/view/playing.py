@@ -43,12 +43,8 @@ class Crossing:
     """Bodies to world, w x y z, shape (F, num_bodies, 4)."""
     forces: NDArray[np.float64]
     """Arrows of the feet's contact forces, begin and end [m], shape (F, num_feet, 2, 3); small forces have length 0."""
-    force_newtons: NDArray[np.float64]
-    """Their size [N], shape (F, num_feet)."""
     command: NDArray[np.float64]
     """Arrow of the velocity command, begin and end [m], shape (F, 2, 3)."""
-    command_values: NDArray[np.float64]
-    """v_x, v_y [m/s], yaw rate [rad/s], yaw frame, shape (F, 3)."""
     penalties: NDArray[np.float64]
     """Scaled sums so far, in the archive's order, shape (F, P)."""
     touching: NDArray[np.bool_] | None
@@ -96,9 +92,7 @@ def crossing_of(
         positions=positions,
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
-        force_newtons=size,
         command=_command_arrows(qpos, command),
-        command_values=command,
         penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
         touching=None if recording.touching is None else recording.touching[0, replica, :frames],
         marks=marks_of(recording, replica),
@@ -149,11 +143,6 @@ def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
     return np.asarray(touching.any(axis=0))
 
 
-def next_mark(marks: Sequence[Mark], time_s: float) -> Mark:
-    """The first mark after a time [s]; after the last one it is the first again."""
-    return next((mark for mark in marks if mark.time_s > time_s + 1e-6), marks[0])
-
-
 def episodes_by_ending(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
     """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
     endings = list(map(ending_of, recording.outcome[0].tolist()))
@@ -195,15 +184,3 @@ def paths_of(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.flo
         chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
         paths.append((positions[chosen], ImageColor.getrgb(ending_of(outcome).color)))
     return paths
-
-
-def moment_text(crossing: Crossing, frame: int, feet: Sequence[str]) -> str:
-    """The numbers of a frame in a line: forces on the feet, command, position of the base."""
-    v_x, v_y, yaw_rate = crossing.command_values[frame]
-    forces = zip(feet, crossing.force_newtons[frame], strict=True)
-    force_words = " · ".join(f"{name} {newtons:,.0f}" for name, newtons in forces)
-    x, y, z = crossing.positions[frame, 0]
-    return (
-        f"Forces on the feet [N]: {force_words}. Command: {v_x:.2f}, {v_y:.2f} m/s, {yaw_rate:.2f} rad/s. "
-        f"Base at {x:.2f}, {y:.2f}, {z:.2f} m."
-    )

@@ -56,8 +56,10 @@ class Simulator:
 
         try:
             if isinstance(wanted, WantedFilm):
-                film(wanted.recording, robot, wanted.scales, cfg=wanted.cfg, out=wanted.file)
-                report(1.0)
+                film(
+                    wanted.recording, robot, wanted.scales, wanted.file, wanted.cfg, by=wanted.by,
+                    beside=wanted.beside, progress=report,
+                )  # fmt: skip
                 return wanted.file
             self._simulation = simulation = self._simulation or Simulation(robot, "cpu")
             if only_ready:

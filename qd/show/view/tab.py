@@ -17,7 +17,7 @@ from qd.show.view.filming import Filming
 from qd.show.view.ghost import CERTIFYING, Ghost
 from qd.show.view.listing import Column, column_of
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.playing import Crossing, crossing_of, episodes_by_ending, moment_text, next_mark, paths_of
+from qd.show.view.playing import Crossing, crossing_of, episodes_by_ending, paths_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
@@ -25,8 +25,8 @@ from sim.bank import terrains_of
 from sim.files.command import command_line
 from sim.recording.recorder import Recording
 
-_BAR_S, _NUMBERS_S = 0.1, 0.25
-"""Real time from one update of the bar's time, and of the numbers, to the next, while playing."""
+_BAR_S = 0.1
+"""Real time from one update of the bar's time to the next, while playing."""
 _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
 _BEFORE_S = 1.0
@@ -65,7 +65,7 @@ class Tab:
         self._begin_s: float | None = None  # where the next crossing begins; just before the robot fails if None
         self.recording: Recording | None = None
         self.crossing: Crossing | None = None
-        self.query, self._bar_at, self._numbers_at, self._address_at = "", 0.0, 0.0, time.perf_counter()
+        self.query, self._bar_at, self._address_at = "", 0.0, time.perf_counter()
         self.ghost = Ghost(common, client.client_id)
         self.scene = Scene(client, common.shapes)
         title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
@@ -76,24 +76,22 @@ class Tab:
 
     def act(self, name: str, value: Any) -> None:
         """Do what a visitor did on the bar, by a key or with an elite; what makes no sense is left out."""
-        tasks: dict[str, tuple[type, Callable[..., None]]] = {
-            "seek": (float, self.seek), "go_on": (float, self.go_on), "speed": (float, self.set_speed),
-            "follow": (bool, self.set_follow), "pick": (str, self.pick_typed), "pick_typed": (str, self.pick_typed),
-            "step": (int, self.step), "episode": (int, lambda number: self.choose_replica(number - 1)),
+        tasks: dict[str, tuple[Callable[[Any], Any], Callable[..., None]]] = {
+            "play": (bool, self.play), "seek": (float, self.seek), "pause_at": (float, self.pause_at),
+            "speed": (float, self.set_speed), "episode": (int, lambda number: self.choose_replica(number - 1)),
+            "follow": (bool, self.set_follow), "overview": (bool, lambda _: self.overview()),
+            "pick": (str, self.pick_typed), "step": (int, self.step), "resize": (list, self.resize),
             "open": (str, lambda query: self.go_to(*read_address(query))),
         }  # fmt: skip
-        simple = {"play": self.play, "mark": self.go_to_next_mark, "overview": self.overview,
-                  "toggle_follow": self.toggle_follow}  # fmt: skip
-        if name in simple:
-            simple[name]()
+        kind, method = tasks.get(name, (bool, lambda _: None))
         with suppress(TypeError, ValueError, OverflowError):
-            if name == "resize":
-                self.window = (int(value[0]), int(value[1]))
-            elif name in tasks:
-                kind, method = tasks[name]
-                value = kind(value)
-                if not isinstance(value, float) or math.isfinite(value):
-                    method(value)
+            value = kind(value)
+            if not isinstance(value, float) or math.isfinite(value):
+                method(value)
+
+    def resize(self, window: list[int]) -> None:
+        """Know another width and height of the window [CSS pixels]."""
+        self.window = (int(window[0]), int(window[1]))
 
     def go_to(self, address: Address, refused: list[str]) -> None:
         """Show what an address asks for; one that names no time opens just before the robot fails, and plays."""
@@ -137,7 +135,7 @@ class Tab:
         if self.playing:
             self.clock.tick(real_s)
             self._show_frame()
-            if now - self._bar_at > _BAR_S or not self.clock.playing:
+            if now - self._bar_at > _BAR_S:
                 self._bar_at = now
                 self._show_moment()
         if now - self._address_at > _ADDRESS_S:
@@ -274,11 +272,10 @@ class Tab:
         if self.recording is not None:
             self._show_episode()
 
-    def play(self) -> None:
+    def play(self, playing: bool) -> None:
         """Play or pause."""
-        if self.crossing is not None:
-            self.clock.toggle()
-            self._show_moment()
+        self.clock.playing = playing
+        self._show_moment()
 
     def seek(self, time_s: float) -> None:
         """Show a time [s]."""
@@ -287,16 +284,10 @@ class Tab:
             self._show_frame()
             self._show_moment()
 
-    def go_on(self, by_s: float) -> None:
-        """Pause, and show a later or earlier time [s]."""
+    def pause_at(self, time_s: float) -> None:
+        """Pause, and show a time [s]."""
         self.clock.playing = False
-        self.seek(self.clock.time_s + by_s)
-
-    def go_to_next_mark(self) -> None:
-        """Pause at the next mark."""
-        if self.crossing is not None:
-            self.clock.playing = False
-            self.seek(next_mark(self.crossing.marks, self.clock.time_s).time_s)
+        self.seek(time_s)
 
     def set_speed(self, speed: float) -> None:
         """Play at a speed in simulated seconds a real one."""
@@ -308,18 +299,9 @@ class Tab:
         self.scene.set_follow(follow)
         self.bar.show({"follow": follow})
 
-    def toggle_follow(self) -> None:
-        """Follow the robot, or stop following."""
-        self.set_follow(not self.scene.follow)
-
     def set_forces(self, shown: bool) -> None:
         """Show or hide the forces of the feet."""
         self.scene.show_forces = shown
-        self._show_frame()
-
-    def set_names(self, shown: bool) -> None:
-        """Show or hide the names of the feet."""
-        self.scene.show_names = shown
         self._show_frame()
 
     def show_report(self, report: Report) -> None:
@@ -421,9 +403,8 @@ class Tab:
         """Show the picked elite's crossings if they are recorded, else have them recorded."""
         self.recording = self.crossing = None
         self.scene.hide_crossing()
-        self.clock.load(0.0)
+        self.clock.duration_s = 0.0
         self.panel.show_curves(None)
-        self.panel.numbers.content = ""
         self.bar.show({"enabled": False, "status": "", "marks": [], "episodes": [], "share": None})
         wanted = self.common.wanted(self.selection.picked, self.controller, minimal=self._minimal)
         recording = None if wanted is None else self.common.recordings.read(wanted)
@@ -451,11 +432,11 @@ class Tab:
         self.crossing = crossing = crossing_of(
             self.recording, self.replica, self.common.skeleton, archive.penalties, archive.scales
         )
-        self.clock.load(0.0 if crossing is None else crossing.duration_s)
         self.panel.show_curves(crossing)
         self._show_ghost()
         if crossing is not None:
-            self.clock.seek(max(0.0, crossing.moment_s - _BEFORE_S) if self._begin_s is None else self._begin_s)
+            self.clock.begin_s = max(0.0, crossing.moment_s - _BEFORE_S)
+            self.clock.seek(self.clock.begin_s if self._begin_s is None else self._begin_s)
             self._show_frame()
         marks = [] if crossing is None else list(crossing.marks)
         self.bar.show({"enabled": crossing is not None, "marks": marks, "episode": self.replica + 1})
@@ -468,9 +449,4 @@ class Tab:
                 self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames), self.ghost.name or "")
 
     def _show_moment(self) -> None:
-        crossing, now = self.crossing, time.perf_counter()
-        if crossing is not None and (not self.clock.playing or now - self._numbers_at > _NUMBERS_S):
-            self._numbers_at = now
-            frame = self.clock.frame(crossing.dt, crossing.num_frames)
-            self.panel.show_numbers(moment_text(crossing, frame, self.common.shapes.feet))
         self.bar.show({"time": round(self.clock.time_s, 3), "playing": self.clock.playing})
