@@ -209,7 +209,7 @@ def write_terrain(
         "nodes": list(terrain.heights.shape),
         "start": terrain.on_ground(*CrossingCfg.start),
         "goal": terrain.on_ground(*CrossingCfg.goal),
-        "axes": "rows along y, columns along x; the top row of a PNG is the highest y; an npy is [x, y]",
+        "axes": "rows along y, columns along x; of an npy x along the rows; the top row of a PNG is the highest y",
         "scale_m": scale,
         "offset_m": offset,
         "png_height": "offset_m + scale_m * gray level",
