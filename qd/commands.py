@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from msgspec import Meta
 
@@ -121,7 +121,33 @@ class Archive(ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
+class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
+    """What commands that work on a run's elites share."""
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    certifiers: tuple[str, ...] = ()
+    """The other controllers, each NAME=FILE; if left out, the robot's panel and RUN/certifiers/*.pt."""
+
+    def named(self) -> tuple[Path, dict[str, Any]]:
+        """The run, and what the command line names beside it."""
+        from qd.run.directory import find_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.find import get_robot
+
+        robot = get_robot(self.robot)
+        return find_run(robot, self.run, published="never"), {
+            "compute": Compute.resolve(self.device, self.workers, self.num_envs),
+            "certifiers": controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
+            "robot": self.robot,
+            "policy": self.policy,
+            "space": self.space,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge(_OnRun):
     """Say which elites of a run are faults of its controller.
 
     fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
@@ -132,39 +158,21 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
     kept, so the same command goes on after Ctrl-C.
     """
 
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
     stages: tuple[Literal["fresh", "resolved", "others"], ...] = ("fresh", "resolved", "others")
     """What to do, in this order."""
-    certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, RUN/certifiers/*.pt and the robot's panel:
-    sim/robots/<robot>/panel/*.pt, of a robot of your own <robot>/panel/*.pt beside its settings."""
 
     def execute(self) -> None:
         """Judges the run."""
         from qd.judge import judge
-        from qd.run.directory import find_run
         from qd.search import say_what_stops_the_robot
-        from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
-        robot = get_robot(self.robot)
-        run = find_run(robot, self.run, published="never")
-        archive = judge(
-            run,
-            compute=Compute.resolve(self.device, self.workers, self.num_envs),
-            stages=self.stages,
-            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
-            robot=self.robot,
-            policy=self.policy,
-            space=self.space,
-        )
+        run, named = self.named()
+        archive = judge(run, stages=self.stages, **named)
         say_what_stops_the_robot(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
+class Minimise(_OnRun):
     """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
     Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
@@ -174,8 +182,6 @@ class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
     several calls add up. Crossings are kept, so the same command goes on after Ctrl-C.
     """
 
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
     elite: str | None = None
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
@@ -185,29 +191,13 @@ class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
     exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
     judge: bool = False
     """Cross the minimal terrains with contact resolved and by other controllers too, as `faultline judge` does."""
-    certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, those that `faultline judge` takes."""
 
     def execute(self) -> None:
         """Finds the minimal terrains, and prints them."""
         from qd.minimise import minimise
-        from qd.run.directory import find_run
-        from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
-        robot = get_robot(self.robot)
-        minimise(
-            find_run(robot, self.run, published="never"),
-            compute=Compute.resolve(self.device, self.workers, self.num_envs),
-            elite=self.elite,
-            how=self.how,
-            judged=self.judge or bool(self.certifiers),
-            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
-            robot=self.robot,
-            policy=self.policy,
-            space=self.space,
-        )
+        run, named = self.named()
+        minimise(run, elite=self.elite, how=self.how, judged=self.judge or bool(self.certifiers), **named)
 
 
 @dataclass(frozen=True, kw_only=True)
