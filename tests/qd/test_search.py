@@ -17,7 +17,7 @@ from tests.qd import stand_in
 from tests.qd.searches import CFG, rows_of, run, without_figures
 
 FILES = ["archive.json", "archive.npz", "checkpoint.bin", "config.json", "metrics.jsonl"]
-FIGURES = ["archive.png", "curves.png", "spread.png"]
+FIGURES = ["archive.png", "curves.png"]
 GOLDEN = {
     "cma_mae": {
         "elites": 24,
