@@ -137,16 +137,21 @@ def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Came
     sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
     smooth = (sums[width:] - sums[:-width]) / width
     targets = np.stack([np.interp(times, recording.dt * np.arange(frames), axis) for axis in smooth.T], axis=1)
+    elevation = clear_elevation(recording.heights[0], targets, distance)
+    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+
+
+def clear_elevation(heights: NDArray[np.floating], targets: NDArray[np.floating], distance: float) -> float:
+    """The lowest elevation of a camera [deg] from which the ground never hides targets, shape (N, 3)."""
     along = np.linspace(0.1, 1.0, 19)[:, None]
     for elevation in _ELEVATIONS:
-        camera = Camera(target=(0.0, 0.0, 0.0), distance=distance, elevation=elevation)
-        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
+        azimuth, tilt = np.deg2rad(Camera.azimuth), np.deg2rad(elevation)
         back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
         sight = targets[:, None] + along * back
-        ground = surface_heights(recording.heights[0].astype(np.float64), sight[..., 0], sight[..., 1])
-        if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
-            break
-    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+        ground = surface_heights(heights.astype(np.float64), sight[..., 0], sight[..., 1])
+        if (sight[..., 2] > ground + _CLEARANCE).all():
+            return elevation
+    return _ELEVATIONS[-1]
 
 
 def pictures_of(

@@ -12,9 +12,9 @@ from PIL import Image
 from kernels.episode import Outcome
 from qd.show.crossed import moment_of_failure, typical_episode
 from qd.show.figures import relief
+from qd.show.film import clear_elevation
 from qd.show.report.page import picture_source
 from sim.bank import heights_of, terrains_of
-from sim.mujoco_c.model import surface_heights
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
@@ -27,8 +27,6 @@ _EVERY = 2  # nodes, which are enough for a small picture
 _SHEET_QUALITY = 70  # of WebP
 _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of that
 _DISTANCE = 3.0  # of the camera [m]
-_ELEVATIONS = (-16.0, -26.0, -38.0, -52.0)
-_CLEARANCE = 0.08  # of the line of sight over the ground [m]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,28 +97,13 @@ def why_no_pictures() -> str:
 
 def close_pictures(robot: RobotCfg, moments: Sequence[Moment]) -> list[str]:
     """Pictures of moments on one terrain, each from 3 m away; they need OpenGL."""
-    recording, (width, height) = moments[0].recording, _SIZE
-    heights = recording.heights[0]
+    (width, height), recording = _SIZE, moments[0].recording
+    heights, sources = recording.heights[0], []
     with Renderer(robot, heights, width=width, height=height, ground=recording.ground) as renderer:
-        return [picture_source(Image.fromarray(_rendered(renderer, moment, heights))) for moment in moments]
-
-
-def _rendered(renderer: Renderer, moment: Moment, heights: NDArray[np.float32]) -> NDArray[np.uint8]:
-    recording, episode, frame = moment
-    pose = recording.qpos(0, episode)[frame]
-    touching = recording.touching[0, episode, frame]
-    return renderer.render(pose, _camera(heights, pose[:3]), touching=touching)
-
-
-def _camera(heights: NDArray[np.float32], target: NDArray[np.float64]) -> Camera:
-    """As low as the ground does not hide the robot."""
-    x, y, z = target.tolist()
-    cameras = [Camera(target=(x, y, z), distance=_DISTANCE, elevation=elevation) for elevation in _ELEVATIONS]
-    for camera in cameras:
-        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(camera.elevation)
-        back = -np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
-        sight = target + np.linspace(0.1, 1.0, 19)[:, None] * _DISTANCE * back
-        ground = surface_heights(heights.astype(np.float64), sight[:, 0], sight[:, 1])
-        if (sight[:, 2] > ground + _CLEARANCE).all():
-            return camera
-    return cameras[-1]
+        for recording, episode, frame in moments:
+            pose = recording.qpos(0, episode)[frame]
+            elevation = clear_elevation(heights, pose[None, :3], _DISTANCE)
+            camera = Camera(target=tuple(pose[:3].tolist()), distance=_DISTANCE, elevation=elevation)
+            pixels = renderer.render(pose, camera, touching=recording.touching[0, episode, frame])
+            sources.append(picture_source(Image.fromarray(pixels)))
+    return sources

@@ -23,7 +23,8 @@ from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
 
-_MOST_BARS = 9
+_MOST_BARS = 10
+_FAULT = VERDICTS.index("fault")
 _MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
@@ -109,7 +110,8 @@ def content_of(material: Material) -> dict[str, Any]:
         "summary": summary_of(ranking, archive),
         "failing": int(elites.failing.sum()),
         "certifiers": any_of(certifiers) if certifiers else "",
-        "numbers": fault_numbers(archive, _families(material)),
+        "numbers": fault_numbers(archive),
+        "fault_families": len(np.unique(ranking.families[elites.verdict == _FAULT])),
         "means": {name: mean_words(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},
         "causes": causes_of(ranking),
         "tiles": sheet_of(archive.genes[elites.numbers], space),
@@ -122,13 +124,6 @@ def content_of(material: Material) -> dict[str, Any]:
     }
 
 
-def _families(material: Material) -> NDArray[np.int64]:
-    """Family of every elite of the archive; those that were not judged are none's kin."""
-    families = np.zeros(len(material.archive), np.int64)
-    families[material.ranking.elites.numbers] = material.ranking.families
-    return families
-
-
 def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
     """Mean over terrains, with its interval over families where they are not few."""
     limits = bootstrap_interval(rates, 0, families=families) if len(rates) >= _MIN_TERRAINS else None
@@ -137,17 +132,17 @@ def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
 
 def causes_of(ranking: Ranking) -> list[Cause]:
     """The bars, the longest first; the rarest causes share one."""
-    groups = [(name, rows) for name, rows in ranking.by_cause().items()]
-    first, rest = groups[:_MOST_BARS], groups[_MOST_BARS:]
+    groups = [*ranking.by_cause().items()]
+    count = len(groups) if len(groups) <= _MOST_BARS else _MOST_BARS - 1
+    first, rest = groups[:count], groups[count:]
     tiles: list[int | None] = [int(rows[0]) for _, rows in first]
     if rest:
         first = [*first, (f"{len(rest)} other causes", np.concatenate([rows for _, rows in rest]))]
         tiles.append(None)
     longest = max((len(rows) for _, rows in first), default=1)
-    fault = VERDICTS.index("fault")
     return [
         Cause(
-            name=name, failing=len(rows), faults=int((ranking.elites.verdict[rows] == fault).sum()),
+            name=name, failing=len(rows), faults=int((ranking.elites.verdict[rows] == _FAULT).sum()),
             share=100.0 / longest, tile=tile,
         )
         for (name, rows), tile in zip(first, tiles, strict=True)

@@ -15,7 +15,7 @@ from qd.archive import FaultCounts, read_archive, write_archive
 from qd.groups import VERDICTS, Ranking, elites_of, rank, summary_of
 from qd.show.elites import open_run
 from qd.show.report import report
-from qd.show.report.page import Table, percent, render
+from qd.show.report.page import percent
 from qd.show.report.pictures import TILE, failure_of, same_moment, sheet_of
 from qd.show.report.search import causes_of
 from sim.files.atomic import to_json
@@ -37,26 +37,13 @@ def whole(tmp_path_factory):
         return reporter(run, patch)(num_elites=2)
 
 
-def judged_by_c_g(run, file):
-    """Every failing elite of the run is confirmed, and the first ten are crossed by a controller that lies in it."""
-    archive = read_archive(run)
-    fails = np.tile([9, 11, 0, 0], (len(archive), 1))
-    crosses = np.where(np.arange(len(archive))[:, None] < 10, [20, 0, 0, 0], [0, 20, 0, 0])
-    faults = FaultCounts(
-        resolved_outcomes=fails, certifiers=("C-G",),
-        certifier_sha256=(str(controller_hash(file)),), certifier_outcomes=crosses[:, None],
-        certifier_resolved_outcomes=crosses[:, None],
-    )  # fmt: skip
-    write_archive(run / "archive.npz", dataclasses.replace(archive, faults=faults))
-
-
 def test_the_page_is_whole_and_fetches_nothing(whole):
     out, crossed = whole
     content = out.read_text()
-    assert out.name == "report.html" and len(content) < 4_000_000
+    assert out.name == "report.html" and len(content) < 4_000_000 and str(out.parent.parent) not in content
     outside = re.sub(SOURCE, "", content)
     assert not re.search(r'https?://|url\((?!\))|@import|<link|<iframe|fetch\(|href|src="[^"]', outside)
-    assert "default-src 'none'" in content and str(out.parent.parent) not in content
+    assert "default-src 'none'" in content and "<script>alert" not in content
     images = [np.asarray(Image.open(io.BytesIO(base64.b64decode(data)))) for data in re.findall(SOURCE, content)]
     assert all(image.std() > 1.0 for image in images)  # something is drawn
     # the sheet, one elite more of each cause than the two, maps of the two, curves and archive
@@ -64,21 +51,17 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
 
 
 def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whole):
-    out, archive = whole[0], read_archive(whole[0].parent)
-    content, ranking = out.read_text(), rank(archive, SUPER_GAUSSIAN, judged=True)
-    text = text_of(content.encode())
-    body = text[text.index("terrains that stop it") + len("terrains that stop it") :]
-    assert body.strip().startswith(summary_of(ranking, archive))
+    content, archive = whole[0].read_text(), read_archive(whole[0].parent)
+    ranking, text = rank(archive, SUPER_GAUSSIAN, judged=True), text_of(content.encode())
+    assert text.startswith(f"anymal: terrains that stop it {summary_of(ranking, archive)}")
     failing = int((archive.fresh.goal_rate < 0.5).sum())
     for part in (f"stop the robot {failing}", "40 terrains and 160 episodes in 10 s", "for this page 1 of 4 5 to 70 %"):
         assert part in text
     for number in ranking.worst(2):
         row = ranking.elites.place_of(number)
         assert f"{ranking.name(row)} Terrain {number}, {VERDICTS[int(ranking.elites.verdict[row])]}, after" in text
-    listed = content[content.index("All 20 terrains") :]
-    numbers = re.findall(r'<td><i class="tile elites"[^>]*></i></td><td>(\d+)</td>', listed)
-    assert sorted(map(int, numbers)) == list(range(20))
-    assert "<script>alert" not in content and "&lt;script&gt;alert(1)" in content
+    listed = re.findall(r'<td><i class="tile elites"[^>]*></i></td><td>(\d+)</td>', content)
+    assert sorted(map(int, listed)) == list(range(20))
 
 
 def test_bars_count_terrains_and_faults_by_cause():
@@ -96,31 +79,35 @@ def test_bars_count_terrains_and_faults_by_cause():
     assert len(bars) == 10 and (last.name, last.failing, last.tile) == ("6 other causes", 6, None)
 
 
-def test_the_controller_that_crosses_a_terrain_is_shown_beside(reported, run, monkeypatch):
-    certifier = run / "certifiers" / "C-G.pt"
+def test_the_controller_that_crosses_a_terrain_is_shown_beside(reported, run):
+    certifier, archive = run / "certifiers" / "C-G.pt", read_archive(run)
     certifier.parent.mkdir()
     certifier.write_bytes(b"another controller")
-    judged_by_c_g(run, certifier)
-    opened_run = open_run(None, run)
-    failing = np.flatnonzero(opened_run.archive.failing)
+    # all are confirmed; C-G crosses the first ten
+    counts = np.where(np.arange(20)[:, None] < 10, [20, 0, 0, 0], [0, 20, 0, 0])
+    faults = FaultCounts(
+        resolved_outcomes=np.tile([9, 11, 0, 0], (20, 1)), certifiers=("C-G",),
+        certifier_sha256=(str(controller_hash(certifier)),), certifier_outcomes=counts[:, None],
+        certifier_resolved_outcomes=counts[:, None],
+    )  # fmt: skip
+    write_archive(run / "archive.npz", dataclasses.replace(archive, faults=faults))
+    opened_run, failing = open_run(None, run), np.flatnonzero(archive.failing)
     assert opened_run.certifiers() == {"C-G": str(certifier)}
     assert [opened_run.certifier(number) for number in (failing[0], failing[-1])] == ["C-G", None]
     out, crossed = reported(num_elites=2)
-    text, count = text_of(out.read_bytes()), int((failing < 10).sum())
-    assert f"faults {count} confirmed" in text and "Beside it C-G" in text and "OpenGL" in text
+    text = text_of(out.read_bytes())
+    assert f"faults {(failing < 10).sum()} confirmed" in text and "Beside it C-G" in text and "OpenGL" in text
     assert max(map(crossed.count, crossed)) == 2  # by both controllers
 
 
 def test_the_other_controller_is_shown_at_the_same_moment_from_the_same_start():
-    failing = recording_of([Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT], [7.0, 14.0, 7.0])
-    crossing = recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11)
-    failure = failure_of(failing, {})
+    ends = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT]
+    failure = failure_of(recording_of(ends, [7.0, 14.0, 7.0]), {})
     # from x = 2 m to 7 m in 20 frames of 0.02 s, 0.25 m each: within 0.3 m of the end from the 19th on
     assert failure is not None and (failure.episode, failure.frame, failure.time_s) == (0, 19, 0.38)
-    beside = same_moment(failure, crossing, {})
+    beside = same_moment(failure, recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11), {})
     assert (beside.episode, beside.frame) == (0, 10)  # it has arrived by then
-    lost = recording_of([Outcome.TIME_OUT, Outcome.GOAL, Outcome.GOAL], [8.0, 14.0, 14.0])
-    assert same_moment(failure, lost, {}).episode == 1
+    assert same_moment(failure, recording_of([ends[0], ends[1], ends[1]], [8.0, 14.0, 14.0]), {}).episode == 1
     assert failure_of(recording_of([Outcome.INVALID] * 2, [8.0] * 2), {}) is None
 
 
@@ -130,16 +117,6 @@ def test_small_pictures_stand_in_one_image():
     image = Image.open(io.BytesIO(base64.b64decode(re.fullmatch(SOURCE, sheet.source)[1])))
     assert sheet.columns == 2 and image.size == (2 * TILE[0], 3 * TILE[1])  # the root of 5 / 2 is 1.6
     assert [sheet.offset(place) for place in (0, 1, 4)] == [(0, 0), (96, 0), (0, 96)]
-
-
-def test_what_is_put_into_a_page_is_escaped():
-    rows = [("<c>", "<d>")]
-    content = {"robot": "<r>", "run": "<p>", "rounds": [{"faults": None}], "counts": Table(head=["<t>"], rows=rows)}
-    compared = {"episodes": 20, "measures": [("<m>", Table(head=["&"], rows=rows))], "certified": None}
-    content |= {"goals": {"<g>": {"<h>": 50.0}}, "compared": compared | {"changes": Table(head=[], rows=[])}}
-    text = text_of(render("rounds.html", **content, choices={}, origin=[("<o>", "a\udcff")], reports=["make <x>"]))
-    for part in ("<r>", "<p>", "<t>", "<c>", "<m>", "<g>", "<h>", "<o>", "a\\udcff", "make <x>"):
-        assert part in text
 
 
 def test_crossings_are_stored_and_a_stopped_report_goes_on(reported, run):

@@ -52,16 +52,10 @@ def test_the_page_has_the_numbers_of_the_rounds(run):
     assert "search-0: base" not in text_of(write_report(run).read_bytes())
 
 
-@pytest.mark.parametrize(
-    ("changes", "asked", "field"),
-    [
-        ({"rounds": []}, {}, "rounds.json"),
-        ({"rounds": [{"controller": 3}]}, {}, "rounds.json"),
-        ({"tables": {"episodes": 20}}, {}, "rounds.json"),
-        ({}, {"robot": "cassie"}, "cassie"),
-    ],
-)
-def test_what_is_no_hardening_is_refused(run, changes, asked, field):
-    write(run, **changes)
-    with pytest.raises(ValueError, match=field):
-        write_report(run, **asked)
+def test_what_is_no_hardening_is_refused(run):
+    with pytest.raises(ValueError, match="cassie"):
+        write_report(run, robot="cassie")
+    for changes in ({"rounds": []}, {"rounds": [{"controller": 3}]}, {"tables": {"episodes": 20}}):
+        (run / "rounds.json").write_bytes(to_json(content() | changes))
+        with pytest.raises(ValueError, match="rounds"):
+            write_report(run)

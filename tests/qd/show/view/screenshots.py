@@ -18,6 +18,7 @@ from tests.qd.show.view.visitor import ROOT, serve
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDE, NARROW = (1400, 900), (390, 844)
+REPORT_HEIGHT = 1400
 QUALITY = 80
 SETTLE_MS = 3000  # for the last frames of a browser that draws without a GPU
 
@@ -64,8 +65,8 @@ def viewer_pictures(browser, address: str, elite: int) -> None:
 
 
 def report_picture(browser, file: Path) -> None:
-    """The top of a report."""
-    page = browser.new_page(viewport={"width": WIDE[0], "height": WIDE[1]})
+    """The top of a report, down to the first failure."""
+    page = browser.new_page(viewport={"width": WIDE[0], "height": REPORT_HEIGHT})
     page.goto(file.absolute().as_uri())
     take(page, "report")
     page.close()
