@@ -11,7 +11,7 @@ import pytest
 from qd.archive import write_archive
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
-from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables, sizes_for
+from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS
 from qd.evaluate.sets import split_elites
 from qd.evaluate.tables import is_regression
@@ -130,13 +130,6 @@ def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     assert {cfg.penalties_from_s for cfg in crosser.opened} == {2.0} and report["flat"]["vx_error_mean"] == 0.0
     evaluate_rates(anymal, str(anymal.policy_file), **given)
     assert Path("runs/anymal-rates.json").exists()
-
-
-def test_sizes():
-    given = {"full": (300, 20), "small": (24, 4)}
-    assert sizes_for(Compute("cuda:1"), None, None, **given) == (300, 20)
-    assert sizes_for(CPU, 5, None, **given) == (5, 4)
-    assert sizes_for(CPU, None, 7, **given) == (24, 7)
 
 
 @pytest.mark.parametrize(
