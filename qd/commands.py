@@ -241,7 +241,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
-    --policies, --archive, --independent, --sets or --part the command makes tables: any controllers on the same
+    --policies, --archive, --independent or --sets the command makes tables: any controllers on the same
     hand-crafted, hard-random and generated terrains, with rewards, penalties and intervals. With --pack it says which
     terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the same command goes on.
 
@@ -265,9 +265,6 @@ class Evaluate(ControllerFlags, WorkerFlags):
     independent: Path | None = None
     """Run of another search, with another seed, or its archive.npz: elites that share no ancestor with those trained
     on, drawn from all of its elites. They are the terrains of generated_independent."""
-    part: Literal["test", "validation"] = "test"
-    """Which terrains the tables are of. test: those to report. validation: others of the same kinds, to choose settings
-    by: elites that are neither trained on nor in the test, and other hand-crafted and hard-random terrains."""
     space: str | None = None
     """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS, with ground as in
     course+friction; super_gaussian if left out. If the archive is of a space of your own, name it here."""
@@ -283,7 +280,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
-    validation validation.json. A figure of tables is written beside it as .png."""
+    old and new compared.json."""
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
@@ -298,7 +295,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
-        makes_tables = self.policies or self.sets or self.archive or self.independent or self.part != "test"
+        makes_tables = self.policies or self.sets or self.archive or self.independent
         if self.pack is not None:
             if makes_tables or self.space is not None:
                 raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
@@ -322,11 +319,11 @@ class Evaluate(ControllerFlags, WorkerFlags):
         controllers = controllers_of(self.policies, robot)
         names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"} and self.archive is not None
         if compared:
-            if names or self.independent or self.part != "test":
-                raise ValueError("old and new are compared on --archive: leave --sets, --independent and --part out")
+            if names or self.independent:
+                raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
             names = (COMPARED,)
         cfg = SetsCfg(
-            names=names, archive=self.archive, independent=self.independent, space=self.space, part=self.part, **size
+            names=names, archive=self.archive, independent=self.independent, space=self.space, **size
         )
         report = evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
         return int(compared and is_regression(report))
