@@ -1,6 +1,6 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,11 +43,7 @@ class Source:
     terrains: Iterator[ExportedTerrain]
     """The same ones in the same order."""
     origin: dict[str, Any]
-    """Where they come from, for every file."""
-    named: dict[str, Any]
-    """The same for the index alone."""
-    ground: tuple[str, ...] = ()
-    """What the terrains have maps of beside heights."""
+    """Where they come from."""
 
 
 def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | None = None) -> Source:
@@ -76,9 +72,12 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | No
             for row, terrain in enumerate(terrains)
         },
         terrains=rasterised(),
-        origin={"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256},
-        named=archive.named(),
-        ground=space.ground,
+        origin={
+            "run": str(opened_run.path),
+            "space": archive.space,
+            "space_sha256": archive.space_sha256,
+            **archive.named(),
+        },
     )
 
 
@@ -95,8 +94,8 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
             ExportedTerrain(heights=pack.heights[row], name=name, genes=pack.genes[row], timestep=of_robot.physics_dt)
             for name, row in names.items()
         ),
-        origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
-        named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
+        origin={"pack": folder.name}
+        | {name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")},
     )
 
 
@@ -106,25 +105,23 @@ def export_terrains(
     """Writes terrains as files that other programs read."""
     formats, folder, count = list(dict.fromkeys(formats)), out or source.folder, len(source.about)
     check_formats(formats)
-    if source.ground and "npz" not in formats:
-        raise ValueError(
-            f"formats must have npz, which alone holds {' and '.join(source.ground)}, got {', '.join(formats)}"
-        )
-    if not overwrite:
-        _refuse_to_replace(folder, source.about.keys())
+    common = (INDEX_FILE, README_FILE)
+    stored = sorted(file.name for file in folder.glob("*") if file.name in common or file.stem in source.about)
+    if stored and not overwrite:
+        names = ", ".join(stored[:3]) + ", ..." * (len(stored) > 3)
+        raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
     prepare_output(folder / INDEX_FILE)
     origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     files = []
     with Bar("exporting", count) as bar:
         for done, terrain in enumerate(source.terrains, start=1):
-            about = {**source.about[terrain.name], **origin}
-            files += write_terrain(folder, terrain, formats=formats, about=about)
+            files += write_terrain(folder, terrain, formats=formats, about={**source.about[terrain.name], **origin})
             bar.move_to(done)
     files += [folder / README_FILE, folder / INDEX_FILE]
-    write_atomically(files[-2], readme_of(next(iter(source.about)), formats).encode())
+    write_atomically(files[-2], _README.replace("STEM", next(iter(source.about))).encode())
     index = [{**about, "files": name} for name, about in source.about.items()]
-    write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
+    write_atomically(files[-1], to_json({"formats": formats, "elites": index, **origin}))
     print(f"{count} terrain{'s' * (count != 1)} as {', '.join(formats)}: {folder}")
     return files
 
@@ -135,25 +132,16 @@ x runs along the course (0 to 16 m), y across it (0 to 8 m), z up. Robots start 
 `STEM.json` says what the numbers in its files mean and what is known of the terrain; `index.json` lists all terrains.
 The line of MuJoCo is tested, the others follow the sources of these programs.
 
+- **MuJoCo**: `python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file('STEM.xml')`,
+  `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`
+- **mjlab**: `SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach(
+  mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`
+- **Isaac Lab**: `import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or
+  `scripts/tools/convert_mesh.py` for a USD file
+- **Isaac Lab's and legged_gym's generators**: `convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, 0.001)`
+  (x along the rows); it cuts cells along the other diagonal, so that between the nodes the mesh is truer
+- **Gazebo**: `gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world
 """
-_PROGRAMS = (
-    ("MuJoCo", "xml", "`python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file("
-     "'STEM.xml')`, `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`"),
-    ("mjlab", "xml", "`SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach("
-     "mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`"),
-    ("Isaac Lab", "stl", "`import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or "
-     "`scripts/tools/convert_mesh.py` for a USD file"),
-    ("Isaac Lab's and legged_gym's generators", "npy", "`convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, "
-     "0.001)` (x along the rows); it cuts cells along the other diagonal, so between nodes the mesh is truer"),
-    ("Gazebo", "sdf", "`gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world"),
-)  # fmt: skip
-"""How programs take the files, and the format that it needs."""
-
-
-def readme_of(stem: str, formats: Sequence[str]) -> str:
-    """How other programs take the files of a terrain, a line each."""
-    lines = [f"- **{program}**: {words}\n" for program, ending, words in _PROGRAMS if ending in formats]
-    return (_README + "".join(lines)).replace("STEM", stem)
 
 
 def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwrite: bool = False) -> None:
@@ -184,11 +172,3 @@ def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
         **numbers(archive),
         "fresh": None if archive.fresh is None else numbers(archive.fresh),
     }
-
-
-def _refuse_to_replace(folder: Path, stems: Collection[str]) -> None:
-    written = (INDEX_FILE, README_FILE)
-    replaced = sorted(file.name for file in folder.glob("*") if file.name in written or file.stem in stems)
-    if replaced:
-        names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
-        raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")

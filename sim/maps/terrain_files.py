@@ -24,8 +24,6 @@ from sim.ground import GroundMaps
 from sim.maps.hfield import LEAST_EXTENT, as_hfield
 from sim.terrain import SPACING
 
-Heights = NDArray[np.floating]
-
 STEP_M = 1e-3
 """Height of one step of an npy's whole numbers [m], one for all terrains, as a terrain generator takes it."""
 _BASE_BELOW = 0.5  # depth of the block under the lowest point of a mesh [m]
@@ -43,7 +41,7 @@ _SIX_LINES = """<?xml version="1.0"?>
 class ExportedTerrain:
     """A terrain, and what some of its files say beside its heights."""
 
-    heights: Heights
+    heights: NDArray[np.floating]
     """[m], shape (nrow, ncol)."""
     name: str = "terrain"
     """Stem of its files."""
@@ -139,11 +137,8 @@ def _words(numbers: Sequence[float]) -> str:
     return " ".join(map(repr, numbers))
 
 
-def block_of(heights: Heights) -> trimesh.Trimesh:
-    """A closed block [m] with the terrain as its top.
-
-    The top's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is.
-    """
+def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
+    """A closed block [m]; the terrain's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is."""
     rows, columns = heights.shape
     y, x = np.meshgrid(SPACING * np.arange(rows), SPACING * np.arange(columns), indexing="ij")
     top = np.stack([x, y, np.asarray(heights, dtype=np.float64)], axis=-1).reshape(-1, 3)
@@ -203,6 +198,8 @@ def write_terrain(
         about: Further keys of the JSON.
     """
     check_formats(formats)
+    if terrain.ground is not None and "npz" not in formats:
+        raise ValueError(f"formats must have npz, which alone holds friction and softness, got {', '.join(formats)}")
     scale, offset = terrain.gray_scale
     meaning = {
         "size_m": list(terrain.size),
