@@ -114,7 +114,7 @@ class Shot:
         """Who else crosses, or how often this controller arrives."""
         if self.beside is not None:
             return f"{self.beside[0]} {title_of(self.beside[1]).partition(': ')[2]}"
-        arrived = crossed_of(self.recording, (), ()).rates[ending_of(Outcome.GOAL).words]
+        arrived = crossed_of(self.recording).rates[ending_of(Outcome.GOAL).words]
         return f"reached the goal: {arrived}"
 
 

@@ -181,7 +181,7 @@ def replay(source: Source, *, device: str = "cpu", out: Path | None = None) -> l
         reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(crossed)})
         print(describe(source, k, recording))
         save(figure.with_suffix(".json"), to_json(reports[-1]), "Numbers")
-        save(figure, as_png(draw_crossing(crossed, source.fitness.penalties, title_of(recording, source.by))), "Figure")
+        save(figure, as_png(draw_crossing(crossed, title_of(recording, source.by))), "Figure")
     return reports
 
 
