@@ -45,7 +45,7 @@ class Wanted:
     """Genes, shape (num_genes,), or heights [m], shape (nrow, ncol)."""
     policy: str
     """The controller."""
-    replicas: int
+    replicas: int = 20
     """Episodes."""
     seed: int = 0
     """What ``terrain_seed`` was drawn with, for the record."""
@@ -63,8 +63,13 @@ class Wanted:
 
 
 def on_elite(
-    archive: Archive, number: int, *, label: str | None = None, minimal: NDArray[np.float32] | None = None,
-    seed: int = 0, **crossing: Any,
+    archive: Archive,
+    number: int,
+    *,
+    label: str | None = None,
+    minimal: NDArray[np.float32] | None = None,
+    seed: int = 0,
+    **crossing: Any,
 ) -> Wanted:
     """The crossings of an elite that ``faultline replay`` shows, by a ``policy`` in ``replicas`` episodes.
 
@@ -80,7 +85,7 @@ def on_elite(
     )
 
 
-def on_heights(heights: NDArray[np.float32], *, seed: int, **crossing: Any) -> Wanted:
+def on_heights(heights: NDArray[np.float32], *, seed: int = 0, **crossing: Any) -> Wanted:
     """Crossings of a user's own terrain; further arguments as of :class:`Wanted`."""
     terrain_seed = int(episode_seeds(seed, 0, 1, stream=_OWN_STREAM)[0])
     return Wanted(terrain=heights, seed=seed, terrain_seed=terrain_seed, **crossing)
