@@ -257,10 +257,10 @@ def film(
     fps, size = (GIF_FPS, GIF_SIZE) if cfg.gif else (FPS, SIZE)
     times = shot.times(fps, whole=cfg.whole)
     pictures = pictures_of(shot, robot, times, size, shadows=cfg.shadows, progress=progress)
-    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures, size, fps), "Film")
+    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures, size, FPS), "Film")
 
 
-def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: float) -> bytes:
+def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> bytes:
     """Pictures whose sides, width and height [pixels], are even as an MP4 (H.264) that plays everywhere."""
     how: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with tempfile.TemporaryDirectory() as folder:

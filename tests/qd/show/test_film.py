@@ -205,7 +205,7 @@ def test_films_of_elites_of_a_map_and_of_recordings(run, capsys):
     recording = read_recording(f"runs/terrains/hill.npz-anymal-{name}.recording.npz")
     assert recording.labels == ("hill.npz",) and (recording.heights == 0).all()
     with Image.open(f"runs/terrains/hill.npz-anymal-{name}.gif") as gif:
-        assert gif.size == (480, 270) and gif.n_frames == 3
+        assert gif.size == (480, 270) and gif.n_frames > 1
 
 
 @pytest.mark.parametrize(
