@@ -101,7 +101,7 @@ def _case(
         source=sources[0],
         time_s=failure.time_s,
         beside=beside,
-        figure=figure_source(draw_crossing(crossed, archive.penalties, title)) if whole else "",
+        figure=figure_source(draw_crossing(crossed, title)) if whole else "",
         rates=_rates(ranking, archive, row, crossed),
         film=material.command("film", elite=number),
     )
