@@ -79,7 +79,7 @@ def changed_file(folder, archive, **changes):
     np.savez(folder / "archive.npz", **{name: array for name, array in arrays.items() if array is not None})
 
 
-@pytest.mark.parametrize("name", ["cell", "robot_sha256", "fresh_reproduced", "certifiers", "resolved_outcomes"])
+@pytest.mark.parametrize("name", ["cell", "end_position", "robot_sha256", "fresh_reproduced", "certifiers"])
 def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
     changed_file(tmp_path, judged_archive(), **{name: None})
     with pytest.raises(ValueError, match=name):
