@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from sim.ground import GroundMaps
 from sim.maps.picture import height_colors, tinted
 from sim.recording.scene import surface_of
-from sim.robots.skeleton import Geom, Skeleton
+from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
 
 Color = tuple[int, int, int]
 
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
-_SEGMENTS = 20  # round a capsule
-_CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
+_SEGMENTS = 20  # round an arrow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,31 +73,6 @@ def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return mesh
 
 
-def geom_mesh(geom: Geom) -> trimesh.Trimesh:
-    """A shape in its body's frame and its colour."""
-    if geom.vertices is not None and geom.faces is not None:
-        shape = trimesh.Trimesh(geom.vertices, geom.faces, process=False)
-    else:
-        shape = trimesh.graph.smooth_shade(_primitive(geom.kind, geom.size), angle=_CREASE)
-    transform = trimesh.transformations.quaternion_matrix(geom.quaternion)  # w x y z too
-    transform[:3, 3] = geom.position
-    return _mesh(shape.apply_transform(transform).vertices, shape.faces, np.rint(255.0 * np.array(geom.color)))
-
-
-def _primitive(kind: str, size: NDArray[np.float64]) -> trimesh.Trimesh:
-    """A shape about its own centre, along z."""
-    radius = float(size[0])
-    if kind == "capsule":
-        return trimesh.creation.capsule(height=2.0 * float(size[1]), radius=radius, count=(_SEGMENTS, _SEGMENTS))
-    if kind == "cylinder":
-        return trimesh.creation.cylinder(radius=radius, height=2.0 * float(size[1]), sections=_SEGMENTS)
-    if kind == "box":
-        return trimesh.creation.box(extents=2.0 * size)
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-    ball.apply_scale(size if kind == "ellipsoid" else (radius, radius, radius))
-    return ball
-
-
 def arrow_mesh() -> trimesh.Trimesh:
     """An arrow along z, 1 m long when it is not scaled."""
     shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
@@ -115,24 +89,11 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     return (half / size if size > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])), length
 
 
-def path_mesh(points: NDArray[np.floating], radius: float) -> trimesh.Trimesh:
-    """A thin tube of three sides along two or more points [m], in one piece that can be translucent."""
-    ahead = np.gradient(points, axis=0)
-    left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(points))], axis=1)
-    length = np.linalg.norm(left, axis=1, keepdims=True)
-    left = np.where(length > 1e-6, left / np.maximum(length, 1e-6), np.array([0.0, 1.0, 0.0]))
-    angles = 2.0 * np.pi * np.arange(3) / 3.0
-    round_it = np.cos(angles)[:, None] * left[:, None] + np.sin(angles)[:, None] * np.array([0.0, 0.0, 1.0])
-    vertices = (points[:, None] + radius * round_it).reshape(-1, 3)
-    k, side = np.divmod(np.arange(3 * (len(points) - 1)), 3)
-    a, b = 3 * k + side, 3 * k + (side + 1) % 3
-    faces = np.concatenate([np.stack([a, b, a + 3], axis=1), np.stack([b, b + 3, a + 3], axis=1)])
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
 def robot_parts(skeleton: Skeleton) -> list[Part]:
     """All that is to be seen of a robot."""
     groups = dict[tuple[int, tuple[int, ...]], list[trimesh.Trimesh]]()
-    for geom in skeleton.geoms:
-        groups.setdefault((geom.body, geom.touches), []).append(geom_mesh(geom))
+    for geom, touches in skeleton.touches.items():
+        body = int(skeleton.model.geom_bodyid[geom]) - 1
+        shape, color = skeleton.shape(geom)
+        groups.setdefault((body, touches), []).append(_mesh(shape.vertices, shape.faces, np.rint(255.0 * color)))
     return [Part(body=body, touches=touches, mesh=joined(parts)) for (body, touches), parts in groups.items()]

@@ -16,7 +16,6 @@ from qd.show.view.meshes import (
     arrow_pose,
     in_bytes,
     joined,
-    path_mesh,
     robot_parts,
     terrain_mesh,
 )
@@ -39,7 +38,7 @@ _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
-_PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
+_PATH_WIDTH = 1.2  # [pixels]
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _START_RADIUS, _DISC_HEIGHT, _DISC_OPACITY = 0.25, 0.02, 0.5
@@ -89,8 +88,8 @@ class Shapes:
 def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
     """The shapes of a robot."""
     num_others = len(robot.geom_names) - len(robot.foot_geoms)
-    bodies = len(skeleton.body_names)
-    return Shapes(parts=robot_parts(skeleton), num_bodies=bodies, feet=robot.foot_geoms, num_others=num_others)
+    parts, num_bodies = robot_parts(skeleton), skeleton.num_bodies
+    return Shapes(parts=parts, num_bodies=num_bodies, feet=robot.foot_geoms, num_others=num_others)
 
 
 class Scene:
@@ -173,14 +172,14 @@ class Scene:
         self.paths = []
 
     def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], Color]]) -> None:
-        """Show the way of the base in every episode as points [m] and colour, thin and translucent."""
+        """Show the way of the base in every episode as points [m] and colour, thin."""
         self._drop_paths()
-        for color in dict.fromkeys(color for _, color in paths):
-            tubes = [path_mesh(points, _PATH_RADIUS) for points, other in paths if other == color and len(points) > 1]
-            if tubes:
-                mesh: Any = trimesh.util.concatenate(tubes)
-                name = f"/paths/{len(self.paths)}"
-                self.paths.append(self._add_mesh(name, mesh, color, opacity=_PATH_OPACITY))
+        ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
+        colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
+        if paths:
+            look: Any = {"colors": np.concatenate(colors), "thickness": _PATH_WIDTH, "thickness_units": "screen"}
+            add = self._client.scene.add_line_segments
+            self.paths = [add("/paths", np.concatenate(ends), visible=False, **look)]
         self._show_paths()
 
     def switch_paths(self, shown: bool) -> None:
