@@ -21,7 +21,7 @@ from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
-from sim.maps.hfield import LEAST_EXTENT, as_hfield
+from sim.maps.hfield import LEAST_EXTENT, as_hfield, surface_of
 from sim.terrain import SPACING
 
 STEP_M = 1e-3
@@ -139,12 +139,8 @@ def _words(numbers: Sequence[float]) -> str:
 
 def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
     """A closed block [m]; the terrain's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is."""
-    rows, columns = heights.shape
-    y, x = np.meshgrid(SPACING * np.arange(rows), SPACING * np.arange(columns), indexing="ij")
-    top = np.stack([x, y, np.asarray(heights, dtype=np.float64)], axis=-1).reshape(-1, 3)
-    node = np.arange(len(top)).reshape(rows, columns)
-    low, along_x, along_y, high = node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]
-    surface = np.stack([low, along_x, along_y, high, along_y, along_x], axis=2).reshape(-1, 3)
+    top, surface = surface_of(heights)
+    node = np.arange(len(top)).reshape(heights.shape)
     # Once round the rim, the terrain on the left; below it the bottom's rim, and fans to the middle of the bottom.
     rim = np.concatenate([node[0, :-1], node[:-1, -1], node[-1, :0:-1], node[:0:-1, 0]])
     below = top[rim] * [1.0, 1.0, 0.0] + [0.0, 0.0, top[:, 2].min() - _BASE_BELOW]

@@ -21,7 +21,7 @@ from sim.robots.skeleton import touches_of
 
 _mj: Any = mujoco  # its types are not written down
 
-_MAX_GEOMS = 4000
+_MAX_GEOMS = 20_000
 _GHOST_OPACITY = 0.4
 _NAME_HEIGHT = 0.55  # over the base, in standing heights of the robot
 _LEAST_LETTERS = 14  # [pixels]
@@ -228,14 +228,7 @@ class Renderer:
         self._add_connector(_mj.mjtGeom.mjGEOM_ARROW.value, _ARROW_WIDTH, foot, tip, color)
 
     def _add_connector(self, kind: int, width: float, begin: Any, end: Any, color: NDArray[np.float32]) -> None:
-        if (geom := self._add_geom(kind, np.zeros(3), color)) is not None:
-            _mj.mjv_connector(geom, kind, width, begin, end)
-
-    def _add_geom(self, kind: int, place: NDArray[np.float64], color: NDArray[np.float32]) -> Any:
-        """A new geom of the picture; None if there are too many."""
-        if self._scene.ngeom >= self._scene.maxgeom:
-            return None
         geom = self._scene.geoms[self._scene.ngeom]
-        _mj.mjv_initGeom(geom, kind, np.zeros(3), place, np.eye(3).ravel(), color)
+        _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+        _mj.mjv_connector(geom, kind, width, begin, end)
         self._scene.ngeom += 1
-        return geom

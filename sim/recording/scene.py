@@ -12,6 +12,7 @@ from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
+from sim.maps.hfield import surface_of
 from sim.maps.picture import height_colors, tinted
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, robot_spec
@@ -80,21 +81,6 @@ def scene_model(
     first = int(model.texture(GROUND).adr[0])
     model.tex_data[first : first + paint.size] = paint.ravel()
     return model
-
-
-def surface_of(heights: NDArray[np.floating], margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The ground that robots walk on: vertices [m], row by row, and two triangles a cell, cut as the physics cuts it.
-
-    Heights [m] have shape (nrow, ncol), node (0, 0) at x = y = 0; ``margin`` more nodes continue each edge.
-    """
-    grid = np.pad(heights, margin, mode="edge")
-    nrow, ncol = grid.shape
-    y, x = (SPACING * (np.arange(count) - margin) for count in grid.shape)
-    vertices = np.stack([*np.meshgrid(x, y), grid], axis=-1).reshape(-1, 3)
-    low = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
-    # Each cell is cut from its (low x, high y) to its (high x, low y) corner.
-    faces = np.stack([low, low + 1, low + ncol, low + 1, low + ncol + 1, low + ncol], axis=1)
-    return vertices.astype(np.float64), faces.reshape(-1, 3)
 
 
 def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]) -> None:

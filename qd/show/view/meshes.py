@@ -10,8 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from sim.ground import GroundMaps
+from sim.maps.hfield import surface_of
 from sim.maps.picture import height_colors, tinted
-from sim.recording.scene import surface_of
+from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
 
@@ -29,6 +30,7 @@ class Part:
     body: int
     touches: tuple[int, ...]
     """Columns of ``robot.geom_names``."""
+    is_foot: bool
     mesh: trimesh.Trimesh
 
 
@@ -62,10 +64,10 @@ def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
     """Triangles with a colour (sRGB) a vertex, or one of all."""
     colors = np.broadcast_to(in_linear_light(colors), (len(vertices), 3))
-    return joined([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)])
+    return _joined([trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)])
 
 
-def joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     """All in one."""
     mesh = trimesh.util.concatenate(meshes)
     assert isinstance(mesh, trimesh.Trimesh)
@@ -77,7 +79,7 @@ def arrow_mesh() -> trimesh.Trimesh:
     """An arrow along z, 1 m long when it is not scaled."""
     shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
     head = trimesh.creation.cone(radius=0.05, height=0.25, sections=_SEGMENTS)
-    return joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
+    return _joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
 
 
 def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
@@ -89,11 +91,15 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     return (half / size if size > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])), length
 
 
-def robot_parts(skeleton: Skeleton) -> list[Part]:
+def robot_parts(skeleton: Skeleton, robot: RobotCfg) -> list[Part]:
     """All that is to be seen of a robot."""
     groups = dict[tuple[int, tuple[int, ...]], list[trimesh.Trimesh]]()
     for geom, touches in skeleton.touches.items():
         body = int(skeleton.model.geom_bodyid[geom]) - 1
         shape, color = skeleton.shape(geom)
         groups.setdefault((body, touches), []).append(_mesh(shape.vertices, shape.faces, np.rint(255.0 * color)))
-    return [Part(body=body, touches=touches, mesh=joined(parts)) for (body, touches), parts in groups.items()]
+    first_foot = len(robot.geom_names) - len(robot.foot_geoms)
+    return [
+        Part(body=body, touches=touches, is_foot=max(touches, default=0) >= first_foot, mesh=_joined(meshes))
+        for (body, touches), meshes in groups.items()
+    ]

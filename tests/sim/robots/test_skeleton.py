@@ -86,8 +86,6 @@ def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
 
 BOX = '<geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/>'
 LOOK = f'<mujoco><worldbody><body name="{{}}">{BOX}</body></worldbody></mujoco>'
-    '<mujoco><worldbody><body name="{}"><geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/></body></worldbody></mujoco>'
-)
 
 
 def kinds_of(dog, body):
