@@ -61,19 +61,18 @@ def scene_model(
     *,
     width: int,
     height: int,
-    cfg: CrossingCfg | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
     """The model of a scene: the robot's file and its height grid [m], shape (nrow, ncol), in world-local coordinates.
 
-    Images are at most of that width and height [pixels]; the crossing is for its goal.
+    Images are at most of that width and height [pixels].
     """
     spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
-    _add_goal(spec, heights, cfg or CrossingCfg())
+    _add_goal(spec, heights)
     _add_light(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     model = robot_model(spec, robot)
@@ -102,15 +101,15 @@ def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]
     spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
 
 
-def _add_goal(spec: Any, heights: NDArray[np.floating], cfg: CrossingCfg) -> None:
+def _add_goal(spec: Any, heights: NDArray[np.floating]) -> None:
     """A post at the goal, and the rim of the circle that counts as reaching it."""
-    x, y = cfg.goal
+    x, y = CrossingCfg.goal
     ground = float(heights[round(y / SPACING), round(x / SPACING)])
     green = [0.0, 0.62, 0.45, 1.0]
     post = {"type": _mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
     spec.worldbody.add_geom(pos=[x, y, ground + 0.5], size=[0.02, 0.5, 0.0], rgba=green, **post)
     disc = [*green[:3], 0.25]
-    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[cfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
+    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[CrossingCfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
 
 
 def _add_light(spec: Any) -> None:
