@@ -3,18 +3,17 @@
 import queue
 import socket
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import viser
 
 from qd.show.recordings import Recordings
-from qd.show.view.address import read_address
 from qd.show.view.bar import Bar
 from qd.show.view.common import Common
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import SKY, first_view_of, shapes_of
+from qd.show.view.scene import first_view_of, shapes_of, sky
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
@@ -26,9 +25,6 @@ _FRAME_S = 0.04
 _IDLE_S = 0.5
 """Real time from one look at the cameras to the next while nothing plays."""
 _WINDOW = (1400, 900)  # one that is not known yet [pixels]
-
-Task = tuple[Callable[..., None], tuple[Any, ...]]
-"""What to call, and its arguments."""
 
 
 class Page(viser.ViserServer):
@@ -46,9 +42,10 @@ class App:
         """Open the page; the recorder is closed with it."""
         self.tabs: dict[int, Tab] = {}
         self._bars: dict[int, Bar] = {}
-        self._tasks: queue.SimpleQueue[tuple[Hashable, Task]] = queue.SimpleQueue()
-        self._recorders = [recorder]
-        self._adopt(recorder, show)
+        self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
+        self._recorders, self._show, self._recordings = [recorder], show, recordings
+        self._adopt(recorder)
+        self._record_first(recorder)
         skeleton = Skeleton(show.robot)
         self._common = Common(
             show=show, skeleton=skeleton, shapes=shapes_of(skeleton, show.robot), recordings=recordings,
@@ -58,36 +55,34 @@ class App:
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
-        self.page.scene.set_background_image(SKY)
+        self.page.scene.set_background_image(sky())
         self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
         self.page.on_client_connect(self._come)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 
-    def _adopt(self, recorder: Recorder, show: Show) -> None:
-        recorder.robot, recorder.report = show.robot, lambda report: self.post(self.show_report, report)
+    def _adopt(self, recorder: Recorder) -> None:
+        recorder.robot, recorder.report = self._show.robot, lambda report: self.post(self.show_report, report)
+
+    def _record_first(self, recorder: Recorder) -> None:
+        """Have the first elite recorded before a page is open."""
+        show = self._show
+        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
+        wanted = show.wanted(first, next(iter(show.controllers), None), minimal=show.minimal)
+        if wanted is not None and self._recordings.may_keep(wanted):
+            recorder.record(wanted, tab="first")
 
     def _films(self) -> Recorder:
         if len(self._recorders) == 1:
             self._recorders.append(Recorder())
-            self._adopt(self._recorders[1], self._common.show)
+            self._adopt(self._recorders[1])
         return self._recorders[1]
 
     def _come(self, client: viser.ClientHandle) -> None:
-        def act(name: str, value: Any) -> None:
-            last = (client.client_id, name) if name in ("seek", "resize") else None
-            self.post(self.act, client, name, value, only_last=last)
+        self._bars[client.client_id] = Bar(client, lambda name, value: self.post(self.act, client, name, value))
 
-        self._bars[client.client_id] = Bar(client, act)
-
-    def post(self, act: Callable[..., None], *args: Any, only_last: Hashable = None) -> None:
-        """Have the loop call ``act(*args)``; from any thread.
-
-        Args:
-            act: What to call.
-            args: What to call it with.
-            only_last: Of the waiting calls with an equal value, as dragging makes them, only the last one is done.
-        """
-        self._tasks.put((object() if only_last is None else only_last, (act, args)))
+    def post(self, act: Callable[..., None], *args: Any) -> None:
+        """Have the loop call ``act(*args)``; from any thread."""
+        self._tasks.put((act, args))
 
     def act(self, client: viser.ClientHandle, name: str, value: Any) -> None:
         """Do what a visitor did on the bar; at first it says its address and the size of its window."""
@@ -97,7 +92,7 @@ class App:
         elif name == "hello" and number in self.page.get_clients():
             query, width, height = value
             window = (int(width), int(height))
-            self.tabs[number] = Tab(client, self._bars[number], self._common, window, *read_address(str(query)))
+            self.tabs[number] = Tab(client, self._bars[number], self._common, window, str(query))
 
     def leave(self, number: int) -> None:
         """Forget a closed tab."""
@@ -120,14 +115,7 @@ class App:
         self.page.stop()
 
     def run(self) -> None:
-        """Serve until interrupted; before a visitor comes, the first elite is recorded."""
-        show = self._common.show
-        controller = next(iter(show.controllers), None)
-        self._common.recorder.warm(self._common.wanted(0, controller))
-        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
-        wanted = self._common.wanted(first, controller, minimal=show.minimal)
-        if wanted is not None and self._common.recordings.may_keep(wanted):
-            self._common.recorder.record(wanted, tab="first")
+        """Serve until interrupted."""
         last = time.perf_counter()
         while True:
             self.do_tasks(wait_s=_FRAME_S if self._playing else _IDLE_S)
@@ -143,18 +131,14 @@ class App:
     def do_tasks(self, wait_s: float) -> None:
         """Do what was posted, or wait for it; while a tab plays, the whole time."""
         until = time.perf_counter() + wait_s
-        tasks: dict[Hashable, Task] = {}
         while (left := until - time.perf_counter()) > 0.0:
             try:
-                key, task = self._tasks.get(timeout=left)
+                act, args = self._tasks.get(timeout=left)
             except queue.Empty:
-                break
-            tasks.pop(key, None)
-            tasks[key] = task
-            if not self._playing and self._tasks.empty():
-                break
-        for act, args in tasks.values():
+                return
             act(*args)
+            if not self._playing and self._tasks.empty():
+                return
 
 
 def serve(show: Show, recorder: Recorder, *, host: str, port: int, cache: Path) -> None:
@@ -182,8 +166,7 @@ def check_port(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server has it
             probe.bind(address)
     except OSError as error:
-        reason = error.strerror or error
         raise ValueError(
-            f"nothing can be served at port {port} of {host}: {reason}: give another --port, above 1023, and a --host "
-            "that is an address of this machine"
+            f"nothing can be served at port {port} of {host}: {error.strerror or error}: give another --port above "
+            "1023, and a --host that is an address of this machine"
         ) from None

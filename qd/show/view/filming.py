@@ -1,6 +1,9 @@
 """*Film this*: the film of an episode, made in a process of its own and offered for download."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import viser
 
@@ -8,8 +11,22 @@ from qd.run.directory import folder_for
 from qd.show.film import FilmCfg
 from qd.show.view.common import Common
 from qd.show.view.recorder import Report
-from qd.show.view.simulator import WantedFilm
 from sim.recording.recorder import Recording
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WantedFilm:
+    """A film of an episode."""
+
+    recording: Recording
+    scales: dict[str, float]
+    cfg: FilmCfg
+    by: str
+    """Name of the controller, where it is not the search's."""
+    beside: tuple[str, Recording] | None
+    """Name and recording of the ghost."""
+    file: Path
+    """Where it goes."""
 
 
 class Filming:
@@ -20,23 +37,18 @@ class Filming:
         self._client, self._common, self._say = client, common, say
         self._wanted: WantedFilm | None = None
 
-    def begin(
-        self,
-        recording: Recording,
-        replica: int,
-        scales: dict[str, float],
-        stem: str,
-        *,
-        by: str = "",
-        beside: tuple[str, Recording] | None = None,
-    ) -> None:
-        """Film an episode, counted from 0, unless a film is made already; arguments as of :func:`qd.show.film.film`."""
+    def begin(self, recording: Recording, replica: int, stem: str, **how: Any) -> None:
+        """Film an episode, counted from 0, unless a film is made already; more fields of a film."""
         if self._wanted is not None:
             return
         opened_run = self._common.show.opened_run
-        file = folder_for(opened_run.path, opened_run.robot.name) / f"{stem}-episode-{replica + 1}.mp4"
-        cfg = FilmCfg(episode=int(recording.replicas[replica]))
-        self._wanted = WantedFilm(recording=recording, scales=scales, cfg=cfg, by=by, beside=beside, file=file)
+        by = f"-{how['by']}" if how["by"] else ""
+        name = f"{stem}{by}-episode-{replica + 1}.mp4"
+        file, cfg = (
+            folder_for(opened_run.path, opened_run.robot.name) / name,
+            FilmCfg(episode=int(recording.replicas[replica])),
+        )
+        self._wanted = WantedFilm(recording=recording, cfg=cfg, file=file, **how)
         self._say("Filming: the film process starts …")
         self._common.films().record(self._wanted, tab=self._client.client_id)
 

@@ -1,6 +1,5 @@
 """What the colours of the page mean, as HTML."""
 
-from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -11,8 +10,8 @@ from qd.show.view.scene import COMMAND_COLOR, FOOT_TOUCH_COLOR, FORCE_COLOR, GHO
 from sim.maps.picture import SLIPPERY, SOFT, height_colors
 
 
-def legend_html(controllers: Sequence[str]) -> str:
-    """Heights, paths, touches, arrows, and the names of the controllers."""
+def legend_html() -> str:
+    """Heights, paths, touches, arrows and the ghost."""
     ramp = ", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))))
     bar = f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {ramp})"></span>'
     rows = {
@@ -28,7 +27,6 @@ def legend_html(controllers: Sequence[str]) -> str:
                 "commanded velocity, 1 m is 1 m/s": _hex(COMMAND_COLOR),
             }
         ),
-        "Controllers": f"{', '.join(map(escape, controllers)) or 'none'}; robot, paths and curves show the chosen one.",
         "Ghost": _swatches({"a second controller, at the same time from the same start": _hex(GHOST_COLOR)}),
     }
     style = "font-size:0.85em;padding:0.15em 0.6em"

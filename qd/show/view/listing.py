@@ -13,15 +13,11 @@ from qd.faults import elite_words
 from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank, summary_of
 from qd.minimise import MinimalTerrains
 from qd.show.crossed import ARRIVED, FAILED, Crossed
-from qd.show.figures import label_of
+from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
 from sim.spaces.base import TerrainSpace
 
-_SHADES = ("#9ecae1", "#6baed6", "#4292c6", "#2171b5", "#08306b")  # of elites in the list's order, the first darkest
-_GREY, _PICKED = "#d8d8d8", "#d55e00"
-_WIDTH, _HEIGHT = 460, 320
-_TOP, _BOTTOM, _LEFT, _RIGHT = 16, 104, 58, 14
-_MANY = 400  # lines, beyond which they are drawn thinner
+_GREY, _LISTED, _PICKED = "#d8d8d8", "#2171b5", "#d55e00"
 RATES = {"goal_rate": "reached the goal", "collision_rate": "base collision", "other_rate": "out of time, off it",
          "fallen_rate": "fallen"}  # fmt: skip
 FITNESS_WORDS = (
@@ -181,44 +177,21 @@ def table_html(columns: Sequence[Column]) -> str:
     return f'<table class="faultline-rates"><tr><th></th>{heads}</tr>{"".join(rows)}</table>'
 
 
-def plot_svg(listing: Listing, listed: NDArray[np.int64], picked: int) -> str:
-    """The archive on parallel axes: a line an elite, grey if it is not listed, the picked one on top.
-
-    The paths name their elites, so that lines can be pointed at in the browser (``page.js``).
-    """
-    elites, names = listing.elites, listing.archive.penalties
-    values = {label_of(name): elites.ratios[:, k] for k, name in enumerate(names)} | {"fitness": elites.fitness}
-    values |= {RATES[name]: getattr(elites, name) for name in ("goal_rate", "collision_rate", "fallen_rate")}
-    x, bottom = np.linspace(_LEFT, _WIDTH - _RIGHT, len(values)), _HEIGHT - _BOTTOM
-    ends = {label: (float(column.min()), float(column.max())) for label, column in values.items()}
-    y = np.stack([bottom - (v - low) / max(high - low, 1e-9) * (bottom - _TOP)
-                  for v, (low, high) in zip(values.values(), ends.values(), strict=True)], axis=1)  # fmt: skip
-    parts = [_lines(x, np.delete(y, listed, axis=0), _GREY, 0.6, 0.6)]
-    width = 0.8 * min(1.0, _MANY / max(len(listed), 1)) ** 0.5  # else many lines are one blue area
-    # Equally many a shade, so that the first stand out whatever they are sorted by.
-    for shade, numbers in zip(_SHADES, reversed(np.array_split(listed, len(_SHADES))), strict=True):
-        hints = "|".join(f"{n}: {listing.ranking.name(n)}" for n in numbers.tolist())
-        named = f'data-elites="{" ".join(map(str, numbers.tolist()))}" data-hints="{escape(hints)}"'
-        parts.append(_lines(x, y[numbers], shade, width, 0.75, named))
-    parts.append(_lines(x, y[[picked]], _PICKED, 2.5, 1.0))
-    for at, (label, (low, high)) in zip(x, ends.items(), strict=True):
-        decimals = 0 if label == "fitness" else 2
-        parts.append(f'<line x1="{at:.0f}" y1="{_TOP}" x2="{at:.0f}" y2="{bottom}" stroke="#444"/>')
-        parts += [_text(at, _TOP - 5, f"{high:.{decimals}f}"), _text(at, bottom + 12, f"{low:.{decimals}f}")]
-        turned = f'transform="rotate(-52 {at:.0f} {bottom + 24})"'
-        parts.append(_text(at + 4, bottom + 24, label, "end", turned))
-    style = "width:100%;font-family:sans-serif;font-size:10px;fill:currentColor"
-    return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" style="{style}" xmlns="http://www.w3.org/2000/svg">{"".join(parts)}</svg>'
-
-
-def _lines(
-    x: NDArray[np.float64], rows: NDArray[np.float64], color: str, width: float, opacity: float, more: str = ""
-) -> str:
-    """Lines over the same x as one path."""
-    path = "".join("M" + "L".join(f"{a:.0f} {b:.1f}" for a, b in zip(x, row, strict=True)) for row in rows)
-    style = f'fill="none" stroke="{color}" stroke-width="{width:.2f}" stroke-opacity="{opacity}"'
-    return f'<path d="{path}" {style} {more}/>' if path else ""
-
-
-def _text(x: float, y: float, text: str, anchor: str = "middle", more: str = "") -> str:
-    return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}" {more}>{escape(text)}</text>'
+def map_svg(listing: Listing, listed: NDArray[np.int64], picked: int) -> str:
+    """From above, where the typical episode of each elite ends: grey if it is not listed; a click on one shows it."""
+    numbers = [*np.setdiff1d(listing.elites.numbers, listed).tolist(), *reversed(listed.tolist()), picked]
+    shown, dots = set(listed.tolist()), []
+    for number in numbers:
+        x, y = listing.elites.end_position[number]
+        if np.isfinite(x + y):
+            color, radius = (_PICKED, 6) if number == picked else (_LISTED if number in shown else _GREY, 3)
+            words = escape(f"{number}: {listing.ranking.name(number)}")
+            place = f'cx="{20 * x:.0f}" cy="{160 - 20 * y:.0f}" r="{radius}"'
+            dots.append(f'<circle data-elite="{number}" {place} fill="{color}"><title>{words}</title></circle>')
+    ends = "".join(
+        f'<text x="{20 * x:.0f}" y="{154 - 20 * y:.0f}" text-anchor="middle">{words}</text>'
+        for words, (x, y) in {"start": CrossingCfg.start, "goal": CrossingCfg.goal}.items()
+    )
+    frame = '<rect width="320" height="160" fill="none" stroke="#adb5bd"/>'
+    style = "width:100%;font-family:sans-serif;font-size:11px;fill:currentColor;overflow:visible"
+    return f'<svg viewBox="0 0 320 160" style="{style}">{frame}{"".join(dots)}{ends}</svg>'

@@ -50,9 +50,10 @@ window.faultline = (() => {
     .mantine-Paper-root[style*="position: fixed"] { width: 100vw !important; max-height: 48dvh !important; }
     .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100vw !important; }
     body:not(.unfolded) .mantine-Paper-root[style*="position: fixed"] { max-height: 3.5em !important; overflow: hidden; }
+    circle[data-elite]:hover { stroke: #000; }
     [data-elite] { cursor: pointer; padding: 2px 6px; border-radius: 3px; }
     .faultline-list { max-height: 30dvh; overflow-y: auto; margin-top: 4px; }
-    .faultline-rates { width: 100%; border-collapse: collapse; font-size: .85em; }
+    .faultline-rates { width: 100%; border-collapse: collapse; }
     .faultline-rates th, .faultline-rates td { text-align: left; font-weight: normal; padding: 2px 6px; line-height: 1.15;
       white-space: nowrap; }
     .faultline-rates small { display: block; color: #868e96; }
@@ -190,7 +191,7 @@ window.faultline = (() => {
     const row = event.target.closest("[data-elite]");
     const over = event.target.closest(".u-over");
     const sheet = event.target.closest('.mantine-Paper-root[style*="position: fixed"]');
-    if (row) send("pick", Number(row.dataset.elite));
+    if (row) send("pick", row.dataset.elite);
     if (over) send("seek", (state.duration * event.offsetX) / over.offsetWidth);
     if (sheet && event.clientY < sheet.getBoundingClientRect().top + 44 && !event.target.closest("button")) {
       document.body.classList.toggle("unfolded"); // folded by us: viser's own sheet begins open
@@ -199,50 +200,6 @@ window.faultline = (() => {
   }, true);
   on(window, "resize", () => { drawMarks(); send("resize", sizes()); });
   on(window, "popstate", () => send("open", location.search));
-
-  // Lines of the archive's plot: the nearest one is named and drawn thick, a click shows its elite.
-  const NEAR = 8; // pixels of the plot's own scale
-  const lineAt = (event) => {
-    const plot = event.target.closest?.("svg");
-    let best = null;
-    for (const path of plot?.querySelectorAll("path[data-elites]") ?? []) {
-      const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(plot.getScreenCTM().inverse());
-      path.lines ??= path.getAttribute("d").split("M").slice(1)
-        .map((line) => line.split("L").map((point) => point.split(" ").map(Number)));
-      path.lines.forEach((points, k) => {
-        const after = points.findIndex((point) => point[0] >= x);
-        if (after < 1) return;
-        const [[x0, y0], [x1, y1]] = [points[after - 1], points[after]];
-        const slope = (y1 - y0) / (x1 - x0);
-        const away = Math.abs(y0 + slope * (x - x0) - y) / Math.hypot(1, slope);
-        if (away < (best?.away ?? NEAR)) best = { plot, path, k, away, x, y };
-      });
-    }
-    return best;
-  };
-  let pointed = null; // the line that is named
-  on(document, "pointermove", (event) => {
-    document.querySelectorAll("svg .pointed").forEach((mark) => mark.remove());
-    pointed = lineAt(event);
-    if (!pointed) return;
-    const { plot, path, k, x, y } = pointed;
-    const line = `M${path.getAttribute("d").split("M")[k + 1]}`;
-    const words = path.dataset.hints.split("|")[k];
-    const parts = document.createElementNS(plot.namespaceURI, "g");
-    parts.classList.add("pointed");
-    parts.style.pointerEvents = "none";
-    parts.innerHTML = `<path d="${line}" fill="none" stroke="#000" stroke-width="2"/><text x="${x}"
-      y="${Math.max(y - 8, 10)}" text-anchor="${x < plot.viewBox.baseVal.width / 2 ? "start" : "end"}" style="font-size:
-      13px;font-weight:bold;fill:#000;stroke:#fff;stroke-width:3;paint-order:stroke"></text>`;
-    parts.lastChild.textContent = words;
-    plot.append(parts);
-  });
-  on(document, "click", (event) => {
-    let line = lineAt(event);
-    // A click's place is rounded, and lines are dense: what is named is what is meant.
-    if (line && pointed?.path.isConnected && Math.hypot(pointed.x - line.x, pointed.y - line.y) < 2) line = pointed;
-    if (line) send("pick", Number(line.path.dataset.elites.split(" ")[line.k]));
-  });
 
   const measure = setInterval(() => { // viser makes its sheet when it likes
     const sheet = document.querySelector('.mantine-Paper-root[style*="position: fixed"]');

@@ -17,7 +17,7 @@ from viser import uplot
 from qd.groups import ORDERS
 from qd.show.figures import label_of, look_of
 from qd.show.view.legend import legend_html
-from qd.show.view.listing import FITNESS_WORDS, Choice, Column, Listing, plot_svg, table_html
+from qd.show.view.listing import FITNESS_WORDS, Choice, Column, Listing, map_svg, table_html
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import PHONE, first_view_of
 
@@ -54,8 +54,7 @@ class Selection:
 
         If the picked one is not listed any more, its neighbours are those of its place among all elites.
         """
-        everyone = self._listing.listed(Choice(order=self.choice.order))
-        place = np.argsort(everyone)  # of each elite by its number
+        place = np.argsort(self._listing.listed(Choice(order=self.choice.order)))  # of each elite by its number
         ahead = place[self.matching] - place[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
         return int(near[0]) if len(near) else self.picked
@@ -94,7 +93,7 @@ class Clock:
 
 
 class ArchivePanel:
-    """What the archive says, its elites on parallel axes, and the list of those that are chosen."""
+    """What the archive says, the list of elites that are chosen, and a map of where their episodes end."""
 
     def __init__(self, client: viser.ClientHandle, selection: Selection, title: str, tab: Any) -> None:
         """Lay it out; the ``tab`` does what a visitor asks for."""
@@ -107,14 +106,11 @@ class ArchivePanel:
             panel.minimize()
         with panel.add_tab("Archive"):
             gui.add_html(_small(f"{escape(title)}<br><b>{escape(listing.summary)}.</b>"))
-            self._choosers = {
-                "cause": _add_choice(gui, "Cause", causes := listing.causes(), partial(self._choose, "cause")),
-                "order": _add_choice(gui, "Sort", orders := {words: name for name, words in ORDERS.items()},
-                                     partial(self._choose, "order"), f"Fitness is {FITNESS_WORDS}."),
-                "kind": _add_choice(gui, "Only", kinds := listing.kinds(), partial(self._choose, "kind")),
-            }  # fmt: skip
-            self._options = {"cause": causes, "order": orders, "kind": kinds}
-            self.list, self._plot = gui.add_html(""), gui.add_html("")
+            orders = {words: name for name, words in ORDERS.items()}
+            _add_choice(gui, "Cause", listing.causes(), partial(self._choose, "cause"))
+            _add_choice(gui, "Sort", orders, partial(self._choose, "order"), f"Fitness is {FITNESS_WORDS}.")
+            _add_choice(gui, "Only", listing.kinds(), partial(self._choose, "kind"))
+            self.list, self._map = gui.add_html(""), gui.add_html("")
 
     def _choose(self, name: str, value: str) -> None:
         def change() -> None:
@@ -124,13 +120,12 @@ class ArchivePanel:
         self._tab.common.post(change)
 
     def show(self) -> None:
-        """Draw plot and list anew."""
+        """Draw list and map anew."""
         selection, listing = self._selection, self._listing
         matching, picked = selection.matching.tolist(), selection.picked
-        for name, options in self._options.items():
-            chosen = getattr(selection.choice, name)
-            self._choosers[name].value = next(words for words, value in options.items() if value == chosen)
-        self._plot.content = plot_svg(listing, selection.matching, picked)
+        self._map.content = _small(
+            f"Where the typical episode of each ends:{map_svg(listing, selection.matching, picked)}"
+        )
         count = f"<b>{len(matching):,}</b> of {len(listing.elites):,} elites"
         number = '<input class="faultline-number" placeholder="number, Enter" size="14" aria-label="Number">'
         shown = "" if picked in matching else f"Shown, but not in this list:{listing.rows_html([picked])}"
@@ -151,22 +146,17 @@ class CrossingPanel:
         self.head = gui.add_html("")
         names = {name: name for name in controllers or ("none",)}
         self.controller = _add_choice(gui, "Controller", names, lambda name: post(tab.choose_controller, name))
-        self.ghost = _add_choice(
-            gui, "Ghost", {name: name for name in tab.ghost.choices}, lambda name: post(tab.choose_ghost, name)
-        )
+        ghosts = {name: name for name in tab.choices}
+        self.ghost = _add_choice(gui, "Ghost", ghosts, lambda name: post(tab.choose_ghost, name))
         self.controller.disabled = self.ghost.disabled = not controllers
-        self.terrain = _add_choice(
-            gui,
-            "Terrain",
-            {"whole": False, "minimal": True},
-            lambda minimal: post(tab.choose_terrain, minimal),
-        )
-        self.ghost_status, self.rates = gui.add_html(""), gui.add_html("")
+        whole = {words: bool(k) for k, words in enumerate(_TERRAINS)}
+        self.terrain = _add_choice(gui, "Terrain", whole, lambda minimal: post(tab.choose_terrain, minimal))
+        self.rates = gui.add_html("")
         self._curves_place = gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True)
         self._curves: Any = None
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, first_view_of)}, post)
         _add_buttons(gui, "Share", {"copy link": (tab.copy_link,), "copy command": (tab.copy_command,)}, post)
-        _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
+        _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.filming.cancel,)}, post)
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
@@ -178,7 +168,7 @@ class CrossingPanel:
                 box = gui.add_checkbox(label, value)
                 _on_visit(box, lambda value, switch=switch: post(switch, value))
         with gui.add_folder("Legend", expand_by_default=False):
-            gui.add_html(legend_html(controllers))
+            gui.add_html(legend_html())
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
@@ -190,12 +180,7 @@ class CrossingPanel:
 
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""
-        self.rates.content = table_html(columns) if columns else ""
-
-    def show_ghost(self, choice: str, words: str) -> None:
-        """Say which ghost is chosen, and its status as HTML."""
-        self.ghost.value = choice
-        self.ghost_status.content = _small(words)
+        self.rates.content = _small(table_html(columns)) if columns else ""
 
     def show_film(self, words: str) -> None:
         """Say how far a film is."""

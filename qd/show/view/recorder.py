@@ -21,8 +21,8 @@ class Report:
 
     wanted: Any
     """The task: :class:`qd.show.recordings.Wanted`, or :class:`qd.show.view.simulator.WantedFilm`."""
-    text: str
-    """In words."""
+    text: str = ""
+    """In words, where its share does not say it."""
     share: float = 0.0
     result: Any = None
     """The recording or the film's file, when it is done."""
@@ -53,15 +53,12 @@ class Recorder:
         self._build = build
         self._drop = get_context("spawn").Event()
         self._wishes: dict[Hashable, Any] = {}  # by tab, the oldest first
-        self._ahead: dict[Hashable, list[Any]] = {}  # by tab, the likeliest first
-        self._warm: Any = None
+        self._ahead: list[Any] = []  # the likeliest first
         self._now: Any = None  # the task that is worked on
         self._awaited = False  # whether a tab waits for it
-        self._is_ahead = False
         self._stopped = False
         self._changed = threading.Condition()
-        self._worker = self._begin()
-        self._is_ready = False
+        self._worker, self._is_ready = self._begin(), False
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -77,18 +74,10 @@ class Recorder:
                     self._drop.set()
             self._changed.notify()
 
-    def record_ahead(self, wanted: Sequence[Any], *, tab: Hashable = 0) -> None:
-        """Record these for a tab, in their order, while nobody waits for others; they replace the tab's former ones."""
+    def record_ahead(self, wanted: Sequence[Any]) -> None:
+        """Record these, in their order, while nobody waits for others; they replace the former ones."""
         with self._changed:
-            self._ahead.pop(tab, None)
-            if wanted:
-                self._ahead[tab] = list(wanted)
-            self._changed.notify()
-
-    def warm(self, wanted: Any) -> None:
-        """Have the simulation of these crossings' controller ready before anybody asks."""
-        with self._changed:
-            self._warm = wanted
+            self._ahead = list(wanted)
             self._changed.notify()
 
     def cancel(self, wanted: Any) -> None:
@@ -112,13 +101,14 @@ class Recorder:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or bool(self._wishes or self._ahead or self._warm))
+                self._changed.wait_for(lambda: self._stopped or bool(self._wishes or self._ahead))
                 if self._stopped:
                     return
-                wanted, only_ready = self._next()
-                self._now, self._awaited = wanted, not (only_ready or self._is_ahead)
+                self._awaited = bool(self._wishes)
+                self._now = self._wishes.pop(next(iter(self._wishes))) if self._awaited else self._ahead.pop(0)
+                wanted = self._now
             try:
-                result = self._result_of(wanted, only_ready)
+                result = self._result_of(wanted)
             except (EvaluatorError, OSError) as error:
                 with self._changed:
                     if self._stopped:
@@ -130,35 +120,18 @@ class Recorder:
                 self._drop.clear()
                 if result is not None:  # others may have asked for the same meanwhile
                     self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
-            if isinstance(result, Exception):
-                if awaited:
-                    self.report(Report(wanted=wanted, text=str(result), failed=True))
-            elif result is not None:
-                self.report(Report(wanted=wanted, text="done", share=1.0, result=result))
+            if not isinstance(result, Exception):
+                self.report(Report(wanted=wanted, share=1.0, result=result)) if result is not None else None
+            elif awaited:
+                self.report(Report(wanted=wanted, text=str(result), failed=True))
 
-    def _next(self) -> tuple[Any, bool]:
-        """What to do next, and whether only to have its simulation ready."""
-        self._is_ahead = False
-        if self._wishes:
-            return self._wishes.pop(next(iter(self._wishes))), False
-        if self._warm is not None:
-            warm, self._warm = self._warm, None
-            return warm, True
-        self._is_ahead = True
-        tab = next(iter(self._ahead))
-        wanted = self._ahead[tab].pop(0)
-        if not self._ahead[tab]:
-            del self._ahead[tab]
-        return wanted, False
-
-    def _result_of(self, wanted: Any, only_ready: bool) -> Any:
-        """What came of a task: its result, an error, or None of one that is dropped or only ready."""
+    def _result_of(self, wanted: Any) -> Any:
+        """What came of a task: its result, an error, or None of one that is dropped."""
         if not self._is_ready:
             self._tell(wanted, _PREPARING, 0.0)
             self._worker.receive()  # that it is ready
             self._is_ready = True
-        how: Any = (self.robot, only_ready)
-        self._worker.send(wanted, how)
+        self._worker.send(wanted, self.robot)
         while True:
             message, value = self._worker.receive()
             if message == "result":

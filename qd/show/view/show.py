@@ -6,8 +6,12 @@ from functools import cached_property
 from itertools import compress
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
+from qd.show.recordings import Wanted, on_elite
 from qd.show.view.listing import Listing, listing_of
 from qd.workers.evaluator import check_policy
 from sim.policy.spec import ControllerSpec, controllers_of
@@ -45,6 +49,19 @@ class Show:
     def robot(self) -> RobotCfg:
         """Whose archive it is."""
         return self.opened_run.robot
+
+    def genes(self, elite: int, minimal: bool) -> NDArray[np.float32] | None:
+        """Of the minimal terrain of an elite; None where the whole one is to be shown."""
+        return self.minima.genes.get(elite) if minimal and self.minima is not None else None
+
+    def wanted(self, elite: int, controller: str | None, *, minimal: bool = False) -> Wanted | None:
+        """A controller's crossings of an elite, or of its minimal terrain if it has one; None without a controller."""
+        if controller is None:
+            return None
+        return on_elite(
+            self.opened_run.archive, elite, policy=self.controllers[controller], replicas=self.replicas,
+            minimal=self.genes(elite, minimal),
+        )  # fmt: skip
 
     def certifying(self, number: int) -> tuple[str | None, str]:
         """Name of the controller that crosses a failing elite, the best of several, or why there is none to show."""

@@ -13,11 +13,11 @@ from qd.show.crossed import crossed_of, typical_episode
 from qd.show.view.address import Address, copy_text, read_address, show_query
 from qd.show.view.bar import Bar
 from qd.show.view.common import Common
+from qd.show.view.crosser import Crosser
 from qd.show.view.filming import Filming
-from qd.show.view.ghost import CERTIFYING, Ghost
-from qd.show.view.listing import Column, column_of
+from qd.show.view.listing import column_of
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.playing import Crossing, crossing_of, episodes_by_ending, paths_of
+from qd.show.view.playing import episodes_by_ending, paths_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
@@ -29,50 +29,40 @@ _BAR_S = 0.1
 """Real time from one update of the bar's time to the next, while playing."""
 _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
+_SETTLES_S = 3.0
+"""How long a browser that has just come may still say where its camera stood before it was moved."""
 _BEFORE_S = 1.0
 """How long before the robot fails an episode begins to be shown."""
+
+
+CERTIFYING, NOBODY = "who certifies it", "none"
+"""Ghosts to choose beside the controllers: the one that certifies the elite, if it is at hand, and no ghost."""
 
 
 class Tab:
     """What one tab shows; all methods are called by the loop."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        bar: Bar,
-        common: Common,
-        window: tuple[int, int],
-        address: Address,
-        refused: list[str],
+        self, client: viser.ClientHandle, bar: Bar, common: Common, window: tuple[int, int], query: str
     ) -> None:
-        """Lay out the page and show what its address asks for.
-
-        Args:
-            client: The browser.
-            bar: Its player bar.
-            common: What all tabs share.
-            window: Width and height of the window [CSS pixels].
-            address: What the address asks for.
-            refused: What of the address means nothing, in words.
-        """
+        """Show what the address asks for behind its question mark, in a window of so many CSS pixels."""
         self.client, self.bar, self.common, self.window = client, bar, common, window
         show = common.show
-        self._archive, self._others = show.opened_run.archive, address.others
+        self._archive = show.opened_run.archive
         self.selection, self.clock = Selection(show.listing), Clock()
         self.controller = next(iter(show.controllers), None)
+        self.choice, self.choices = CERTIFYING, (CERTIFYING, NOBODY, *show.controllers)  # of the ghost
         self._minimal = False  # whether the elite's minimal terrain is wanted, where it has one
         self.replica: int | None = None  # the typical one of the recording that comes
         self._begin_s: float | None = None  # where the next crossing begins; just before the robot fails if None
-        self.recording: Recording | None = None
-        self.crossing: Crossing | None = None
-        self.query, self._bar_at, self._address_at = "", 0.0, time.perf_counter()
-        self.ghost = Ghost(common, client.client_id)
+        self.query, self._bar_at, self._near_until, self._address_at = "", 0.0, 0.0, time.perf_counter()
+        self.robot, self.ghost = Crosser(common, client.client_id), Crosser(common, (client.client_id, "ghost"))
         self.scene = Scene(client, common.shapes)
         title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
         self.list = ArchivePanel(client, self.selection, title, self)
+        self.filming = Filming(client, common, lambda words: self.panel.show_film(words))
         self.panel = CrossingPanel(client, list(show.controllers), self)
-        self._filming = Filming(client, common, self.panel.show_film)
-        self.go_to(address, refused)
+        self.go_to(query)
 
     def act(self, name: str, value: Any) -> None:
         """Do what a visitor did on the bar, by a key or with an elite; what makes no sense is left out."""
@@ -80,8 +70,8 @@ class Tab:
             "play": (bool, self.play), "seek": (float, self.seek), "pause_at": (float, self.pause_at),
             "speed": (float, self.set_speed), "episode": (int, lambda number: self.choose_replica(number - 1)),
             "follow": (bool, self.set_follow), "overview": (bool, lambda _: self.overview()),
-            "pick": (str, self.pick_typed), "step": (int, self.step), "resize": (list, self.resize),
-            "open": (str, lambda query: self.go_to(*read_address(query))),
+            "pick": (str, self.pick), "step": (int, self.step), "resize": (list, self.resize),
+            "open": (str, self.go_to),
         }  # fmt: skip
         kind, method = tasks.get(name, (bool, lambda _: None))
         with suppress(TypeError, ValueError, OverflowError):
@@ -93,9 +83,10 @@ class Tab:
         """Know another width and height of the window [CSS pixels]."""
         self.window = (int(window[0]), int(window[1]))
 
-    def go_to(self, address: Address, refused: list[str]) -> None:
+    def go_to(self, query: str) -> None:
         """Show what an address asks for; one that names no time opens just before the robot fails, and plays."""
-        show = self.common.show
+        show, (address, refused) = self.common.show, read_address(query)
+        self._others = address.others
         for words in refused:
             self.refuse(words)
         first = self.selection.picked if show.elite is None else show.elite
@@ -103,16 +94,16 @@ class Tab:
         if not 0 <= elite < len(self._archive):
             self.refuse(self._no_elite(elite))
             elite = first
-        for name, choices in ((address.controller, show.controllers), (address.ghost, self.ghost.choices)):
+        for name, choices in ((address.controller, show.controllers), (address.ghost, self.choices)):
             if name is not None and name not in choices:
                 self.refuse(f"There is no controller '{name}' here: there are {', '.join(show.controllers) or 'none'}.")
         if address.controller in show.controllers:
             self.controller = address.controller
             self.panel.controller.value = address.controller
-        if address.ghost in self.ghost.choices:
-            self.ghost.choice = address.ghost
+        if address.ghost in self.choices:
+            self.choice = address.ghost
         self._minimal = address.minimal or (address.elite is None and show.minimal)
-        if address.minimal and self.common.genes(elite, True) is None:
+        if address.minimal and self.common.show.genes(elite, True) is None:
             self.refuse(f"Elite {elite} has no minimal terrain here.")
         self.replica, self._begin_s, self.clock.playing = None, address.time_s, address.time_s is None
         if address.episode is not None:
@@ -122,12 +113,13 @@ class Tab:
         self.selection.picked = elite
         self.list.show()
         self._show_elite()
+        self._near_until = time.perf_counter() + _SETTLES_S
         self.set_follow(address.follow or (address.time_s is None and address.camera is None))
 
     @property
     def playing(self) -> bool:
         """Whether time goes by."""
-        return self.clock.playing and self.crossing is not None
+        return self.clock.playing and self.robot.crossing is not None
 
     def tick(self, real_s: float) -> None:
         """Let real time go by [s]: show the next frame if it plays, and keep the address up to date."""
@@ -135,6 +127,8 @@ class Tab:
         if self.playing:
             self.clock.tick(real_s)
             self._show_frame()
+            if self.scene.follow and now < self._near_until:
+                self.scene.set_follow(True)
             if now - self._bar_at > _BAR_S:
                 self._bar_at = now
                 self._show_moment()
@@ -149,10 +143,10 @@ class Tab:
         address = Address(
             elite=self.selection.picked,
             controller=self.controller,
-            ghost=None if self.ghost.choice == CERTIFYING else self.ghost.choice,
+            ghost=None if self.choice == CERTIFYING else self.choice,
             minimal=self.minimal,
             episode=None if self.replica is None else self.replica + 1,
-            time_s=self.clock.time_s if self.crossing is not None else self._begin_s,
+            time_s=self.clock.time_s if self.robot.crossing is not None else self._begin_s,
             follow=self.scene.follow,
             camera=(position, look_at),
             others=self._others,
@@ -183,22 +177,18 @@ class Tab:
 
     def film(self) -> None:
         """Have the shown episode filmed in a process of its own."""
-        if self.recording is None or self.replica is None:
-            return
-        suffix = "" if self.controller in (None, SEARCHED) else f"-{self.controller}"
-        stem = f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}{suffix}"
-        name, ghost = self.ghost.name, self.ghost.recording
-        beside = None if name is None or ghost is None else (name, ghost)
-        self._filming.begin(self.recording, self.replica, self._scales, stem, by=suffix[1:], beside=beside)
-
-    def cancel_film(self) -> None:
-        """Make the film no further."""
-        self._filming.cancel()
+        if self.robot.recording is not None and self.replica is not None:
+            name, ghost = self.ghost.name, self.ghost.recording
+            self.filming.begin(
+                self.robot.recording, self.replica, f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}",
+                scales=self._scales, by="" if self.controller in (None, SEARCHED) else str(self.controller),
+                beside=None if name is None or ghost is None else (name, ghost),
+            )  # fmt: skip
 
     @property
     def minimal(self) -> bool:
         """Whether a minimal terrain is shown."""
-        return self.common.genes(self.selection.picked, self._minimal) is not None
+        return self.common.show.genes(self.selection.picked, self._minimal) is not None
 
     @property
     def _scales(self) -> dict[str, float]:
@@ -234,17 +224,12 @@ class Tab:
         """Show the next (1) or previous (-1) elite of the list."""
         self.pick(self.selection.step(by))
 
-    def pick_typed(self, text: str) -> None:
-        """Show the elite whose number was typed, or say that there is none."""
-        number = int(text) if text.strip().isdecimal() else -1
-        if 0 <= number < len(self._archive):
-            self.pick(number)
-        else:
+    def pick(self, text: str | int) -> None:
+        """Show the elite of a number, just before the robot fails, or say that there is none."""
+        number = int(text) if str(text).strip().isdecimal() else -1
+        if not 0 <= number < len(self._archive):
             self.refuse(self._no_elite(f"'{text}'"))
-
-    def pick(self, number: int) -> None:
-        """Show an elite, just before the robot fails."""
-        if number != self.selection.picked:
+        elif number != self.selection.picked:
             self.selection.picked = number
             self._begin_anew()
             self.list.show()
@@ -259,8 +244,8 @@ class Tab:
 
     def choose_ghost(self, name: str) -> None:
         """Show the crossings of a second controller beside the chosen one's."""
-        if name in self.ghost.choices and name != self.ghost.choice:
-            self.ghost.choice = name
+        if name in self.choices and name != self.choice:
+            self.choice = name
             self._load_ghost()
 
     def choose_replica(self, replica: int, begin_s: float | None = None, *, playing: bool = True) -> None:
@@ -269,7 +254,7 @@ class Tab:
             self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.replicas}.")
             return
         self.replica, self._begin_s, self.clock.playing = replica, begin_s, playing
-        if self.recording is not None:
+        if self.robot.recording is not None:
             self._show_episode()
 
     def play(self, playing: bool) -> None:
@@ -279,7 +264,7 @@ class Tab:
 
     def seek(self, time_s: float) -> None:
         """Show a time [s]."""
-        if self.crossing is not None:
+        if self.robot.crossing is not None:
             self.clock.seek(time_s)
             self._show_frame()
             self._show_moment()
@@ -306,15 +291,11 @@ class Tab:
 
     def show_report(self, report: Report) -> None:
         """Say how far a recording or film is, and show it, if it is one of this tab."""
-        self._filming.take_report(report)
-        ghost_words = self.ghost.take_report(report)
-        if ghost_words is not None:
-            self.panel.show_ghost(self.ghost.choice, ghost_words)
-            if report.result is not None:
-                self._show_ghost()
-                self._show_rates()
-        wanted = self.common.wanted(self.selection.picked, self.controller, minimal=self._minimal)
-        if report.wanted != wanted or self.recording is not None:
+        self.filming.take_report(report)
+        if self.ghost.takes(report):
+            self._show_ghost(f"no ghost: {report.text}" if report.failed else f"{report.share:.0%}")
+            self._show_rates()
+        if not self.robot.takes(report):
             return
         if report.result is not None:
             self._show_recording(report.result)
@@ -326,17 +307,16 @@ class Tab:
     def leave(self) -> None:
         """Ask for nothing more; the browser is gone."""
         self.clock.playing = False
-        self.common.recorder.record(None, tab=self.client.client_id)
-        self.common.recorder.record_ahead([], tab=self.client.client_id)
+        self.robot.leave()
         self.ghost.leave()
-        self._filming.cancel()
+        self.filming.cancel()
 
     def _record_ahead(self) -> None:
         """Have the crossings of the neighbours in the list recorded while nobody waits."""
         near = dict.fromkeys(self.selection.step(by) for by in (1, -1))
-        crossings = [self.common.wanted(number, self.controller, minimal=self._minimal) for number in near]
+        crossings = [self.common.show.wanted(number, self.controller, minimal=self._minimal) for number in near]
         missing = [wanted for wanted in crossings if wanted is not None and self.common.recordings.may_keep(wanted)]
-        self.common.recorder.record_ahead(missing, tab=self.client.client_id)
+        self.common.recorder.record_ahead(missing)
 
     def _show_elite(self) -> None:
         show, elite, listing = self.common.show, self.selection.picked, self.common.show.listing
@@ -346,10 +326,10 @@ class Tab:
         self.panel.show_elite(
             f"<b>{escape(name)}</b><br>{known}",
             listing.details(elite),
-            has_minimal=self.common.genes(elite, True) is not None,
+            has_minimal=self.common.show.genes(elite, True) is not None,
             minimal=self.minimal,
         )
-        genes = self.common.genes(elite, self._minimal)
+        genes = self.common.show.genes(elite, self._minimal)
         shown = self._archive.genes[elite] if genes is None else genes
         heights, ground = terrains_of(shown[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)
@@ -357,43 +337,40 @@ class Tab:
 
     def _show_rates(self) -> None:
         """Show how episodes end: what is known of the whole terrain, and what is recorded of others than that."""
-
-        def recorded(name: str | None, recording: Recording | None) -> list[Column]:
-            if recording is None:
-                return []
-            return [column_of(str(name), crossed_of(recording, self._archive.penalties, self._archive.scales))]
-
-        if self.minimal:
-            columns = recorded(self.controller, self.recording) + recorded(self.ghost.name, self.ghost.recording)
-        else:
-            columns = [*self.common.show.listing.columns(self.selection.picked)]
-            columns += recorded(self.controller, self.recording) if self.controller != SEARCHED else []
+        crossers = [self.robot, self.ghost] if self.minimal else [self.robot] * (self.controller != SEARCHED)
+        columns = [] if self.minimal else [*self.common.show.listing.columns(self.selection.picked)]
+        for crosser in crossers:
+            if crosser.recording is not None:
+                crossed = crossed_of(crosser.recording, self._archive.penalties, self._archive.scales)
+                columns.append(column_of(str(crosser.name), crossed))
         self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
         """Load the ghost's recording of the elite that is shown, or ask for it, and show what there is."""
-        self.ghost.load(self.selection.picked, self.controller, minimal=self._minimal)
+        name, self._note = self.choice, ""
+        if self.choice == CERTIFYING:
+            name, self._note = self.common.show.certifying(self.selection.picked)
+        is_ghost = name in self.common.show.controllers and name != self.controller
+        self.ghost.load(self.selection.picked, name if is_ghost else None, minimal=self._minimal)
+        self.panel.ghost.value = self.choice
         self._show_ghost()
         self._show_rates()
 
-    def _show_ghost(self) -> None:
+    def _show_ghost(self, words: str = "") -> None:
         """Show the ghost's crossing of the episode beside the robot's; time lasts as long as the longer one."""
-        words = self.ghost.show_episode(self.replica or 0)
-        self.panel.show_ghost(self.ghost.choice, words)
-        crossing, ghost = self.crossing, self.ghost.crossing
+        self.ghost.show_episode(self.replica or 0)
+        crossing, ghost = self.robot.crossing, self.ghost.crossing
         self.scene.hide_ghost()
         if crossing is not None:
+            words = self._note if self.ghost.name is None else f"Ghost, {self.ghost.name}: {words or 'is recorded'}"
+            if ghost is not None:
+                words = f"Ghost, {self.ghost.name}: {ghost.ending} after {ghost.duration_s:.1f} s"
             self.clock.duration_s = max(crossing.duration_s, 0.0 if ghost is None else ghost.duration_s)
             self.clock.seek(self.clock.time_s)
             self.panel.stretch_curves(self.clock.duration_s)
-            self.bar.show({"duration": self.clock.duration_s, "status": self._status(words)})
+            status = f"{crossing.ending} after {crossing.duration_s:.1f} s{f' · {words}' * bool(words)}"
+            self.bar.show({"duration": self.clock.duration_s, "status": escape(status)})
             self._show_frame()
-
-    def _status(self, ghost_words: str) -> str:
-        """How the episode and the ghost's ended, as HTML."""
-        if self.crossing is None:
-            return "This episode broke at once."
-        return f"{self.crossing.ending} after {self.crossing.duration_s:.1f} s{f' · {ghost_words}' * bool(ghost_words)}"
 
     def _show_progress(self, words: str, share: float) -> None:
         task = f"Recording {self.common.show.replicas} episodes of {self.controller}: {words or f'{share:.0%}'}"
@@ -401,24 +378,20 @@ class Tab:
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings if they are recorded, else have them recorded."""
-        self.recording = self.crossing = None
         self.scene.hide_crossing()
         self.clock.duration_s = 0.0
         self.panel.show_curves(None)
         self.bar.show({"enabled": False, "status": "", "marks": [], "episodes": [], "share": None})
-        wanted = self.common.wanted(self.selection.picked, self.controller, minimal=self._minimal)
-        recording = None if wanted is None else self.common.recordings.read(wanted)
-        self.common.recorder.record(None if recording is not None else wanted, tab=self.client.client_id)
+        self.robot.load(self.selection.picked, self.controller, minimal=self._minimal)
         self._load_ghost()
-        if recording is not None:
-            self._show_recording(recording)
-        elif wanted is None:
+        if self.robot.recording is not None:
+            self._show_recording(self.robot.recording)
+        elif self.robot.wanted is None:
             self.bar.show({"status": f"No crossing: {escape(self.common.show.note)}"})
         else:
             self._show_progress("", 0.0)
 
     def _show_recording(self, recording: Recording) -> None:
-        self.recording = recording
         self.replica = typical_episode(recording, self._scales) if self.replica is None else self.replica
         self.bar.show({"share": None, "episodes": episodes_by_ending(recording)})
         self._show_rates()
@@ -427,24 +400,22 @@ class Tab:
         self._record_ahead()
 
     def _show_episode(self) -> None:
-        assert self.recording is not None and self.replica is not None
-        archive = self._archive
-        self.crossing = crossing = crossing_of(
-            self.recording, self.replica, self.common.skeleton, archive.penalties, archive.scales
-        )
+        assert self.replica is not None
+        self.robot.show_episode(self.replica)
+        crossing = self.robot.crossing
         self.panel.show_curves(crossing)
+        self.bar.show({"status": "This episode broke at once."})
         self._show_ghost()
         if crossing is not None:
             self.clock.begin_s = max(0.0, crossing.moment_s - _BEFORE_S)
-            self.clock.seek(self.clock.begin_s if self._begin_s is None else self._begin_s)
-            self._show_frame()
+            self.seek(self.clock.begin_s if self._begin_s is None else self._begin_s)
         marks = [] if crossing is None else list(crossing.marks)
         self.bar.show({"enabled": crossing is not None, "marks": marks, "episode": self.replica + 1})
         self._show_moment()
 
     def _show_frame(self) -> None:
-        if self.crossing is not None:
-            self.scene.show_frame(self.crossing, self.clock.frame(self.crossing.dt, self.crossing.num_frames))
+        if (crossing := self.robot.crossing) is not None:
+            self.scene.show_frame(crossing, self.clock.frame(crossing.dt, crossing.num_frames))
             if (ghost := self.ghost.crossing) is not None:
                 self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames), self.ghost.name or "")
 

@@ -12,15 +12,13 @@ class Instant:
     def __init__(self, drop):
         self.wanted, self.drop = [], drop
 
-    def put(self, wanted, how):
-        self.wanted.append((wanted, *how))
+    def put(self, wanted, robot):
+        self.wanted.append((wanted, robot))
 
     def take(self, progress):
-        wanted, robot, only_ready = self.wanted.pop(0)
+        wanted, robot = self.wanted.pop(0)
         if wanted.policy == "refused":
             return ValueError("no such controller")
-        if only_ready:
-            return None
         if wanted.terrain_seed == 13:
             raise RuntimeError("broken")
         progress(0.5)

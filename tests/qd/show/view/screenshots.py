@@ -1,7 +1,7 @@
-"""The pictures of the viewer and the report in docs/: ``python -m tests.qd.show.view.screenshots [--run RUN]``.
+"""Pictures of the viewer and of the report's top: ``python -m tests.qd.show.view.screenshots [--report PAGE]``.
 
-It serves the archive, drives a browser as the tests of the page do, and writes the report of the same archive if it is
-not there yet. Pictures are JPEGs of docs/pictures.
+It serves the published archive of ANYmal and drives a browser as the tests of the page do. docs/pictures gets the
+picture of a laptop and the report's; those of a large screen and a phone are for the eye, in runs/.
 """
 
 import argparse
@@ -10,81 +10,45 @@ from pathlib import Path
 
 from PIL import Image
 
-from qd.groups import rank
-from qd.show.elites import open_run
-from qd.show.report.report import write_report
-from tests.qd.show.view.browser import LIMIT_MS, open_chromium, see
+from tests.qd.show.view.browser import LIMIT_MS, open_chromium, until_it_plays, wait_for
 from tests.qd.show.view.visitor import ROOT, serve
 
-FOLDER = ROOT / "docs" / "pictures"
-WIDE, NARROW = (1400, 900), (390, 844)
-REPORT_HEIGHT = 1400
-QUALITY = 80
-SETTLE_MS = 3000  # for the last frames of a browser that draws without a GPU
+DOCS, RUNS = ROOT / "docs" / "pictures", ROOT / "runs"
+WINDOWS = {DOCS / "viewer.jpg": (1366, 768, 1), RUNS / "viewer-wide.jpg": (1920, 1080, 1),
+           RUNS / "viewer-phone.jpg": (390, 844, 3)}  # fmt: skip
+SETTLE_MS = 4000  # for the last frames of a browser that draws without a GPU
 
 
-def take(page, name: str) -> None:
+def take(page, file: Path) -> None:
     """Writes what a page shows."""
-    for note in page.get_by_role("button", name="Close").all():  # such as that there is no GPU
-        if note.is_visible():
-            note.click()
-    for close in page.locator(".mantine-Notification-closeButton").all():
+    for close in page.locator(".mantine-Notification-closeButton").all():  # such as that there is no GPU
         close.click()
     page.wait_for_timeout(SETTLE_MS)
-    picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    FOLDER.mkdir(exist_ok=True)
-    picture.save(FOLDER / f"{name}.jpg", quality=QUALITY)
-    print(FOLDER / f"{name}.jpg", flush=True)
-
-
-def viewer_pictures(browser, address: str, elite: int) -> None:
-    """The viewer at a desk, along with the robot, with one failure mode listed, and on a phone."""
-
-    def opened(size):
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
-        page.set_default_timeout(LIMIT_MS)
-        page.goto(f"{address}?elite={elite}&episode=1")
-        see(page, "^Episode 1: ")
-        page.wait_for_timeout(SETTLE_MS)
-        return page
-
-    page = opened(WIDE)
-    page.keyboard.press("m")
-    take(page, "viewer")
-    page.keyboard.press("f")
-    take(page, "viewer-follow")
-    page.keyboard.press("f")
-    page.keyboard.press("o")
-    page.get_by_role("combobox", name="Mode").click()
-    page.get_by_role("option").nth(1).click()
-    take(page, "viewer-mode")
-    page.close()
-    page = opened(NARROW)
-    take(page, "viewer-phone")
-    page.close()
-
-
-def report_picture(browser, file: Path) -> None:
-    """The top of a report, down to the first failure."""
-    page = browser.new_page(viewport={"width": WIDE[0], "height": REPORT_HEIGHT})
-    page.goto(file.absolute().as_uri())
-    take(page, "report")
-    page.close()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.open(io.BytesIO(page.screenshot(timeout=LIMIT_MS))).convert("RGB").save(file, quality=78)
+    print(file, flush=True)
 
 
 def main() -> None:
     """Takes all pictures."""
     flags = argparse.ArgumentParser(description=__doc__)
-    flags.add_argument("--run", type=Path, default=Path("results/anymal/archive"))
-    flags.add_argument("--elite", type=int, help="the first of the list if left out")
-    flags.add_argument("--report", type=Path, default=Path("runs/anymal-published/report.html"))
-    args = flags.parse_args()
-    report = args.report if args.report.exists() else write_report(args.run, out=args.report, device="cpu")
-    opened_run = open_run(None, args.run)
-    elite = rank(opened_run.archive, opened_run.space).worst(1)[0] if args.elite is None else args.elite
-    with serve("--run", str(args.run)) as (address, _), open_chromium() as browser:
-        viewer_pictures(browser, address, elite)
-        report_picture(browser, report)
+    flags.add_argument("--report", type=Path, help="a page that `faultline report` wrote")
+    report = flags.parse_args().report
+    with open_chromium() as browser:
+        with serve("--run", "results/anymal/archive") as (address, _):
+            for file, (width, height, ratio) in WINDOWS.items():
+                page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=ratio)
+                page.goto(address, timeout=LIMIT_MS)
+                until_it_plays(page)
+                wait_for(page, "document.querySelector('#faultline .words').textContent.includes('Ghost')")
+                page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
+                page.keyboard.press("Space")
+                take(page, file)
+                page.close()
+        if report is not None:
+            page = browser.new_page(viewport={"width": 1366, "height": 768})
+            page.goto(report.absolute().as_uri())
+            take(page, DOCS / "report.jpg")
 
 
 if __name__ == "__main__":

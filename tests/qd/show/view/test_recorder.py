@@ -62,7 +62,6 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
 
 
 def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, reports):
-    recorder.warm(wish(0, "droppable"))
     recorder.record_ahead([wish(1, "droppable"), wish(2, "droppable")])
     time.sleep(0.5)  # it may be at the first
     recorder.record(wish(7, "droppable"))

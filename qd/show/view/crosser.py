@@ -1,0 +1,49 @@
+"""A controller on the terrain that a tab shows: its recording, and one episode of that."""
+
+from collections.abc import Hashable
+
+from qd.show.recordings import Wanted
+from qd.show.view.common import Common
+from qd.show.view.playing import Crossing, crossing_of
+from qd.show.view.recorder import Report
+from sim.recording.recorder import Recording
+
+
+class Crosser:
+    """The controller that is shown, or the ghost beside it."""
+
+    def __init__(self, common: Common, key: Hashable) -> None:
+        """Nobody yet; the recorder does what the ``key`` asked for last."""
+        self._common, self._key = common, key
+        self.name: str | None = None
+        """Of the controller; None if there is none."""
+        self.wanted: Wanted | None = None
+        self.recording: Recording | None = None
+        self.crossing: Crossing | None = None
+
+    def load(self, elite: int, name: str | None, *, minimal: bool = False) -> None:
+        """Load the recording of another elite or controller, or ask for it."""
+        self.name, self.recording, self.crossing = name, None, None
+        self.wanted = self._common.show.wanted(elite, name, minimal=minimal)
+        if self.wanted is not None:
+            self.recording = self._common.recordings.read(self.wanted)
+        self._common.recorder.record(self.wanted if self.recording is None else None, tab=self._key)
+
+    def leave(self) -> None:
+        """Ask for nothing more."""
+        self._common.recorder.record(None, tab=self._key)
+
+    def takes(self, report: Report) -> bool:
+        """Take the recording of a report, if it has one; whether it is on what was asked for here."""
+        if self.wanted is None or report.wanted != self.wanted or self.recording is not None:
+            return False
+        self.recording = report.result
+        return True
+
+    def show_episode(self, replica: int) -> None:
+        """Load the crossing of an episode, counted from 0, where one is recorded."""
+        archive = self._common.show.opened_run.archive
+        self.crossing = None
+        if self.recording is not None:
+            skeleton = self._common.skeleton
+            self.crossing = crossing_of(self.recording, replica, skeleton, archive.penalties, archive.scales)
