@@ -268,10 +268,7 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *PER_ELITE, *_JUDGED) if name not in _OPTIONAL or name in stored]
         fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
         fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
-        expected = [*names, *fresh_names, *fault_names]
-        unknown = {name for name in expected if name.endswith("end_position")} - stored
-        arrays = read_arrays(file, [name for name in expected if name not in unknown])
-        arrays |= dict.fromkeys(unknown, np.full((arrays["fitness"].size, 2), np.nan, np.float32))
+        arrays = read_arrays(file, [*names, *fresh_names, *fault_names])
         _check_shapes(arrays)
         fresh = {name.removeprefix(_PREFIX): arrays[name] for name in fresh_names}
         faults = {name: _as_field(name, arrays[name]) for name in fault_names}

@@ -32,7 +32,7 @@ SLIPPERY, SOFT = "slippery ground", "soft ground"
 UNCLEAR = "unclear"
 """The cause where no part of the terrain lies where robots end."""
 
-_BEHIND, _AHEAD, _BESIDE = 1.0, 1.5, 0.5  # of the place where robots end, what may have stopped them there [m]
+_BEHIND, _AHEAD, _BESIDE = 1.25, 0.75, 0.4  # of the place where robots end, what may have stopped them there [m]
 _BESIDE_THE_WAY = "beside the way"
 _COARSE = 2  # nodes; parts are compared at 0.1 m
 _NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
@@ -129,8 +129,10 @@ def causes_at(
 ) -> list[str]:
     """What stops robots that end at a place of each terrain, in a word or two as :attr:`Shape.kind`.
 
-    It is the part which, alone on flat ground, has the largest difference of heights from 1 m behind that place to
-    1.5 m ahead of it. Where none has :data:`LEAST_HEIGHT` it is slippery or soft ground, or :data:`UNCLEAR`.
+    It is the part which, alone on flat ground, has the largest difference of heights near that place. Where none has
+    :data:`LEAST_HEIGHT` it is slippery or soft ground, or :data:`UNCLEAR`. How near was chosen on half of the elites in
+    results/ whose minimal terrain is known. Of the other half it names the kind of the minimal terrain's cause in six
+    of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
 
     Args:
         genes: Shape (N, num_genes).

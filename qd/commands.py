@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from msgspec import Meta
 
@@ -121,7 +121,33 @@ class Archive(ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
+class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
+    """What commands that work on a run's elites share."""
+
+    run: Path | None = None
+    """Run directory; the newest of the robot under runs/."""
+    certifiers: tuple[str, ...] = ()
+    """The other controllers, each NAME=FILE; if left out, the robot's panel and RUN/certifiers/*.pt."""
+
+    def named(self) -> tuple[Path, dict[str, Any]]:
+        """The run, and what the command line names beside it."""
+        from qd.run.directory import find_run
+        from qd.workers.evaluator import Compute
+        from sim.policy.spec import controllers_of
+        from sim.robots.find import get_robot
+
+        robot = get_robot(self.robot)
+        return find_run(robot, self.run, published="never"), {
+            "compute": Compute.resolve(self.device, self.workers, self.num_envs),
+            "certifiers": controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
+            "robot": self.robot,
+            "policy": self.policy,
+            "space": self.space,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge(_OnRun):
     """Say which elites of a run are faults of its controller.
 
     fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
@@ -132,39 +158,21 @@ class Judge(ControllerFlags, SpaceFlag, WorkerFlags):
     kept, so the same command goes on after Ctrl-C.
     """
 
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
     stages: tuple[Literal["fresh", "resolved", "others"], ...] = ("fresh", "resolved", "others")
     """What to do, in this order."""
-    certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, RUN/certifiers/*.pt and the robot's panel:
-    sim/robots/<robot>/panel/*.pt, of a robot of your own <robot>/panel/*.pt beside its settings."""
 
     def execute(self) -> None:
         """Judges the run."""
         from qd.judge import judge
-        from qd.run.directory import find_run
         from qd.search import say_what_stops_the_robot
-        from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
-        robot = get_robot(self.robot)
-        run = find_run(robot, self.run, published="never")
-        archive = judge(
-            run,
-            compute=Compute.resolve(self.device, self.workers, self.num_envs),
-            stages=self.stages,
-            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
-            robot=self.robot,
-            policy=self.policy,
-            space=self.space,
-        )
+        run, named = self.named()
+        archive = judge(run, stages=self.stages, **named)
         say_what_stops_the_robot(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
+class Minimise(_OnRun):
     """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
     Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
@@ -174,8 +182,6 @@ class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
     several calls add up. Crossings are kept, so the same command goes on after Ctrl-C.
     """
 
-    run: Path | None = None
-    """Run directory; the newest of the robot under runs/."""
     elite: str | None = None
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
@@ -185,29 +191,13 @@ class Minimise(ControllerFlags, SpaceFlag, WorkerFlags):
     exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
     judge: bool = False
     """Cross the minimal terrains with contact resolved and by other controllers too, as `faultline judge` does."""
-    certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, those that `faultline judge` takes."""
 
     def execute(self) -> None:
         """Finds the minimal terrains, and prints them."""
         from qd.minimise import minimise
-        from qd.run.directory import find_run
-        from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
-        robot = get_robot(self.robot)
-        minimise(
-            find_run(robot, self.run, published="never"),
-            compute=Compute.resolve(self.device, self.workers, self.num_envs),
-            elite=self.elite,
-            how=self.how,
-            judged=self.judge or bool(self.certifiers),
-            certifiers=controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
-            robot=self.robot,
-            policy=self.policy,
-            space=self.space,
-        )
+        run, named = self.named()
+        minimise(run, elite=self.elite, how=self.how, judged=self.judge or bool(self.certifiers), **named)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,7 +241,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
-    --policies, --archive, --independent, --sets or --part the command makes tables: any controllers on the same
+    --policies, --archive, --independent or --sets the command makes tables: any controllers on the same
     hand-crafted, hard-random and generated terrains, with rewards, penalties and intervals. With --pack it says which
     terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the same command goes on.
 
@@ -275,9 +265,6 @@ class Evaluate(ControllerFlags, WorkerFlags):
     independent: Path | None = None
     """Run of another search, with another seed, or its archive.npz: elites that share no ancestor with those trained
     on, drawn from all of its elites. They are the terrains of generated_independent."""
-    part: Literal["test", "validation"] = "test"
-    """Which terrains the tables are of. test: those to report. validation: others of the same kinds, to choose settings
-    by: elites that are neither trained on nor in the test, and other hand-crafted and hard-random terrains."""
     space: str | None = None
     """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS, with ground as in
     course+friction; super_gaussian if left out. If the archive is of a space of your own, name it here."""
@@ -293,7 +280,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
-    validation validation.json. A figure of tables is written beside it as .png."""
+    old and new compared.json."""
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
@@ -308,7 +295,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
-        makes_tables = self.policies or self.sets or self.archive or self.independent or self.part != "test"
+        makes_tables = self.policies or self.sets or self.archive or self.independent
         if self.pack is not None:
             if makes_tables or self.space is not None:
                 raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
@@ -332,11 +319,11 @@ class Evaluate(ControllerFlags, WorkerFlags):
         controllers = controllers_of(self.policies, robot)
         names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"} and self.archive is not None
         if compared:
-            if names or self.independent or self.part != "test":
-                raise ValueError("old and new are compared on --archive: leave --sets, --independent and --part out")
+            if names or self.independent:
+                raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
             names = (COMPARED,)
         cfg = SetsCfg(
-            names=names, archive=self.archive, independent=self.independent, space=self.space, part=self.part, **size
+            names=names, archive=self.archive, independent=self.independent, space=self.space, **size
         )
         report = evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
         return int(compared and is_regression(report))

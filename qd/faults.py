@@ -113,32 +113,6 @@ def any_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'s' * (count != 1)}"
-
-
-def fault_words(archive: Archive) -> list[str]:
-    """What is known of the failing elites, in sentences; nothing where none was crossed under other conditions."""
-    faults, numbers = archive.faults, fault_numbers(archive)
-    if faults is None or not numbers["failing"]:
-        return []
-    sentences = []
-    if numbers["crossed_resolved"]:
-        rate = rate_words(numbers["confirmed"], numbers["crossed_resolved"])
-        sentences.append(
-            f"{_counted(numbers['failing'], 'failing elite')}; with contact resolved the controller fails on {rate} of "
-            "those that it crossed so: they are confirmed."
-        )
-    if faults.certifiers:
-        if (count := count_faults(archive)) is not None:
-            terrains = f"{_counted(count, 'fault')}: terrains that {any_of(faults.certifiers)} crosses"
-            alone = " No specialist of this search was trained." if numbers["faults"] is None else ""
-            sentences.append(f"{terrains} and this controller does not.{alone}")
-        rest = int((archive.failing & ~archive.certified).sum())
-        sentences.append(f"{_counted(rest, 'failing elite')} {'is' if rest == 1 else 'are'} not known to be passable.")
-    return sentences
-
-
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
     faults = archive.faults or FaultCounts.none_of(len(archive))

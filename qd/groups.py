@@ -4,17 +4,13 @@ Elites are grouped in two ways. Families: terrains that are much alike, so that 
 Causes: failing elites on which a part of the same kind stops the robot, such as a ridge.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.distance import pdist, squareform
-from sklearn.metrics import silhouette_score
 
 from qd.archive import Archive
 from qd.causes import HALF_WIDTH, UNCLEAR, causes_at, commonest_words
@@ -33,14 +29,6 @@ KIN_M = 0.06
 """Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
 _EVERY = 2  # nodes; distances are compared at 0.1 m
 _BANK = 50  # height maps that are made at once
-
-MAX_MODES = 7
-"""Most groups that are tried: as many as colours and markers stay apart."""
-TOLERANCE = 0.05
-"""How far below the best silhouette that of a finer division may lie."""
-_COMMON = 0.25  # share of the crossings from which on an end is named
-_MEANS = ("goal_rate", "collision_rate", "other_rate", "fallen_rate", "fitness")
-_MIN_ELITES = 10  # of fewer a silhouette says nothing
 
 ORDERS = {
     "cause": "faults first, one a cause",
@@ -73,20 +61,14 @@ class Elites:
     Penalties are scaled. Lower numbers have a higher fitness.
     """
 
-    penalties: tuple[str, ...]
-    """Names of the P penalties."""
     numbers: NDArray[np.int64]
     """Number of each elite in the archive, shape (N,), ascending."""
     fresh: NDArray[np.bool_]
     """Whether the values are of fresh episodes, shape (N,)."""
-    cell: NDArray[np.int64]
-    """Cell that these episodes fall into, shape (N,)."""
     fitness: NDArray[np.float64]
     """Shape (N,)."""
     ratios: NDArray[np.float64]
     """Shape (N, P)."""
-    variation: NDArray[np.float64]
-    """Standard deviation of the penalties over the episodes, summed, as a share of their mean, shape (N,)."""
     counted: NDArray[np.int64]
     """Valid episodes, shape (N,)."""
     goal_rate: NDArray[np.float64]
@@ -97,8 +79,6 @@ class Elites:
     """Share that ended tilted by more than 60 degrees, shape (N,)."""
     end_position: NDArray[np.float32]
     """Where the typical episode ended [m], shape (N, 2); NaN where that is not known."""
-    reproduced: NDArray[np.bool_]
-    """Whether fresh episodes landed in its cell or a neighbour; True where there are none; shape (N,)."""
     verdict: NDArray[np.int64]
     """Place in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found it say whether it fails."""
 
@@ -109,11 +89,6 @@ class Elites:
     def failing(self) -> NDArray[np.bool_]:
         """Whether under half of the robots reach the goal, shape (N,)."""
         return self.goal_rate < FAILING_GOAL_RATE
-
-    @property
-    def failing_cells(self) -> int:
-        """Different ways to fail: cells that the failing elites fall into."""
-        return len(np.unique(self.cell[self.failing]))
 
     @property
     def other_rate(self) -> NDArray[np.float64]:
@@ -149,39 +124,27 @@ class Elites:
         """
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
-    def most_reproducible(self, count: int) -> list[int]:
-        """Numbers of the terrains whose penalties vary least between episodes, failing and reproduced ones first."""
-        order = np.lexsort((self.variation, ~self.reproduced, ~self.failing))
-        return self.numbers[order[:count]].tolist()
 
-
-_FROM_FRESH = ("cell", "fitness", "ratios", "penalty_mean", "penalty_std", "episodes", "invalid_episodes", "goal_rate",
-               "collision_rate", "fallen_rate", "end_position")  # fmt: skip
+_FROM_FRESH = ("fitness", "ratios", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate",
+               "end_position")  # fmt: skip
 
 
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
     """The elites of an archive, in its order; ``judged`` leaves out those whose fresh episodes are invalid."""
     values = {name: np.asarray(getattr(archive, name)) for name in _FROM_FRESH}
-    is_fresh, reproduced = np.zeros(len(archive), bool), np.ones(len(archive), bool)
-    rows = np.arange(len(archive))
+    is_fresh = np.zeros(len(archive), bool)
     if (fresh := archive.fresh) is not None:
-        is_fresh, reproduced = fresh.valid, fresh.reproduced | ~fresh.valid
+        is_fresh = fresh.valid
         for name, value in values.items():
             values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
-        rows = np.flatnonzero(is_fresh) if judged else rows
-    values = {name: value[rows] for name, value in values.items()}
-    means, stds = (values.pop(name).sum(axis=1) for name in ("penalty_mean", "penalty_std"))
-    counted = values.pop("episodes") - values.pop("invalid_episodes")
-    return Elites(
-        penalties=archive.penalties,
-        numbers=rows.astype(np.int64),
-        fresh=is_fresh[rows],
-        variation=stds / np.maximum(means, np.finfo(float).tiny),
-        counted=counted,
-        reproduced=reproduced[rows],
-        verdict=np.maximum(verdicts_of(archive)[rows], values["goal_rate"] < FAILING_GOAL_RATE),
+    elites = Elites(
+        numbers=np.arange(len(archive)),
+        fresh=is_fresh,
+        counted=values.pop("episodes") - values.pop("invalid_episodes"),
+        verdict=np.maximum(verdicts_of(archive), values["goal_rate"] < FAILING_GOAL_RATE),
         **values,
     )
+    return elites.rows(np.flatnonzero(is_fresh)) if judged and fresh is not None else elites
 
 
 def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
@@ -210,114 +173,6 @@ def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDA
     """
     squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mode:
-    """A group of elites."""
-
-    number: int
-    """From 1, the group with the lowest goal rate first."""
-    members: NDArray[np.int64]
-    """Rows of the elites, shape (num_members,)."""
-    typical: int
-    """Number, in the archive, of the elite nearest to all others of the group (its medoid)."""
-    ratios: NDArray[np.float64]
-    """Mean share of each penalty, shape (P,)."""
-    goal_rate: float
-    """Mean over the members, as are the next four."""
-    collision_rate: float
-    other_rate: float
-    """Neither at the goal nor ended by a collision."""
-    fallen_rate: float
-    fitness: float
-    marked_by: str
-    """Penalty whose share stands out most against all elites that were grouped."""
-
-    @property
-    def ending(self) -> str:
-        """How most of its crossings end, in words; both ways of two that are common, the goal only where it leads."""
-        ends = {
-            "reaches the goal": self.goal_rate,
-            "topples" if self.fallen_rate >= 0.5 else "strikes the terrain": self.collision_rate,
-            "gets stuck": self.other_rate,
-        }
-        first, *others = sorted(ends, key=lambda end: -ends[end])
-        second = next(end for end in others if end != "reaches the goal")
-        return first if ends[second] < _COMMON else f"{first} or {second}"
-
-    @property
-    def deed(self) -> str:
-        """The same of the robot, in a sentence."""
-        return self.ending.replace("strikes the terrain", "strikes the terrain with its base")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Modes:
-    """All groups, and how well each number of them separates."""
-
-    modes: list[Mode]
-    labels: NDArray[np.int64]
-    """Number of the group of each elite, 0 of one in no group, shape (N,)."""
-    silhouettes: Mapping[int, float]
-    """Mean silhouette by number of groups; empty of too few elites to divide."""
-
-
-def failure_modes(elites: Elites) -> Modes:
-    """Groups the failing elites; a terrain that is crossed is in no group."""
-    failing = np.flatnonzero(elites.failing)
-    labels = np.zeros(len(elites), np.int64)
-    if not len(failing):
-        return Modes(modes=[], labels=labels, silhouettes={})
-    of_failing = find_modes(elites.rows(failing))
-    labels[failing] = of_failing.labels
-    modes = [replace(mode, members=failing[mode.members]) for mode in of_failing.modes]
-    return replace(of_failing, modes=modes, labels=labels)
-
-
-def find_modes(elites: Elites) -> Modes:
-    """Groups all of some elites, at least one.
-
-    Ward's agglomerative clustering on the shares of the penalties and the rates of goal, base collision and fall: all
-    fractions, none weighted. The number of groups is the largest whose mean silhouette (Rousseeuw 1987) is within
-    :data:`TOLERANCE` of the best: of divisions that separate about as well, the finer one says more.
-    """
-    features = np.column_stack([elites.ratios, elites.goal_rate, elites.collision_rate, elites.fallen_rate])
-    distances, silhouettes = squareform(pdist(features)), {}
-    labels = np.ones(len(elites), np.int64)
-    if len(elites) >= _MIN_ELITES and distances.any():
-        tree = linkage(features, "ward")
-        divisions = {count: fcluster(tree, count, "maxclust") for count in range(2, MAX_MODES + 1)}
-        silhouettes = {
-            count: float(silhouette_score(distances, division, metric="precomputed"))
-            for count, division in divisions.items()
-            if len(np.unique(division)) == count
-        }
-        enough = max(silhouettes.values(), default=0.0) - TOLERANCE
-        good = [count for count, value in silhouettes.items() if value >= enough]
-        labels = divisions[max(good)] if good else labels  # ties may leave no division to judge
-    groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    groups.sort(key=lambda rows: float(elites.goal_rate[rows].mean()))
-    modes = [_mode(number, rows, elites, distances) for number, rows in enumerate(groups, start=1)]
-    numbers = np.zeros(len(elites), np.int64)
-    for mode in modes:
-        numbers[mode.members] = mode.number
-    return Modes(modes=modes, labels=numbers, silhouettes=silhouettes)
-
-
-def _mode(number: int, rows: NDArray[np.int64], elites: Elites, distances: NDArray[np.float64]) -> Mode:
-    ratios = elites.ratios[rows].mean(axis=0)
-    spread = np.maximum(elites.ratios.std(axis=0), np.finfo(float).tiny)
-    alone = len(rows) == len(elites)  # nothing to stand out against but its own mean: the largest share then
-    standing_out = ratios if alone else (ratios - elites.ratios.mean(axis=0)) / spread
-    return Mode(
-        number=number,
-        members=rows,
-        typical=int(elites.numbers[rows[distances[np.ix_(rows, rows)].sum(axis=1).argmin()]]),
-        ratios=ratios,
-        marked_by=elites.penalties[int(standing_out.argmax())],
-        **{name: float(getattr(elites, name)[rows].mean()) for name in _MEANS},
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -378,20 +233,6 @@ class Ranking:
     def worst(self, count: int) -> list[int]:
         """Numbers of the first terrains of the order ``cause``."""
         return self.elites.numbers[self.order()[:count]].tolist()
-
-    def leaders(self) -> list[int]:
-        """Numbers of the terrains that stand for a cause, one of each."""
-        return self.worst(len(self.by_cause()))
-
-    @cached_property
-    def modes(self) -> Modes:
-        """Groups of those that fail, by how the robot struggles."""
-        return failure_modes(self.elites)
-
-    def mode_of(self, place: int) -> Mode | None:
-        """The mode of the elite in a row; None if it does not fail."""
-        number = int(self.modes.labels[place])
-        return self.modes.modes[number - 1] if number else None
 
 
 def rank(

@@ -40,6 +40,8 @@ from sim.spaces.registry import get_space, is_own
 
 _MOST_SAMPLED = 200  # elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)
 _SAMPLE_STREAM = 3
+_SAME = ("robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
+         "collision_bit")  # fmt: skip
 
 
 def search(
@@ -198,16 +200,9 @@ def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive
     """What a search has found after a number of iterations."""
     elites: dict[str, Any] = scheduler.elites()
     return Archive(
-        robot=cfg.robot,
-        robot_sha256=cfg.robot_sha256,
-        policy_sha256=cfg.policy_sha256,
-        space=cfg.space,
-        space_sha256=cfg.space_sha256,
-        penalty_definition=cfg.penalty_definition,
+        **{name: getattr(cfg, name) for name in _SAME},
         penalties=cfg.fitness.penalties,
         scales=cfg.fitness.scales,
-        intervals=cfg.intervals,
-        collision_bit=cfg.collision_bit,
         iterations=iterations,
         **elites,
     )

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 
 from qd.archive import ARCHIVE_FILE, Archive
-from qd.evaluate.figures import draw_tables
 from qd.evaluate.labels import COMPARED, HELD_OUT
 from qd.evaluate.marks import check_untrained, recorded_marks
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
 from qd.evaluate.sets import (
-    Part,
     TerrainSet,
     make_sets,
     paper_terrains,
@@ -30,7 +28,6 @@ from qd.run.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
 from sim.files.command import publish
-from sim.files.figures import as_png
 from sim.files.records import identity, robot_identity
 from sim.policy.spec import controller_hash, crosser_name, name_of, spec_of
 from sim.robots.find import get_robot
@@ -59,7 +56,6 @@ class SetsCfg:
     """Run of another search, or its archive file, for ``generated_independent``."""
     space: str | None = None
     """Terrain space of the hard-random terrains, by name; super_gaussian if None."""
-    part: Part = "test"
     terrains: int | None = None
     """A set; by default as many as suit the device."""
     episodes: int | None = None
@@ -170,9 +166,9 @@ def evaluate_tables(
     out: Path | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
-    """The tables of controllers with where their terrains come from; prints, writes and draws them.
+    """The tables of controllers with where their terrains come from; prints and writes them.
 
-    Without ``out`` the file lies under runs/; the figure is beside it.
+    Without ``out`` the file lies under runs/.
     """
     terrains, episodes = sizes_for(
         compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL
@@ -188,11 +184,9 @@ def evaluate_tables(
     if cfg.names == (COMPARED,) and archive is not None:
         sets = {COMPARED: _untrained_elites(archive, controllers, terrains, cfg)}
     else:
-        sets = make_sets(
-            cfg.names, terrains, cfg.seed, archive=archive, independent=independent, space=space, part=cfg.part
-        )
+        sets = make_sets(cfg.names, terrains, cfg.seed, archive=archive, independent=independent, space=space)
     for name in set(HELD_OUT).intersection(sets):
-        check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for {cfg.part}")
+        check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for the test")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
         check_untrained(controllers, independent.genes, str(cfg.independent))
     about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}  # before they change
@@ -203,20 +197,17 @@ def evaluate_tables(
     if cfg.independent is not None and independent is not None:
         search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
         about["independent"] = _about(cfg.independent, independent) | search
-    about |= {"space": space.name, "part": cfg.part}
-    file, show = "tables.json" if cfg.part == "test" else "validation.json", show_tables
-    if COMPARED in sets:
-        file, show = "compared.json", show_comparison
+    file, show = ("compared.json", show_comparison) if COMPARED in sets else ("tables.json", show_tables)
 
     def make() -> dict[str, Any]:
         tables = evaluate(
             controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed,
             cache=crossings_folder(robot), open_evaluator=open_evaluator,
         )  # fmt: skip
-        return {**origin_of(compute.device, cfg.seed, compute.workers), **robot_identity(robot), **about, **tables}
+        origin = origin_of(compute.device, cfg.seed, compute.workers)
+        return {**origin, **robot_identity(robot), "space": space.name, **about, **tables}
 
-    out = out or RUNS / f"{robot.name}-tables" / file
-    return publish(out, make, show, draw=lambda tables: as_png(draw_tables(tables)))
+    return publish(out or RUNS / f"{robot.name}-tables" / file, make, show)
 
 
 def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: int, cfg: SetsCfg) -> TerrainSet:

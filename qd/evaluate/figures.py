@@ -1,54 +1,17 @@
-"""Figures of evaluations: tables and doses."""
+"""The figure of doses."""
 
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from qd.evaluate.labels import SETS
 from qd.fitness import FAILING_GOAL_RATE
-from sim.files.figures import bar_lengths, new_figure
-from sim.policy.spec import firsts, kind_of
+from sim.files.figures import new_figure
 
-_PANELS = {
-    "goal": ("goal reached\n[% of episodes]", 100.0),
-    "success": ("no base collision\n[% of episodes]", 100.0),
-    "reward": ("training reward\n[sum over 20 s]", 1.0),
-}
 _DOSE_COLUMNS = 4
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
-
-
-def draw_tables(report: Mapping[str, Any]) -> Figure:
-    """Goal rate, no base collision and reward of all controllers by set, with intervals; seeds of a kind look alike."""
-    figure, controllers = new_figure(13.0, 4.2), list(report["controllers"])
-    kinds = [kind_of(first) for first in firsts(controllers)]
-    step = min(0.16, 0.7 / len(controllers))
-    for panel, (measure, (label, factor)) in enumerate(_PANELS.items(), 1):
-        axes, sets = figure.add_subplot(1, len(_PANELS), panel), list(report[measure])
-        for number, controller in enumerate(controllers):
-            place = kinds.index(kind_of(controller))
-            means = np.array([report[measure][name][controller] for name in sets], np.float64)
-            limits = [report["intervals"][measure][name][controller] for name in sets]
-            axes.errorbar(
-                np.arange(len(sets)) + step * (number - (len(controllers) - 1) / 2),
-                factor * means, factor * bar_lengths(means, limits), linestyle="", capsize=3,
-                marker=_MARKERS[place % len(_MARKERS)], color=_COLOURS[place % len(_COLOURS)],
-                label=kinds[place] if controller in firsts(controllers) else "",
-            )  # fmt: skip
-        labels = [str(SETS.get(name, name)).replace(", ", ",\n") for name in sets]
-        axes.set_xticks(range(len(sets)), labels, fontsize=8.5)
-        axes.set_xlim(-0.5, len(sets) - 0.5)
-        axes.grid(axis="y", alpha=0.3)
-        axes.set_ylabel(label)
-    part = ", validation" if report.get("part") == "validation" else ""
-    figure.suptitle(f"{report['robot']}{part}: {report['episodes']} episodes on each terrain, 95 % intervals")
-    handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=8, frameon=False)
-    return figure
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:

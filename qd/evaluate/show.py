@@ -60,8 +60,6 @@ def show_rates(report: dict[str, Any]) -> None:
 
 def show_tables(report: dict[str, Any]) -> None:
     """Prints the means of every set with every controller, and what became of terrains."""
-    if report.get("part") == "validation":
-        print("\nValidation terrains, to choose settings by. Rates to report are of part test.")
     for name, count in report["terrains"].items():
         limits = {measure: report["intervals"][measure][name] for measure in _FORMS}
         rows = [

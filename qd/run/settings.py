@@ -11,7 +11,7 @@ from qd.fitness import FitnessCfg
 from qd.run.presets import SchedulerCfg, preset_of
 from sim.files.records import robot_identity
 from sim.files.settings import NonNegativeInt, PositiveInt, check, from_builtins
-from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, label_suffix, spec_of
+from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
 from sim.robots.robot import RobotCfg
 
 Settings = dict[str, Any]
@@ -120,11 +120,6 @@ def is_searched(cfg: SearchCfg, policy: str, robot: RobotCfg) -> bool:
     if cfg.policy_sha256 is None:
         return policy == spec_of(cfg.policy, robot)
     return controller_hash(policy) == cfg.policy_sha256
-
-
-def suffix_of(cfg: SearchCfg, policy: str, robot: RobotCfg) -> str:
-    """The ending of the names of what is made of a run with a controller: empty for the search's, else ``-C-G``."""
-    return "" if is_searched(cfg, policy, robot) else label_suffix(policy)
 
 
 def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:

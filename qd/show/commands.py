@@ -193,20 +193,23 @@ class Export(ControllerFlags, EliteFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(ControllerFlags, DeviceFlag, SpaceFlag):
-    """Write one HTML page about a run, with its figures beside it; it opens from disk, without a network.
+    """Write one HTML page about a run; it opens from disk, without a network, and prints well.
 
-    Robots cross the elites that it shows again, 20 times each. The crossings are stored, so the same command goes on
-    after a stop. The evaluation's tables are those of results/<robot>/tables.json, if there are any.
+    It begins with what stops the robot, and shows the worst terrains close up at the moment of failure, with another
+    controller beside that crosses them. For this robots cross these terrains again, 20 times each. The crossings are
+    stored, so the same command goes on after a stop.
     """
 
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive. Of a `faultline harden` the page
     is about its rounds, and nothing is crossed."""
     out: Path | None = None
-    """Page to write, *.html; report.html in the run, or of published results in runs/<robot>-published; with another
-    controller report-<its name>.html."""
-    elites: Annotated[int, Meta(ge=1, le=10)] = 5
-    """How many of the worst and of the most reproducible elites to show, with one of each failure mode."""
+    """Page to write, *.html; report.html in the run, or of published results in a folder of their own under runs/;
+    with another controller report-<its name>.html."""
+    elites: Annotated[int, Meta(ge=1, le=10)] = 3
+    """How many of the worst terrains to show close up, one a cause first."""
+    tables: Path | None = None
+    """Tables of an evaluation to show, such as results/anymal/tables.json; none if left out."""
 
     def execute(self) -> None:
         """Writes the page."""
@@ -214,7 +217,7 @@ class Report(ControllerFlags, DeviceFlag, SpaceFlag):
 
         write_report(
             self.run, robot=self.robot, policy=self.policy, space=self.space, out=self.out, num_elites=self.elites,
-            device=self.device,
+            tables=self.tables, device=self.device,
         )  # fmt: skip
 
 

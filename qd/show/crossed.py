@@ -1,5 +1,6 @@
 """Recorded crossings in numbers and figures: how they ended, what they cost, and where."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,35 +24,35 @@ class Ending(NamedTuple):
     """A way to end, in words and in looks that the colour-blind tell apart."""
 
     words: str
-    color: str
+    way: str = ""
+    """As one says of a robot: ``gets stuck``."""
+    color: str = "#5a5a5a"
     """As ``#rrggbb`` (Okabe and Ito's)."""
-    marker: str
+    marker: str = ""
     """Matplotlib's, where the episode ended."""
-    line: str
+    line: str = ""
     """Matplotlib's, of the path to it."""
 
 
 ENDINGS = {
-    Outcome.GOAL: Ending("reached the goal", "#009e73", "o", "-"),
-    Outcome.BASE_COLLISION: Ending("base collision", "#d55e00", "X", "--"),
-    Outcome.TIME_OUT: Ending("out of time", "#0072b2", "s", "-."),
-    Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
+    Outcome.GOAL: Ending("reached the goal", "crosses it", "#009e73", "o", "-"),
+    Outcome.BASE_COLLISION: Ending("base collision", "hits the ground", "#d55e00", "X", "--"),
+    Outcome.TIME_OUT: Ending("out of time", "gets stuck", "#0072b2", "s", "-."),
+    Outcome.OUT: Ending("left the terrain", "leaves the terrain", "#cc79a7", "^", ":"),
 }
 """How a valid episode may end, the good way first."""
-_INVALID = Ending("invalid: the simulation broke", "#5a5a5a", "", "")
 ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
 """The good way in words, and the others."""
 
 
 def ending_of(outcome: int) -> Ending:
     """How an episode of an outcome ended, a valid one or not."""
-    return ENDINGS.get(Outcome(outcome), _INVALID)
+    return ENDINGS.get(Outcome(outcome), Ending("invalid: the simulation broke"))
 
 
 def way_to_end(outcome: int, fallen: bool) -> str:
     """How an episode ended, as one says of a robot: ``topples``."""
-    ways = {Outcome.GOAL: "crosses it", Outcome.TIME_OUT: "gets stuck", Outcome.OUT: "leaves the terrain"}
-    return ways.get(Outcome(outcome), "topples" if fallen else "hits the ground")
+    return "topples" if fallen and outcome == Outcome.BASE_COLLISION else ending_of(outcome).way
 
 
 class Rate(NamedTuple):
@@ -75,57 +76,37 @@ class Crossed:
 
     recording: Recording
     """Of one terrain."""
+    scales: dict[str, float]
+    """What each penalty of the archive is divided by, in its order."""
     chosen: NDArray[np.int64]
     """Valid episodes, shape (E,)."""
-    penalties: NDArray[np.float64]
-    """Raw penalty sums of each, in the archive's order, shape (E, P)."""
-    scales: NDArray[np.float64]
-    """Shape (P,)."""
+    outcome: NDArray[np.uint8]
+    """How each ended, shape (E,)."""
     rates: dict[str, Rate]
     """By the words of :data:`ENDINGS`, and ``fallen``."""
 
     @property
     def ends(self) -> NDArray[np.float64]:
         """Where each episode ended, shape (E, 3) [m]."""
-        last = self.recording.num_frames[0, self.chosen] - 1
-        return self.recording.base_position[0, self.chosen, last].astype(np.float64)
-
-    @property
-    def outcome(self) -> NDArray[np.uint8]:
-        """How each ended, shape (E,)."""
-        return self.recording.outcome[0, self.chosen]
-
-    @property
-    def scaled(self) -> NDArray[np.float64]:
-        """Scaled penalties, shape (E, P)."""
-        return self.penalties / self.scales
-
-    @property
-    def failed_at(self) -> float | None:
-        """Median of x where the episodes that did not reach the goal ended [m]; None if all did."""
-        x = self.ends[self.outcome != Outcome.GOAL, 0]
-        return float(np.median(x)) if len(x) else None
+        return np.array([self.path(k)[-1] for k in range(len(self.chosen))]).reshape(-1, 3)
 
     def path(self, k: int) -> NDArray[np.float64]:
         """Base positions of the k-th valid episode [m], shape (frames, 3)."""
         episode = self.chosen[k]
-        frames = slice(self.recording.num_frames[0, episode])
-        return self.recording.base_position[0, episode, frames].astype(np.float64)
+        return self.recording.base_position[0, episode, : self.recording.num_frames[0, episode]].astype(np.float64)
 
 
-def crossed_of(recording: Recording, penalties: tuple[str, ...], scales: tuple[float, ...]) -> Crossed:
+def crossed_of(recording: Recording, penalties: Sequence[str] = (), scales: Sequence[float] = ()) -> Crossed:
     """A recording of one terrain in numbers."""
-    outcome = recording.outcome[0]
-    chosen = np.flatnonzero(outcome != Outcome.INVALID)
-    columns = [recording.penalty_names.index(name) for name in penalties]
-    last = recording.num_frames[0, chosen] - 1
-    hits = {ending.words: outcome[chosen] == end for end, ending in ENDINGS.items()}
+    chosen = np.flatnonzero(recording.outcome[0] != Outcome.INVALID)
+    outcome = recording.outcome[0, chosen]
+    hits = {ending.words: outcome == end for end, ending in ENDINGS.items()}
     hits["fallen"] = recording.fallen[0, chosen]
     return Crossed(
         recording=recording,
+        scales=dict(zip(penalties, scales, strict=True)),
         chosen=chosen,
-        penalties=recording.penalties[0, chosen, last][:, columns].astype(np.float64),
-        scales=np.asarray(scales, dtype=np.float64),
+        outcome=outcome,
         rates={label: Rate(int(hit.sum()), len(chosen)) for label, hit in hits.items()},
     )
 
@@ -184,86 +165,65 @@ def title_of(recording: Recording, controller: str = "") -> str:
     return f"{who}, {recording.labels[0]}: {way}, {ended.sum()} of {valid.sum()}"
 
 
-def penalties_by_place(crossed: Crossed, penalties: tuple[str, ...], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scaled penalties per episode by where along x they were incurred.
+def penalties_by_place(crossed: Crossed, edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scaled penalties per episode by where along x they were incurred, shape (places, P); they add up to the mean.
 
-    Args:
-        crossed: The crossings.
-        penalties: Those of the archive.
-        edges: Of the places [m], shape (places + 1,); what lies outside counts in the first or last.
-
-    Returns:
-        Mean over the episodes, shape (places, P); the sum over places is the mean penalty.
+    The places lie between ``edges`` [m], shape (places + 1,); what lies outside counts in the first or last.
     """
-    recording = crossed.recording
-    columns = [recording.penalty_names.index(name) for name in penalties]
+    recording, scales = crossed.recording, crossed.scales
+    columns = [recording.penalty_names.index(name) for name in scales]
     amounts = np.zeros((len(edges) - 1, len(columns)))
     for k, episode in enumerate(crossed.chosen):
         sums = recording.penalties[0, episode, : recording.num_frames[0, episode]][:, columns].astype(np.float64)
         places = np.clip(np.digitize(crossed.path(k)[1:, 0], edges) - 1, 0, len(amounts) - 1)
         np.add.at(amounts, places, np.diff(sums, axis=0))
-    return amounts / (crossed.scales * max(1, len(crossed.chosen)))
+    return amounts / (np.array([*scales.values()]) * max(1, len(crossed.chosen)))
 
 
 _PLACE = 0.5  # length of the places that penalties are summed over [m]
 
 
-def draw_crossing(crossed: Crossed, penalties: tuple[str, ...], title: str) -> Figure:
+def draw_crossing(crossed: Crossed, title: str) -> Figure:
     """One terrain: its height map with the paths, its profile, and the penalties by place."""
     figure = new_figure(9.5, 8.4)
     figure.suptitle(title)
     top, profile, places = panels = figure.subplots(3, 1, sharex=True, height_ratios=(3.2, 0.9, 1.1))
-    figure.colorbar(draw_map(top, crossed), ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
-    _draw_profile(profile, crossed)
-    _draw_places(places, crossed, penalties)
-    handles = _legend(crossed)
-    for name in penalties:
-        look = look_of(name)
-        handles.append(Patch(facecolor=look.color, hatch=look.hatch, edgecolor="white", label=label_of(name)))
+    image = draw_heights(top, crossed.recording.heights[0], None, crossed.recording.ground)
+    figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
+    handles = [*_draw_paths(top, crossed), *(Line2D([], [], **look) for look in (START, GOAL))]
+    ground = crossed.recording.ground
+    if ground is not None and (ground.friction < 1.0).any():
+        handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
+    if ground is not None and ground.time_constant_s.any():
+        handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
+    _draw_profile(profile, crossed.recording.heights[0])
+    _draw_places(places, crossed)
+    for look, name in ((look_of(name), label_of(name)) for name in crossed.scales):
+        handles.append(Patch(facecolor=look.color, hatch=look.hatch, edgecolor="white", label=name))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
-    top.set_xlim(*_x_limits(crossed))
+    xs = [0.0, LENGTH, *crossed.ends[:, 0]]  # robots may leave the terrain
+    top.set_xlim(min(xs), max(xs))
     return figure
 
 
-def draw_map(axes: Axes, crossed: Crossed) -> Any:
-    """The height map with every path, its end marked by how it ended; returns the image."""
-    image = draw_heights(axes, crossed.recording.heights[0], None, crossed.recording.ground)
-    for outcome, end in ENDINGS.items():
-        chosen = np.flatnonzero(crossed.outcome == outcome)
-        for k in chosen:
-            axes.plot(*crossed.path(int(k))[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
-        if len(chosen):
-            places = crossed.ends[chosen]
-            axes.scatter(*places[:, :2].T, color=end.color, marker=end.marker, s=55, edgecolors="white", zorder=3)
-    return image
-
-
-def _legend(crossed: Crossed) -> list[Any]:
-    """Marks of the ends there are and how many, with the lines of the paths to them, of start and goal."""
+def _draw_paths(axes: Axes, crossed: Crossed) -> list[Any]:
+    """Every path, its end marked by how it ended; returns handles of the ends there are, and how many."""
     handles: list[Any] = []
     for outcome, end in ENDINGS.items():
-        if count := int((crossed.outcome == outcome).sum()):
-            looks: dict[str, Any] = {"color": end.color, "marker": end.marker, "linestyle": end.line}
-            label = f"{end.words} ({count})"
-            handles.append(Line2D([], [], **looks, label=label, markeredgecolor="white", markersize=9))
-    handles += [Line2D([], [], **look) for look in (START, GOAL)]
-    ground = crossed.recording.ground
-    if ground is not None and (ground.friction < 1.0).any():
-        handles.append(Patch(facecolor="none", edgecolor=SLIPPERY, hatch="\\\\\\", label="slippery"))
-    if ground is not None and ground.time_constant_s.any():
-        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="|||", label="soft"))
+        chosen = np.flatnonzero(crossed.outcome == outcome)
+        if not len(chosen):
+            continue
+        for k in chosen.tolist():
+            axes.plot(*crossed.path(k)[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
+        mark: dict[str, Any] = {"color": end.color, "marker": end.marker}
+        axes.scatter(*crossed.ends[chosen][:, :2].T, s=55, edgecolors="white", zorder=3, **mark)
+        mark |= {"linestyle": end.line, "markeredgecolor": "white", "markersize": 9}
+        handles.append(Line2D([], [], **mark, label=f"{end.words} ({len(chosen)})"))
     return handles
 
 
-def _x_limits(crossed: Crossed) -> tuple[float, float]:
-    """The terrain, and what robots left it for."""
-    xs = np.concatenate([[0.0, LENGTH], crossed.ends[:, 0]])
-    return float(xs.min()), float(xs.max())
-
-
-def _draw_profile(axes: Axes, crossed: Crossed) -> None:
+def _draw_profile(axes: Axes, heights: NDArray[np.float32]) -> None:
     """Heights along the straight line from start to goal."""
-    heights = crossed.recording.heights[0]
     row = heights[heights.shape[0] // 2]
     x = np.linspace(0.0, LENGTH, len(row))
     axes.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
@@ -272,12 +232,12 @@ def _draw_profile(axes: Axes, crossed: Crossed) -> None:
     axes.grid(alpha=0.3)
 
 
-def _draw_places(axes: Axes, crossed: Crossed, penalties: tuple[str, ...]) -> None:
+def _draw_places(axes: Axes, crossed: Crossed) -> None:
     """Scaled penalties of an episode by where they were incurred."""
     edges = np.arange(0.0, LENGTH + _PLACE / 2, _PLACE)
-    amounts = penalties_by_place(crossed, penalties, edges)
+    amounts = penalties_by_place(crossed, edges)
     bottom = np.zeros(len(amounts))
-    for penalty, amount in zip(penalties, amounts.T, strict=True):
+    for penalty, amount in zip(crossed.scales, amounts.T, strict=True):
         axes.bar(edges[:-1], amount, width=_PLACE, align="edge", bottom=bottom, **look_of(penalty).bar)
         bottom += amount
     axes.set_xlabel("x [m]")

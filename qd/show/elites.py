@@ -14,7 +14,7 @@ from qd.groups import rank
 from qd.judge import CERTIFIERS_FOLDER, panel_of
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
-from qd.run.settings import SearchCfg, find_policy, suffix_of
+from qd.run.settings import SearchCfg, find_policy
 from sim.files.command import chosen_elites
 from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
@@ -92,14 +92,9 @@ class OpenedRun:
 
     def suffix(self, policy: str) -> str:
         """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``."""
-        cfg = self.search()
-        if cfg is None:
-            searched = self.archive.policy_sha256
-            same = controller_hash(policy) == searched
-            if searched is None:
-                same = is_same(policy, str(self.robot.policy_file))
-            return "" if same else label_suffix(policy)
-        return suffix_of(cfg, policy, self.robot)
+        searched, named = self.archive.policy_sha256, spec_of(self.as_searched()[0], self.robot)
+        same = is_same(policy, named) if searched is None else controller_hash(policy) == searched
+        return "" if same else label_suffix(policy)
 
     def certifiers(self) -> dict[str, str]:
         """Files of the controllers that crossed its failing elites, as far as they are at hand, by their names.
@@ -177,10 +172,4 @@ def open_run(named: str | None, run: Path | None = None, *, space: str | None = 
     archive = read_archive(run)
     robot = robot_of(archive.named(), named, run)
     check_space(archive, space)
-    unknown = [name for name in archive.penalties if name not in robot.penalties]
-    if unknown:
-        raise ValueError(
-            f"{run} was searched by penalties that robot {robot.name} does not have: {', '.join(unknown)}; expected "
-            f"some of {', '.join(robot.penalties)}: give the settings that it was searched with, or another --run"
-        )
     return OpenedRun(path=run, archive=archive, robot=robot)

@@ -1,25 +1,23 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.groups import VERDICTS, Ranking, rank
 from qd.minima import read_minimal
 from qd.run.directory import RUNS, folder_for
-from qd.run.progress import share_bar
+from qd.run.progress import Bar
 from qd.show.elites import OpenedRun
 from sim.bank import terrains_of
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
 from sim.files.records import provenance
-from sim.ground import GroundMaps
 from sim.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
@@ -40,47 +38,46 @@ class Source:
 
     folder: Path
     """Where their files go if no other folder is named."""
-    stems: list[str]
-    """Name of each terrain's files."""
-    about: list[dict[str, Any]]
-    """What is known of each."""
-    genes: NDArray[np.float32]
-    """Shape (N, num_genes)."""
-    heights: Callable[[slice], tuple[NDArray[np.float32], GroundMaps | None]]
-    """Heights of some of them [m], shape (n, nrow, ncol), and their ground, if it is not as always."""
+    about: dict[str, dict[str, Any]]
+    """What is known of each, by the name of its files."""
+    terrains: Iterator[ExportedTerrain]
+    """The same ones in the same order."""
     origin: dict[str, Any]
-    """Where they come from, for every file."""
-    named: dict[str, Any]
-    """The same for the index alone."""
-    timestep: float
-    """Physics step of the robot [s]."""
-    ground: tuple[str, ...] = ()
-    """What the terrains have maps of beside heights."""
+    """Where they come from."""
 
 
 def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | None = None) -> Source:
     """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
-    archive, space = opened_run.archive, opened_run.space
+    archive, space, robot = opened_run.archive, opened_run.space, opened_run.robot
     terrains = opened_run.terrains(elite, minimal)
-    genes = np.stack([terrain.genes for terrain in terrains])
     minima = read_minimal(opened_run.folder, archive)
     ranking = rank(archive, space, minima, numbers=[terrain.number for terrain in terrains])
+
+    def rasterised() -> Iterator[ExportedTerrain]:
+        for first in range(0, len(terrains), _AT_ONCE):
+            chosen = terrains[first : first + _AT_ONCE]
+            grids, maps = terrains_of(np.stack([terrain.genes for terrain in chosen]), space)
+            for k, terrain in enumerate(chosen):
+                yield ExportedTerrain(
+                    heights=grids[k], name=terrain.stem, genes=terrain.genes, timestep=robot.physics_dt,
+                    ground=None if maps is None else maps[k : k + 1],
+                )  # fmt: skip
+
     return Source(
-        folder=folder_for(opened_run.path, opened_run.robot.name)
-        / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
-        stems=[terrain.stem for terrain in terrains],
-        about=[
-            about_elite(ranking, row, archive)
+        folder=folder_for(opened_run.path, robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
+        about={
+            terrain.stem: about_elite(ranking, row, archive)
             | ({"minimal": terrain.minimal} if terrain.minimal else {})
             | {"terrain": space.describe(terrain.genes)}
             for row, terrain in enumerate(terrains)
-        ],
-        genes=genes,
-        heights=lambda part: terrains_of(genes[part], space),
-        origin={"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256},
-        named=archive.named(),
-        timestep=opened_run.robot.physics_dt,
-        ground=space.ground,
+        },
+        terrains=rasterised(),
+        origin={
+            "run": str(opened_run.path),
+            "space": archive.space,
+            "space_sha256": archive.space_sha256,
+            **archive.named(),
+        },
     )
 
 
@@ -89,16 +86,16 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
     folder = pack_folder(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
-    rows = chosen_elites(places, len(pack), folder)
+    names = {pack.terrains[row]["name"]: row for row in chosen_elites(places, len(pack), folder)}
     return Source(
         folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
-        stems=[pack.terrains[row]["name"] for row in rows],
-        about=[{"robot": of_robot.name, "place": row, **pack.terrains[row]} for row in rows],
-        genes=pack.genes[rows],
-        heights=lambda part: (pack.heights[rows[part]], None),
-        origin={"pack": folder.name, "terrains_sha256": pack.content["terrains_sha256"]},
-        named={name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition")},
-        timestep=of_robot.physics_dt,
+        about={name: {"robot": of_robot.name, "place": row, **pack.terrains[row]} for name, row in names.items()},
+        terrains=(
+            ExportedTerrain(heights=pack.heights[row], name=name, genes=pack.genes[row], timestep=of_robot.physics_dt)
+            for name, row in names.items()
+        ),
+        origin={"pack": folder.name}
+        | {name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")},
     )
 
 
@@ -106,34 +103,25 @@ def export_terrains(
     source: Source, *, formats: Sequence[str] = tuple(FORMATS), out: Path | None = None, overwrite: bool = False
 ) -> list[Path]:
     """Writes terrains as files that other programs read."""
-    formats, folder = list(dict.fromkeys(formats)), out or source.folder
+    formats, folder, count = list(dict.fromkeys(formats)), out or source.folder, len(source.about)
     check_formats(formats)
-    if source.ground and "npz" not in formats:
-        raise ValueError(
-            f"formats must have npz, which alone holds {' and '.join(source.ground)}, got {', '.join(formats)}"
-        )
-    if not overwrite:
-        _refuse_to_replace(folder, {*source.stems})
+    common = (INDEX_FILE, README_FILE)
+    stored = sorted(file.name for file in folder.glob("*") if file.name in common or file.stem in source.about)
+    if stored and not overwrite:
+        names = ", ".join(stored[:3]) + ", ..." * (len(stored) > 3)
+        raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
     prepare_output(folder / INDEX_FILE)
     origin = {**source.origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
-    files, index, count = [], [], len(source.stems)
-    with share_bar("exporting") as progress:
-        for first in range(0, count, _AT_ONCE):
-            part = slice(first, min(first + _AT_ONCE, count))
-            grids, maps = source.heights(part)
-            for k, heights in enumerate(grids):
-                about, stem = source.about[first + k], source.stems[first + k]
-                terrain = ExportedTerrain(
-                    heights=heights, name=stem, genes=source.genes[first + k], timestep=source.timestep,
-                    ground=None if maps is None else maps[k : k + 1],
-                )  # fmt: skip
-                files += write_terrain(folder, terrain, formats=formats, about={**about, **origin})
-                index.append({**about, "files": stem})
-                progress(len(index) / count)
+    files = []
+    with Bar("exporting", count) as bar:
+        for done, terrain in enumerate(source.terrains, start=1):
+            files += write_terrain(folder, terrain, formats=formats, about={**source.about[terrain.name], **origin})
+            bar.move_to(done)
     files += [folder / README_FILE, folder / INDEX_FILE]
-    write_atomically(files[-2], readme_of(source.stems[0], formats).encode())
-    write_atomically(files[-1], to_json({**source.named, "formats": formats, "elites": index, **origin}))
+    write_atomically(files[-2], _README.replace("STEM", next(iter(source.about))).encode())
+    index = [{**about, "files": name} for name, about in source.about.items()]
+    write_atomically(files[-1], to_json({"formats": formats, "elites": index, **origin}))
     print(f"{count} terrain{'s' * (count != 1)} as {', '.join(formats)}: {folder}")
     return files
 
@@ -144,25 +132,16 @@ x runs along the course (0 to 16 m), y across it (0 to 8 m), z up. Robots start 
 `STEM.json` says what the numbers in its files mean and what is known of the terrain; `index.json` lists all terrains.
 The line of MuJoCo is tested, the others follow the sources of these programs.
 
+- **MuJoCo**: `python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file('STEM.xml')`,
+  `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`
+- **mjlab**: `SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach(
+  mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`
+- **Isaac Lab**: `import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or
+  `scripts/tools/convert_mesh.py` for a USD file
+- **Isaac Lab's and legged_gym's generators**: `convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, 0.001)`
+  (x along the rows); it cuts cells along the other diagonal, so that between the nodes the mesh is truer
+- **Gazebo**: `gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world
 """
-_PROGRAMS = (
-    ("MuJoCo", "xml", "`python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file("
-     "'STEM.xml')`, `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`"),
-    ("mjlab", "xml", "`SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach("
-     "mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`"),
-    ("Isaac Lab", "stl", "`import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or "
-     "`scripts/tools/convert_mesh.py` for a USD file"),
-    ("Isaac Lab's and legged_gym's generators", "npy", "`convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, "
-     "0.001)` (x along the rows); it cuts cells along the other diagonal, so between nodes the mesh is truer"),
-    ("Gazebo", "sdf", "`gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world"),
-)  # fmt: skip
-"""How programs take the files, and the format that it needs."""
-
-
-def readme_of(stem: str, formats: Sequence[str]) -> str:
-    """How other programs take the files of a terrain, a line each."""
-    lines = [f"- **{program}**: {words}\n" for program, ending, words in _PROGRAMS if ending in formats]
-    return (_README + "".join(lines)).replace("STEM", stem)
 
 
 def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwrite: bool = False) -> None:
@@ -193,11 +172,3 @@ def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
         **numbers(archive),
         "fresh": None if archive.fresh is None else numbers(archive.fresh),
     }
-
-
-def _refuse_to_replace(folder: Path, stems: set[str]) -> None:
-    written = (INDEX_FILE, README_FILE)
-    replaced = sorted(file.name for file in folder.glob("*") if file.name in written or file.stem in stems)
-    if replaced:
-        names = ", ".join(replaced[:3]) + ", ..." * (len(replaced) > 3)
-        raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")

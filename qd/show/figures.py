@@ -9,18 +9,23 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.faults import FRESH_EPISODES, fault_numbers, fresh_numbers
-from qd.groups import Mode
+from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, bar_lengths, new_figure
+from sim.ground import GroundMaps
+from sim.maps.picture import LENGTH, height_colors, tinted
 
 CURVES_FILE = "curves.png"
 ARCHIVE_FIGURE_FILE = "archive.png"
-SPREAD_FILE = "spread.png"
 
-_BLUE, _RED = "#0072b2", "#d55e00"  # apart for every kind of colour blindness
+_BLUE = "#0072b2"
+_SUN = (-0.45, 0.35)  # where the light of a relief comes from: how much slopes along x and y gain by it
+_MARK_M = 0.3  # half side of the marks of start and goal
+_START, _GOAL = (240, 200, 60), (0, 158, 115)
 
 
 class PenaltyLook(NamedTuple):
@@ -61,18 +66,26 @@ def label_of(penalty: str) -> str:
     return look_of(penalty).label.replace("-\n", "-").replace("\n", " ")
 
 
-def mode_words(mode: Mode) -> str:
-    """A failure mode in a few words: how its crossings end, and the penalty that stands out."""
-    return f"{mode.ending} · {label_of(mode.marked_by)}"
+def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
+    """A terrain of heights [m], shape (nrow, ncol), from above: blue below the start's level, brown above, lit.
+
+    The nodes may be several cells apart; only with all of them the ground can be tinted. The start is yellow and the
+    goal green. RGB, shape (nrow, ncol, 3), row along y.
+    """
+    spacing = LENGTH / (heights.shape[1] - 1)
+    rise_y, rise_x = (np.asarray(rise) for rise in np.gradient(heights, spacing))
+    light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
+    colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
+    pixels = np.clip(255.0 * colors * light[..., None], 0.0, 255.0).astype(np.uint8)
+    for (x, y), color in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
+        row, column, half = round(y / spacing), round(x / spacing), round(_MARK_M / spacing)
+        pixels[row - half : row + half + 1, column - half : column + half + 1] = color
+    return pixels
 
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:
-    """Draws the figures of a search: its curves, its archive on parallel axes, and the spread of its elites."""
-    figures = {
-        CURVES_FILE: draw_curves(archive, metrics),
-        ARCHIVE_FIGURE_FILE: draw_archive(archive),
-        SPREAD_FILE: draw_spread(archive),
-    }
+    """Draws the figures of a search: its curves, and its archive on parallel axes."""
+    figures = {CURVES_FILE: draw_curves(archive, metrics), ARCHIVE_FIGURE_FILE: draw_archive(archive)}
     for name, figure in figures.items():
         save_figure(folder / name, figure)
     return [folder / name for name in figures]
@@ -171,32 +184,6 @@ def spread(archive: Archive) -> np.ndarray:
     counts = np.zeros((len(archive.penalties), archive.intervals, 2), dtype=np.int64)
     np.add.at(counts, (np.arange(len(archive.penalties)), tuples, archive.collided[:, None].astype(int)), 1)
     return counts
-
-
-def draw_spread(archive: Archive) -> Figure:
-    """How the elites spread over the intervals of each ratio, with and without base collisions."""
-    counts = spread(archive)
-    figure = new_figure(1.9 * len(counts) + 0.8, 3.2)
-    collided = int(archive.collided.sum())
-    figure.suptitle(
-        f"{_title(archive)}: {collided:,} of {len(archive):,} elites had a base collision when they were found"
-    )
-    width, lows = 1.0 / archive.intervals, np.arange(archive.intervals) / archive.intervals
-    panels = figure.subplots(1, len(counts), sharey=True)
-    for axes, name, (without, collides) in zip(panels, archive.penalties, counts.swapaxes(1, 2), strict=True):
-        style = {"width": width, "align": "edge", "edgecolor": "white", "linewidth": 0.5}
-        axes.bar(lows, without, color=_BLUE, label="without base collision", **style)
-        axes.bar(lows, collides, bottom=without, color=_RED, label="with base collision", **style)
-        axes.set_xlim(0, 1)
-        axes.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
-        axes.set_xlabel(f"share of\n{look_of(name).label}")
-        axes.grid(axis="y", alpha=0.3)
-        axes.set_axisbelow(True)
-    panels[0].set_ylabel("elites")
-    panels[0].yaxis.get_major_locator().set_params(integer=True)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
-    return figure
 
 
 _CORRECTED = (

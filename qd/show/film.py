@@ -1,6 +1,7 @@
 """Films of crossings: ``faultline film --elite 0``, without a screen, with a GPU or without."""
 
 import io
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kernels.episode import Outcome
 from qd.judge import panel_of
 from qd.run.progress import share_bar
-from qd.show.crossed import crossed_of, ending_of, moment_of_failure, title_of, typical_episode, way_to_end
+from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode, way_to_end
 from qd.show.replay import RECORDING, Source, save
 from qd.workers.evaluator import check_policy
 from sim.crossing import CrossingCfg
@@ -69,8 +70,6 @@ class Shot:
     recording: Recording
     episode: int
     """Its index."""
-    scales: dict[str, float]
-    """What each penalty is divided by, so that they compare; those not named are not drawn."""
     title: str = ""
     beside: tuple[str, Recording] | None = None
     """Name of another controller, and what was recorded of it from the same starts; without it ghosts are others of
@@ -84,8 +83,8 @@ class Shot:
     @cached_property
     def moment(self) -> float | None:
         """When the robot fails [s]; None if it does not."""
-        arrives = self.recording.outcome[0, self.episode] == Outcome.GOAL
-        return None if arrives else moment_of_failure(self.recording, self.episode)
+        outcome = self.recording.outcome[0, self.episode]
+        return None if outcome == Outcome.GOAL else moment_of_failure(self.recording, self.episode)
 
     @property
     def ghosts(self) -> list[Ghost]:
@@ -114,8 +113,7 @@ class Shot:
         """Who else crosses, or how often this controller arrives."""
         if self.beside is not None:
             return f"{self.beside[0]} {title_of(self.beside[1]).partition(': ')[2]}"
-        arrived = crossed_of(self.recording, (), ()).rates[ending_of(Outcome.GOAL).words]
-        return f"reached the goal: {arrived}"
+        return f"reached the goal: {crossed_of(self.recording).rates[ARRIVED]}"
 
 
 def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
@@ -130,23 +128,27 @@ def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
 
 def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Camera]:
     """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it."""
-    recording, frames = shot.recording, round(shot.end / shot.recording.dt) + 1
-    base = recording.base_position[0, shot.episode, :frames].astype(np.float64)
+    recording = shot.recording
+    base = recording.base_position[0, shot.episode, : recording.num_frames[0, shot.episode]].astype(np.float64)
     width = max(1, round(_SMOOTH_S / recording.dt)) | 1
     padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
-    sums = np.cumsum(np.vstack([np.zeros(3), padded]), axis=0)
-    smooth = (sums[width:] - sums[:-width]) / width
-    targets = np.stack([np.interp(times, recording.dt * np.arange(frames), axis) for axis in smooth.T], axis=1)
+    smooth = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in padded.T]
+    targets = np.stack([np.interp(times, recording.times_s[: len(base)], axis) for axis in smooth], axis=1)
+    elevation = clear_elevation(recording.heights[0], targets, distance)
+    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+
+
+def clear_elevation(heights: NDArray[np.floating], targets: NDArray[np.floating], distance: float) -> float:
+    """The lowest elevation of a camera [deg] from which the ground never hides targets, shape (N, 3)."""
     along = np.linspace(0.1, 1.0, 19)[:, None]
     for elevation in _ELEVATIONS:
-        camera = Camera(target=(0.0, 0.0, 0.0), distance=distance, elevation=elevation)
-        azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(elevation)
+        azimuth, tilt = np.deg2rad(Camera.azimuth), np.deg2rad(elevation)
         back = -distance * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
         sight = targets[:, None] + along * back
-        ground = surface_heights(recording.heights[0].astype(np.float64), sight[..., 0], sight[..., 1])
-        if (sight[..., 2] > ground + _CLEARANCE).all() or elevation == _ELEVATIONS[-1]:
-            break
-    return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
+        ground = surface_heights(heights.astype(np.float64), sight[..., 0], sight[..., 1])
+        if (sight[..., 2] > ground + _CLEARANCE).all():
+            return elevation
+    return _ELEVATIONS[-1]
 
 
 def pictures_of(
@@ -229,7 +231,7 @@ def film(
     robot: RobotCfg,
     scales: dict[str, float],
     out: Path,
-    cfg: FilmCfg | None = None,
+    cfg: FilmCfg,
     *,
     by: str = "",
     beside: tuple[str, Recording] | None = None,
@@ -238,60 +240,52 @@ def film(
     """Films an episode of a recording of one terrain.
 
     Args:
-        recording: Of the terrain.
-        robot: Its robot.
-        scales: What each penalty is divided by.
+        recording: The crossings.
+        robot: The robot.
+        scales: What each penalty is divided by, to find the typical episode.
         out: The file.
         cfg: What to show.
         by: Name of the controller, where it is not the robot's own.
         beside: Name and recording of another controller from the same starts, to be shown beside it.
         progress: Called with the share that is done.
     """
-    cfg, replicas = cfg or FilmCfg(), recording.replicas.tolist()
+    replicas = recording.replicas.tolist()
     if cfg.episode is not None and cfg.episode not in replicas:
         raise ValueError(f"episode {cfg.episode} was not recorded, expected one of {', '.join(map(str, replicas))}")
     episode = typical_episode(recording, scales) if cfg.episode is None else replicas.index(cfg.episode)
-    title = title_of(recording, by)
-    shot = Shot(recording=recording, episode=episode, scales=scales, title=title, beside=beside)
-    times = shot.times(GIF_FPS if cfg.gif else FPS, whole=cfg.whole)
-    pictures = pictures_of(shot, robot, times, GIF_SIZE if cfg.gif else SIZE, shadows=cfg.shadows, progress=progress)
-    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures), "Film")
+    shot = Shot(recording=recording, episode=episode, title=title_of(recording, by), beside=beside)
+    fps, size = (GIF_FPS, GIF_SIZE) if cfg.gif else (FPS, SIZE)
+    times = shot.times(fps, whole=cfg.whole)
+    pictures = pictures_of(shot, robot, times, size, shadows=cfg.shadows, progress=progress)
+    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures, size, FPS), "Film")
 
 
-def as_mp4(pictures: Iterable[Picture], fps: int = FPS) -> bytes:
-    """Pictures of one shape with even sides as an MP4 (H.264) that plays everywhere."""
+def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> bytes:
+    """Pictures whose sides, width and height [pixels], are even as an MP4 (H.264) that plays everywhere."""
+    how: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with tempfile.TemporaryDirectory() as folder:
-        draft, writer = Path(folder) / "film.mp4", None
+        draft = Path(folder) / "film.mp4"
+        writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **how)
+        writer.send(None)
         try:
             for picture in pictures:
-                if writer is None:
-                    size = (picture.shape[1], picture.shape[0])
-                    how: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-                    writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **how)
-                    writer.send(None)
                 writer.send(np.ascontiguousarray(picture))
         finally:
-            if writer is not None:
-                writer.close()
+            writer.close()
         return draft.read_bytes()
 
 
 def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
     """Pictures of one shape as a GIF that repeats, with as many colours, and then pictures, as its size allows."""
-    for step in (1, 2, 4):
-        images = [Image.fromarray(picture) for picture in pictures[::step]]
-        sample = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)]))
-        for colors in _COLORS:
-            palette = sample.quantize(colors, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-            first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-            content = io.BytesIO()
-            duration = round(1000 * step / GIF_FPS)
-            first.save(content, "GIF", save_all=True, append_images=others, duration=duration, loop=0, optimize=False)
-            if content.tell() <= most_bytes:
-                return content.getvalue()
-    raise ValueError(
-        f"a GIF must have at most {most_bytes} bytes, got more of {len(pictures)} pictures: film it as MP4"
-    )
+    sample = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)]))
+    for step, colors in itertools.product((1, 2, 4), _COLORS):
+        palette, content = sample.quantize(colors, Image.Quantize.FASTOCTREE), io.BytesIO()
+        images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+        kept: dict[str, Any] = {"append_images": images[step::step], "duration": round(1000 * step / GIF_FPS)}
+        images[0].save(content, "GIF", save_all=True, loop=0, optimize=False, **kept)
+        if content.tell() <= most_bytes:
+            return content.getvalue()
+    raise ValueError(f"{len(pictures)} pictures must fit into a GIF of {most_bytes} bytes, got more: write an MP4")
 
 
 def film_source(
@@ -299,32 +293,26 @@ def film_source(
 ) -> list[Path]:
     """Films of terrains, each with its recording beside it; all is crossed and stored before the first is made.
 
-    Args:
-        source: The terrains.
-        cfg: What to show.
-        beside: Another controller to show as a ghost: a name of the run's certifiers or of the panel, or a file.
-        device: Where to cross.
-        out: File, or of several terrains a folder.
+    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file.
     """
+    robot, run = source.robot, source.opened_run
     files = source.files(".gif" if cfg.gif else ".mp4", out)
-    replicas = [crossing.replicas for crossing in source.wanted[:1]]
-    if cfg.episode is not None and replicas and cfg.episode >= replicas[0]:
-        raise ValueError(f"episode must be one of 0..{replicas[0] - 1}, got {cfg.episode}")
+    replicas = {crossing.replicas for crossing in source.wanted}
+    if cfg.episode is not None and replicas and cfg.episode >= min(replicas):
+        raise ValueError(f"episode must be one of 0..{min(replicas) - 1}, got {cfg.episode}")
     if beside is not None and source.recorded:
         raise ValueError(f"beside {beside} needs crossings from the same starts: film the elite or the map instead")
     open_context(64, 64).free()
-    certifiers = {**panel_of(source.robot), **(source.opened_run.certifiers() if source.opened_run else {})}
-    policy = None if beside is None else certifiers.get(beside, spec_of(beside, source.robot))
-    if policy is not None:
-        check_policy(policy, source.robot, device)
+    others: list[tuple[str, Recording] | None] = [None] * len(files)
+    if beside is not None:
+        policy = {**panel_of(robot), **(run.certifiers() if run else {})}.get(beside, spec_of(beside, robot))
+        check_policy(policy, robot, device)
     recordings = source.record(device)
-    others = [None] * len(files) if policy is None else source.record(device, policy)
-    if not source.recorded:
-        for recording, file in zip(recordings, files, strict=True):
-            write_recording(file.with_name(file.stem + RECORDING), recording)
-    scales = dict(zip(source.fitness.penalties, source.fitness.scales, strict=True))
+    if beside is not None:
+        others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]
+    for recording, file in zip([] if source.recorded else recordings, files, strict=False):
+        write_recording(file.with_name(file.stem + RECORDING), recording)
     for recording, other, file in zip(recordings, others, files, strict=True):
-        ghost = None if other is None else (label_suffix(str(beside))[1:], other)
         with share_bar(f"filming {recording.labels[0]}") as progress:
-            film(recording, source.robot, scales, file, cfg, by=source.by, beside=ghost, progress=progress)
+            film(recording, robot, source.scales, file, cfg, by=source.by, beside=other, progress=progress)
     return files

@@ -45,7 +45,7 @@ class Wanted:
     """Genes, shape (num_genes,), or heights [m], shape (nrow, ncol)."""
     policy: str
     """The controller."""
-    replicas: int
+    replicas: int = 20
     """Episodes."""
     seed: int = 0
     """What ``terrain_seed`` was drawn with, for the record."""
@@ -66,41 +66,29 @@ def on_elite(
     archive: Archive,
     number: int,
     *,
-    policy: str,
-    replicas: int,
-    seed: int = 0,
     label: str | None = None,
     minimal: NDArray[np.float32] | None = None,
+    seed: int = 0,
+    **crossing: Any,
 ) -> Wanted:
-    """The crossings of an elite that ``faultline replay`` shows.
+    """The crossings of an elite that ``faultline replay`` shows, by a ``policy`` in ``replicas`` episodes.
 
     With ``minimal``, the genes of its minimal terrain, they are of that, from the same starts.
     """
     return Wanted(
         label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
         terrain=archive.genes[number] if minimal is None else minimal,
-        policy=policy,
-        replicas=replicas,
         seed=seed,
         terrain_seed=int(episode_seeds(seed, number, 1, stream=_STREAM)[0]),
         space=get_space(archive.space, archive.space_sha256).name,
+        **crossing,
     )
 
 
-def on_heights(
-    heights: NDArray[np.float32],
-    *,
-    label: str,
-    policy: str,
-    replicas: int,
-    seed: int,
-    ground: GroundMaps | None = None,
-) -> Wanted:
-    """Crossings of a user's own terrain, with its ground; arguments as of :func:`on_elite`."""
-    return Wanted(
-        label=label, terrain=heights, policy=policy, replicas=replicas, seed=seed, ground=ground,
-        terrain_seed=int(episode_seeds(seed, 0, 1, stream=_OWN_STREAM)[0]),
-    )  # fmt: skip
+def on_heights(heights: NDArray[np.float32], *, seed: int = 0, **crossing: Any) -> Wanted:
+    """Crossings of a user's own terrain; further arguments as of :class:`Wanted`."""
+    terrain_seed = int(episode_seeds(seed, 0, 1, stream=_OWN_STREAM)[0])
+    return Wanted(terrain=heights, seed=seed, terrain_seed=terrain_seed, **crossing)
 
 
 Cross = Callable[[Sequence[Wanted], Callable[[float], None]], list[Recording]]
@@ -152,16 +140,10 @@ class Recordings:
         self._cache = Cache(folder)
         self._at_once = AT_ONCE if on_gpu else 1
         self._cross = cross or Simulation(robot, device)
-        self._last: tuple[str, Recording] | None = None
 
     def read(self, wanted: Wanted) -> Recording | None:
-        """The recording of some crossings; None if there is none, or it is damaged.
-
-        Of a controller whose code has no file only the last recording is found.
-        """
+        """The recording of some crossings; None if there is none, or it is damaged."""
         key = self._key(wanted)
-        if controller_hash(wanted.policy) is None:
-            return self._last[1] if self._last is not None and self._last[0] == key else None
         try:
             recording = read_recording(self._cache.file(key))
         except (OSError, ValueError):
@@ -170,15 +152,12 @@ class Recordings:
         return replace(recording, labels=(wanted.label,))
 
     def may_keep(self, wanted: Wanted) -> bool:
-        """Whether a recording of these crossings would be found again, and there is none yet."""
-        return controller_hash(wanted.policy) is not None and not self._cache.file(self._key(wanted)).exists()
+        """Whether no recording of these crossings is stored yet."""
+        return not self._cache.file(self._key(wanted)).exists()
 
     def keep(self, wanted: Wanted, recording: Recording) -> None:
         """Stores a recording; prints a warning if it cannot be written."""
         key = self._key(wanted)
-        self._last = (key, recording)
-        if controller_hash(wanted.policy) is None:
-            return
         try:
             self._cache.folder.mkdir(parents=True, exist_ok=True)
             write_recording(self._cache.file(key), recording)
@@ -190,20 +169,21 @@ class Recordings:
         """Recordings of all that is wanted, in its order; what is missing is crossed and stored, batch by batch."""
         recordings = {k: recording for k, crossing in enumerate(wanted) if (recording := self.read(crossing))}
         missing = [k for k in range(len(wanted)) if k not in recordings]
-        if missing:
-            words = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {wanted[missing[0]].replicas} times each"
-            with share_bar(f"crossing {words}") as progress:
-                done = 0
-                for batch in self._batches(wanted, missing):
+        if not missing:
+            return [*recordings.values()]
+        words = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {wanted[missing[0]].replicas} times each"
+        done = 0
+        with share_bar(f"crossing {words}") as progress:
+            for batch in self._batches(wanted, missing):
 
-                    def report(share: float, done: int = done, size: int = len(batch)) -> None:
-                        progress((done + share * size) / len(missing))
+                def report(share: float, done: int = done, size: int = len(batch)) -> None:
+                    progress((done + share * size) / len(missing))
 
-                    for k, recording in zip(batch, self._cross([wanted[k] for k in batch], report), strict=True):
-                        self.keep(wanted[k], recording)
-                        recordings[k] = recording
-                    done += len(batch)
-                    progress(done / len(missing))
+                for k, recording in zip(batch, self._cross([wanted[k] for k in batch], report), strict=True):
+                    self.keep(wanted[k], recording)
+                    recordings[k] = recording
+                done += len(batch)
+                report(1.0)
         return [recordings[k] for k in range(len(wanted))]
 
     def _batches(self, wanted: Sequence[Wanted], missing: Sequence[int]) -> Iterator[list[int]]:

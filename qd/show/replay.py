@@ -60,6 +60,11 @@ class Source:
     terrains: Sequence[Terrain] = ()
     """The elites."""
 
+    @property
+    def scales(self) -> dict[str, float]:
+        """What each penalty is divided by."""
+        return dict(zip(self.fitness.penalties, self.fitness.scales, strict=True))
+
     def record(self, device: str, policy: str | None = None) -> list[Recording]:
         """The recording of each terrain, by another controller if one is named; what is not stored is crossed."""
         wanted = [replace(crossing, policy=policy or crossing.policy) for crossing in self.wanted]
@@ -80,35 +85,26 @@ class Source:
 
 
 def source_of_run(
-    opened_run: OpenedRun,
-    elite: str = "0",
-    minimal: str | None = None,
-    *,
-    policy: str | None = None,
-    replicas: int = 20,
-    seed: int = 0,
+    opened_run: OpenedRun, elite: str = "0", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
 ) -> Source:
-    """Elites of a run or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
+    """Elites of a run or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
+
+    ``crossing`` may have ``replicas`` and ``seed``.
+    """
     controller, terrains = opened_run.policy(policy), opened_run.terrains(elite, minimal)
-    suffix = opened_run.suffix(controller)
-    _, fitness = opened_run.as_searched()
+    suffix, path = opened_run.suffix(controller), opened_run.path
+    about = [(terrain, {"label": terrain.label, "minimal": terrain.genes if minimal else None}) for terrain in terrains]
     return Source(
         robot=opened_run.robot,
-        fitness=fitness,
-        folder=folder_for(opened_run.path, opened_run.robot.name),
+        fitness=opened_run.as_searched()[1],
+        folder=folder_for(path, opened_run.robot.name),
         stems=[f"{terrain.stem}{suffix}" for terrain in terrains],
         by=suffix[1:],
-        about=[{"run": str(opened_run.path), "elite": t.number, "minimal": t.minimal} for t in terrains],
-        wanted=[
-            on_elite(
-                opened_run.archive, terrain.number, policy=controller, replicas=replicas, seed=seed,
-                label=terrain.label, minimal=terrain.genes if terrain.minimal else None,
-            )
-            for terrain in terrains
-        ],
+        about=[{"run": str(path), "elite": terrain.number, "minimal": terrain.minimal} for terrain in terrains],
+        wanted=[on_elite(opened_run.archive, t.number, policy=controller, **how, **crossing) for t, how in about],
         opened_run=opened_run,
         terrains=terrains,
-    )  # fmt: skip
+    )
 
 
 def source_of_map(
@@ -119,28 +115,31 @@ def source_of_map(
     scale_m: float | None = None,
     offset_m: float | None = None,
     policy: str | None = None,
-    replicas: int = 20,
-    seed: int = 0,
+    **crossing: Any,
 ) -> Source:
-    """A height map of one's own; arguments as of :func:`sim.maps.heightmap.read_heightmap`."""
+    """A height map of one's own, as :func:`sim.maps.heightmap.read_heightmap` takes it; ``crossing`` as of a run."""
     heightmap = read_heightmap(file, size_m=size_m, scale_m=scale_m, offset_m=offset_m)
     print(f"{file}: {fitted(heightmap)}", flush=True)
     heights, controller = as_terrain(heightmap), policy or str(robot.policy_file)
     path, here = file.resolve(), Path.cwd()  # its path from here: two maps of one name have files of their own
     name = "-".join(path.relative_to(here if path.is_relative_to(here) else path.anchor).parts)[-_LONGEST_NAME:]
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    about = {
+        "terrain": str(file),
+        "terrain_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "map": fitted(heightmap),
+        "heights_m": [float(heights.min()), float(heights.max())],
+    }
+    how: dict[str, Any] = {"label": file.name, "policy": controller, "ground": heightmap.ground}
     return Source(
         robot=robot,
         fitness=fitness_of(robot, policy),
         folder=OWN_FOLDER,
         stems=[f"{name}-{crosser_name(robot, controller)}"],
-        about=[{"terrain": str(file), "terrain_sha256": digest, "map": fitted(heightmap),
-                "heights_m": [float(heights.min()), float(heights.max())]}],
-        wanted=[on_heights(heights, label=file.name, policy=controller, replicas=replicas, seed=seed,
-                           ground=heightmap.ground)],
+        by=crosser_name(robot, controller).removeprefix(robot.name)[1:],
+        about=[about],
+        wanted=[on_heights(heights, **how, **crossing)],
         inputs=(file, file.with_suffix(".json")),
-        by="" if (crosser := crosser_name(robot, controller)) == robot.name else crosser.removeprefix(f"{robot.name}-"),
-    )  # fmt: skip
+    )
 
 
 def source_of_recording(file: Path, robot: str | None = None, policy: str | None = None) -> Source:
@@ -181,7 +180,7 @@ def replay(source: Source, *, device: str = "cpu", out: Path | None = None) -> l
         reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(crossed)})
         print(describe(source, k, recording))
         save(figure.with_suffix(".json"), to_json(reports[-1]), "Numbers")
-        save(figure, as_png(draw_crossing(crossed, source.fitness.penalties, title_of(recording, source.by))), "Figure")
+        save(figure, as_png(draw_crossing(crossed, title_of(recording, source.by))), "Figure")
     return reports
 
 

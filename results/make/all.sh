@@ -40,4 +40,5 @@ for robot in "${robots[@]}"; do
   make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
 done
 "$python" -m tests.bench                                              # 3 min
+"$python" -m results.make.pictures                                    # some minutes, a browser
 "$python" -m results.make.docs

@@ -76,7 +76,7 @@ def archives() -> str:
     columns = {
         "episodes": "episodes",
         "*elites*: terrains, each the hardest of its kind": "elites",
-        "... that fresh episodes put into the same cell or its neighbour": "elites_reproduced",
+        "*corrected elites*: cells that fresh episodes alone would fill": "corrected_elites",
         "*failing*: under half of the robots cross it in fresh episodes": "failing",
         "*confirmed*: failing, also with finer physics": "confirmed",
         "*faults*: confirmed, and another controller crosses it": "faults",
@@ -89,7 +89,7 @@ def archives() -> str:
 
 def archive_details() -> str:
     """What else the published archives say."""
-    names = ("iterations", "invalid_episodes", "corrected_elites", "families", "fault_families", "with_collision",
+    names = ("iterations", "invalid_episodes", "elites_reproduced", "families", "fault_families", "with_collision",
              "without_collision", "qd_score", "corrected_qd_score", "certified")  # fmt: skip
     columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
     columns["share of the reachable cells"] = shown("reachable_coverage", ".1%")
@@ -155,7 +155,8 @@ def hardening() -> str:
             for one in numbers.get("rounds", ()):
                 goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
                 rows[f"{words}, seed {seed}: {one['controller']}"] = {**one, **goal}
-    columns: dict[str, Column] = {name: name for name in ("elites", "failing", "faults", "faults_panel")}
+    counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel")
+    columns: dict[str, Column] = {name.replace("_", " "): name for name in counts}
     sets = {"hand_crafted": "hand-crafted", "hard_random": "hard-random", "search-0": "first archive"}
     columns |= {f"goal, {words}": shown(name, ".3f") for name, words in sets.items()}
     return table(rows, columns)
@@ -165,7 +166,8 @@ def spaces() -> str:
     """Searches in different terrain spaces."""
     rows = {f"{words}, {one['space']}": one for words, numbers in of_robots("results/{}/spaces.json").items()
             for one in numbers["spaces"].values()}  # fmt: skip
-    return table(rows, {name: name for name in ("episodes", "elites", "failing", "confirmed", "certified", "faults")})
+    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "certified", "faults")
+    return table(rows, {name.replace("_", " "): name for name in names})
 
 
 def sizes() -> str:
@@ -211,12 +213,9 @@ def packs() -> str:
     return table({name: name for name in files["ANYmal C"]["rates"]}, columns)
 
 
-ROBOT_TABLES = (goals, collisions, methods)
-TABLES: dict[str, Callable[..., str]] = {
-    make.__name__: make
-    for make in (archives, archive_details, training, beside_paper, hardening, spaces, sizes, agreement, minimal,
-                 packs, *ROBOT_TABLES)
-}  # fmt: skip
+TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
+    archives, archive_details, training, goals, collisions, beside_paper, methods, hardening, spaces, sizes, agreement,
+    minimal, packs)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:

@@ -26,11 +26,8 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     source = source_of_map(FOLDER / file, robot)
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", panel_of(robot)[beside])[0]) if beside else None
-    scales = dict(zip(source.fitness.penalties, source.fitness.scales, strict=True))
-    shot = Shot(
-        recording=recording, episode=typical_episode(recording, scales), scales=scales, beside=other,
-        title=title_of(replace(recording, labels=(words,))),
-    )  # fmt: skip
+    episode, title = typical_episode(recording, source.scales), title_of(replace(recording, labels=(words,)))
+    shot = Shot(recording=recording, episode=episode, title=title, beside=other)
     return [*pictures_of(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from qd.archive import Archive
-from qd.groups import elites_of, failure_modes
+from qd.groups import rank
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.search import search
@@ -19,20 +19,10 @@ COUNTS = (
 )  # fmt: skip
 
 
-def modes_of(archive: Archive) -> list[dict[str, Any]]:
-    """How many elites fail in which way, with the most typical terrain in words."""
-    space = get_space(archive.space, archive.space_sha256)
-    return [
-        {
-            "ending": mode.ending,
-            "marked_by": mode.marked_by,
-            "elites": len(mode.members),
-            "goal_rate": mode.goal_rate,
-            "typical": mode.typical,
-            "terrain": space.describe(archive.genes[mode.typical]),
-        }
-        for mode in failure_modes(elites_of(archive)).modes
-    ]
+def causes_of(archive: Archive) -> dict[str, int]:
+    """How many elites fail by which cause, the commonest first."""
+    ranking = rank(archive, get_space(archive.space, archive.space_sha256))
+    return {cause: len(rows) for cause, rows in ranking.by_cause().items()}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -45,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         archive = judge(run, stages=("fresh",) if script.small else ("fresh", "resolved", "others"),
                         compute=script.compute)  # fmt: skip
         summary = RunDirectory(run).read_summary()
-        numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "modes": modes_of(archive)}
+        numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
     dose = script.out.with_name("dose.json")
     rows = json.loads(dose.read_text())["dose"] if dose.exists() else None
     return script.write({"spaces": numbers, "dose": rows})

@@ -19,25 +19,24 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def as_png(figure: Figure) -> bytes:
-    """A figure as PNG, as fine as print needs; names in it are shown as they are, whatever signs they hold."""
+def as_image(figure: Figure) -> Image.Image:
+    """A figure drawn as fine as print needs; names in it are shown as they are, whatever signs they hold."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
         text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
-    return _png_of(figure)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=_DPI, pil_kwargs={"compress_level": 1})
+    return Image.open(content).convert("RGB")
 
 
-def _png_of(figure: Figure) -> bytes:
-    """The PNG with 256 colours, a quarter of the size, where 256 are enough: not for a coloured map."""
-    whole, few = io.BytesIO(), io.BytesIO()
-    figure.savefig(whole, format="png", dpi=_DPI)
-    image = Image.open(whole).convert("RGB")
-    if figure.findobj(AxesImage) and image.getcolors(_SHADES) is None:
-        return whole.getvalue()
-    small = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    small.save(few, "PNG", optimize=True, dpi=(_DPI, _DPI))
-    return few.getvalue()
+def as_png(figure: Figure) -> bytes:
+    """A figure as PNG, with 256 colours, a quarter of the size, where 256 are enough: not for a coloured map."""
+    image, content = as_image(figure), io.BytesIO()
+    if not figure.findobj(AxesImage) or image.getcolors(_SHADES) is not None:
+        image = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
+    image.save(content, "PNG", optimize=True, dpi=(_DPI, _DPI))
+    return content.getvalue()
 
 
 def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) -> NDArray[np.float64]:

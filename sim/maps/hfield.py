@@ -1,4 +1,4 @@
-"""A height grid as a heightfield of MuJoCo's, with the same surface.
+"""A height grid as triangles, and as a heightfield of MuJoCo's with the same surface.
 
 MuJoCo cuts every cell of a heightfield from its (low x, low y) to its (high x, high y) corner, for contacts as for
 rays; ours are cut from (low x, high y) to (high x, low y) (:mod:`kernels.heightfield`). On a grid that is turned by a
@@ -54,3 +54,18 @@ def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thick
         size=(half_y, half_x, extent, thickness),
         position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
     )
+
+
+def surface_of(heights: NDArray[np.floating], margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The ground that robots walk on: vertices [m], row by row, and two triangles a cell, cut as the physics cuts it.
+
+    Heights [m] have shape (nrow, ncol), node (0, 0) at x = y = 0; ``margin`` more nodes continue each edge.
+    """
+    grid = np.pad(heights, margin, mode="edge")
+    nrow, ncol = grid.shape
+    y, x = (SPACING * (np.arange(count) - margin) for count in grid.shape)
+    vertices = np.stack([*np.meshgrid(x, y), grid], axis=-1).reshape(-1, 3)
+    low = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
+    # Each cell is cut from its (low x, high y) to its (high x, low y) corner.
+    faces = np.stack([low, low + 1, low + ncol, low + 1, low + ncol + 1, low + ncol], axis=1)
+    return vertices.astype(np.float64), faces.reshape(-1, 3)

@@ -21,10 +21,8 @@ from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
-from sim.maps.hfield import LEAST_EXTENT, as_hfield
+from sim.maps.hfield import LEAST_EXTENT, as_hfield, surface_of
 from sim.terrain import SPACING
-
-Heights = NDArray[np.floating]
 
 STEP_M = 1e-3
 """Height of one step of an npy's whole numbers [m], one for all terrains, as a terrain generator takes it."""
@@ -43,7 +41,7 @@ _SIX_LINES = """<?xml version="1.0"?>
 class ExportedTerrain:
     """A terrain, and what some of its files say beside its heights."""
 
-    heights: Heights
+    heights: NDArray[np.floating]
     """[m], shape (nrow, ncol)."""
     name: str = "terrain"
     """Stem of its files."""
@@ -139,17 +137,10 @@ def _words(numbers: Sequence[float]) -> str:
     return " ".join(map(repr, numbers))
 
 
-def block_of(heights: Heights) -> trimesh.Trimesh:
-    """A closed block [m] with the terrain as its top.
-
-    The top's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is.
-    """
-    rows, columns = heights.shape
-    y, x = np.meshgrid(SPACING * np.arange(rows), SPACING * np.arange(columns), indexing="ij")
-    top = np.stack([x, y, np.asarray(heights, dtype=np.float64)], axis=-1).reshape(-1, 3)
-    node = np.arange(len(top)).reshape(rows, columns)
-    low, along_x, along_y, high = node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]
-    surface = np.stack([low, along_x, along_y, high, along_y, along_x], axis=2).reshape(-1, 3)
+def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
+    """A closed block [m]; the terrain's triangles come first, 2 a cell, cut as :mod:`kernels.heightfield` is."""
+    top, surface = surface_of(heights)
+    node = np.arange(len(top)).reshape(heights.shape)
     # Once round the rim, the terrain on the left; below it the bottom's rim, and fans to the middle of the bottom.
     rim = np.concatenate([node[0, :-1], node[:-1, -1], node[-1, :0:-1], node[:0:-1, 0]])
     below = top[rim] * [1.0, 1.0, 0.0] + [0.0, 0.0, top[:, 2].min() - _BASE_BELOW]
@@ -203,13 +194,15 @@ def write_terrain(
         about: Further keys of the JSON.
     """
     check_formats(formats)
+    if terrain.ground is not None and "npz" not in formats:
+        raise ValueError(f"formats must have npz, which alone holds friction and softness, got {', '.join(formats)}")
     scale, offset = terrain.gray_scale
     meaning = {
         "size_m": list(terrain.size),
         "nodes": list(terrain.heights.shape),
         "start": terrain.on_ground(*CrossingCfg.start),
         "goal": terrain.on_ground(*CrossingCfg.goal),
-        "axes": "rows along y, columns along x; the top row of a PNG is the highest y; an npy is [x, y]",
+        "axes": "rows along y, columns along x; of an npy x along the rows; the top row of a PNG is the highest y",
         "scale_m": scale,
         "offset_m": offset,
         "png_height": "offset_m + scale_m * gray level",

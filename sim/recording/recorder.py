@@ -100,11 +100,6 @@ class Recording:
         return len(self.replicas)
 
     @property
-    def times_s(self) -> NDArray[np.float64]:
-        """Time of each frame since the start [s], shape (F,)."""
-        return self.dt * np.arange(self.base_position.shape[2])
-
-    @property
     def ground(self) -> GroundMaps | None:
         """Friction and softness of the terrains."""
         if self.friction is None or self.time_constant_s is None:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_EPISODE, TOUCH, Color, scene_model
 from sim.robots.robot import RobotCfg
@@ -21,7 +20,7 @@ from sim.robots.skeleton import touches_of
 
 _mj: Any = mujoco  # its types are not written down
 
-_MAX_GEOMS = 4000
+_MAX_GEOMS = 20_000
 _GHOST_OPACITY = 0.4
 _NAME_HEIGHT = 0.55  # over the base, in standing heights of the robot
 _LEAST_LETTERS = 14  # [pixels]
@@ -85,21 +84,18 @@ class Renderer:
         width: int = 1280,
         height: int = 480,
         shadows: bool = True,
-        cfg: CrossingCfg | None = None,
         ground: GroundMaps | None = None,
     ) -> None:
         """Build the scene of a height grid [m], shape (nrow, ncol), and open OpenGL for images of this size [pixels].
 
-        Shadows take as long as all the rest in software. The crossing is for its goal.
+        Shadows take as long as all the rest in software.
         """
-        self.model = scene_model(robot, heights, width=width, height=height, cfg=cfg, ground=ground)
+        self.model = scene_model(robot, heights, width=width, height=height, ground=ground)
         self._context = open_context(width, height)
         self._robot = robot
-        kind = _mj.mjtObj.mjOBJ_GEOM.value
-        geoms = {name: _mj.mj_name2id(self.model, kind, name) for name in robot.geom_names}
-        self._feet = [geoms[name] for name in robot.foot_geoms]
-        self._touches, self._first_foot = touches_of(self.model, robot), len(geoms) - len(robot.foot_geoms)
-        self._ground = _mj.mj_name2id(self.model, kind, GROUND)
+        self._feet = [self.model.geom(name).id for name in robot.foot_geoms]
+        self._first_foot = len(robot.geom_names) - len(robot.foot_geoms)
+        self._touches, self._ground = touches_of(self.model, robot), self.model.geom(GROUND).id
         self._data = [_mj.MjData(self.model)]
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
@@ -125,7 +121,7 @@ class Renderer:
         qpos: NDArray[np.floating],
         camera: Camera,
         *,
-        ghosts: Sequence[Ghost | tuple[NDArray[np.floating], Color]] = (),
+        ghosts: Sequence[Ghost] = (),
         touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
         paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float, float]]] = (),
@@ -135,7 +131,7 @@ class Renderer:
         Args:
             qpos: MuJoCo's joint coordinates, shape (7 + num_joints,).
             camera: Where from.
-            ghosts: Other robots: :class:`Ghost`, or its first fields.
+            ghosts: Other robots.
             touching: Whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do are
                 yellow, base and limbs magenta.
             foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
@@ -153,18 +149,16 @@ class Renderer:
         everything = _mj.mjtCatBit.mjCAT_ALL.value
         _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
-        others = [ghost if isinstance(ghost, Ghost) else Ghost(*ghost) for ghost in ghosts]
-        for number, ghost in enumerate(others, 1):
+        for number, ghost in enumerate(ghosts, 1):
             self._add_ghost(number, ghost)
         if foot_force is not None:
-            for index, force in zip(self._feet, foot_force, strict=True):
-                if index >= 0:
-                    self._add_arrow(data.geom_xpos[index], np.asarray(force, dtype=np.float64))
+            for place, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
+                self._add_arrow(place, force)
         for points, color in paths:
             self._add_path(points, np.array(color, np.float32))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
-        return self._named(self._image[::-1], others)  # OpenGL's lowest row is first
+        return self._named(self._image[::-1], ghosts)  # OpenGL's lowest row is first
 
     def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
         while len(self._data) <= number:
@@ -228,14 +222,7 @@ class Renderer:
         self._add_connector(_mj.mjtGeom.mjGEOM_ARROW.value, _ARROW_WIDTH, foot, tip, color)
 
     def _add_connector(self, kind: int, width: float, begin: Any, end: Any, color: NDArray[np.float32]) -> None:
-        if (geom := self._add_geom(kind, np.zeros(3), color)) is not None:
-            _mj.mjv_connector(geom, kind, width, begin, end)
-
-    def _add_geom(self, kind: int, place: NDArray[np.float64], color: NDArray[np.float32]) -> Any:
-        """A new geom of the picture; None if there are too many."""
-        if self._scene.ngeom >= self._scene.maxgeom:
-            return None
         geom = self._scene.geoms[self._scene.ngeom]
-        _mj.mjv_initGeom(geom, kind, np.zeros(3), place, np.eye(3).ravel(), color)
+        _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+        _mj.mjv_connector(geom, kind, width, begin, end)
         self._scene.ngeom += 1
-        return geom

@@ -12,6 +12,7 @@ from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
+from sim.maps.hfield import surface_of
 from sim.maps.picture import height_colors, tinted
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, robot_spec
@@ -60,19 +61,18 @@ def scene_model(
     *,
     width: int,
     height: int,
-    cfg: CrossingCfg | None = None,
     ground: GroundMaps | None = None,
 ) -> Any:
     """The model of a scene: the robot's file and its height grid [m], shape (nrow, ncol), in world-local coordinates.
 
-    Images are at most of that width and height [pixels]; the crossing is for its goal.
+    Images are at most of that width and height [pixels].
     """
     spec = robot_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
-    _add_goal(spec, heights, cfg or CrossingCfg())
+    _add_goal(spec, heights)
     _add_light(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     model = robot_model(spec, robot)
@@ -80,21 +80,6 @@ def scene_model(
     first = int(model.texture(GROUND).adr[0])
     model.tex_data[first : first + paint.size] = paint.ravel()
     return model
-
-
-def surface_of(heights: NDArray[np.floating], margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The ground that robots walk on: vertices [m], row by row, and two triangles a cell, cut as the physics cuts it.
-
-    Heights [m] have shape (nrow, ncol), node (0, 0) at x = y = 0; ``margin`` more nodes continue each edge.
-    """
-    grid = np.pad(heights, margin, mode="edge")
-    nrow, ncol = grid.shape
-    y, x = (SPACING * (np.arange(count) - margin) for count in grid.shape)
-    vertices = np.stack([*np.meshgrid(x, y), grid], axis=-1).reshape(-1, 3)
-    low = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
-    # Each cell is cut from its (low x, high y) to its (high x, low y) corner.
-    faces = np.stack([low, low + 1, low + ncol, low + 1, low + ncol + 1, low + ncol], axis=1)
-    return vertices.astype(np.float64), faces.reshape(-1, 3)
 
 
 def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]) -> None:
@@ -116,15 +101,15 @@ def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]
     spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
 
 
-def _add_goal(spec: Any, heights: NDArray[np.floating], cfg: CrossingCfg) -> None:
+def _add_goal(spec: Any, heights: NDArray[np.floating]) -> None:
     """A post at the goal, and the rim of the circle that counts as reaching it."""
-    x, y = cfg.goal
+    x, y = CrossingCfg.goal
     ground = float(heights[round(y / SPACING), round(x / SPACING)])
     green = [0.0, 0.62, 0.45, 1.0]
     post = {"type": _mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
     spec.worldbody.add_geom(pos=[x, y, ground + 0.5], size=[0.02, 0.5, 0.0], rgba=green, **post)
     disc = [*green[:3], 0.25]
-    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[cfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
+    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[CrossingCfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
 
 
 def _add_light(spec: Any) -> None:

@@ -4,22 +4,25 @@ For showing a robot, not for simulating one: forward kinematics and geometry are
 """
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from sim.robots.model_files import read_model_files
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
+_KIND = _mj.mjtGeom
+_SEGMENTS = 20  # round a capsule
+_CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
 LOOK_SUFFIX = ".look.xml"
 """Of a file beside the model file: an MJCF whose bodies have names of the model's, with the shapes to show of them."""
-_FIRST_HIDDEN_GROUP = 3  # MuJoCo shows groups 0 to 2
+_BARE, _BONES, _VISUAL, _HIDDEN = range(4)  # groups, of which MuJoCo shows 0 to 2
 _BASE, _LIMB, _FOOT = (0.27, 0.29, 0.33, 1.0), (0.47, 0.50, 0.55, 1.0), (0.30, 0.32, 0.36, 1.0)
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
 _BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
@@ -33,7 +36,8 @@ def robot_spec(robot: RobotCfg) -> Any:
     those of its own that touch nothing, else all it has, with bones to its joints and feet.
     """
     try:
-        spec = _urdf_spec(robot) if read_model_files(robot.model_file).is_urdf else _mjcf_spec(robot)
+        files = read_model_files(robot.model_file)
+        spec = _urdf_spec(robot) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
     except Exception as error:  # MuJoCo's own type has no name
         raise _not_shown(robot.model_file, error) from None
     joints = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
@@ -42,7 +46,20 @@ def robot_spec(robot: RobotCfg) -> Any:
             f"robot '{robot.name}': {robot.model_file} has joints {', '.join(joints)} for MuJoCo, expected a free base "
             f"and {', '.join(robot.joint_names)}"
         )
-    _dress(spec, robot)
+    looks = _read_look(robot)
+    for body in spec.bodies[1:]:
+        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(touching):
+            if files.is_urdf:
+                geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
+            geom.name = geom.name or f"{body.name}_geom_{number}"
+        _dress(body, touching, looks.pop(body.name, []), robot)
+    _add_bones(spec, robot)
+    if looks:
+        raise ValueError(
+            f"{_look_file(robot)} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
+            f"{', '.join(body.name for body in spec.bodies[1:])}"
+        )
     return spec
 
 
@@ -52,9 +69,10 @@ def robot_model(spec: Any, robot: RobotCfg) -> Any:
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
         raise _not_shown(robot.model_file, error) from None
-    for foot in _geom_ids(model, robot.foot_geoms):
-        if len(_inside(model, foot)) > 1:  # it has a look
-            model.geom_group[foot] = _FIRST_HIDDEN_GROUP
+    visual = {columns for geom, columns in touches_of(model, robot).items() if model.geom_group[geom] == _VISUAL}
+    for column, name in enumerate(robot.geom_names):
+        if name in robot.foot_geoms and (column,) in visual:
+            model.geom(name).group = _HIDDEN
     return model
 
 
@@ -63,71 +81,53 @@ def touches_of(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
 
     A shape whose middle is in a foot shows that foot's touch, any other the touch of its body's base and limbs.
     """
-    columns = dict(zip(_geom_ids(model, robot.geom_names), range(len(robot.geom_names)), strict=True))
-    feet = {geom: columns[foot] for foot in _geom_ids(model, robot.foot_geoms) for geom in _inside(model, foot)}
+    ids, num_others = [model.geom(name).id for name in robot.geom_names], len(robot.geom_names) - len(robot.foot_geoms)
     touches = {}
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
-        if body > 0 and model.geom_group[geom] < _FIRST_HIDDEN_GROUP and int(model.geom_type[geom]) in _KINDS:
-            others = [column for k, column in columns.items() if k >= 0 and model.geom_bodyid[k] == body]
-            limbs = tuple(column for column in others if robot.geom_names[column] not in robot.foot_geoms)
-            same = columns.get(geom, feet.get(geom))
-            touches[geom] = limbs if same is None else (same,)
+        if body > 0 and model.geom_group[geom] < _HIDDEN:
+            same = [column for column, other in enumerate(ids) if model.geom_bodyid[other] == body]
+            away = {column: np.linalg.norm(model.geom_pos[geom] - model.geom_pos[ids[column]]) for column in same}
+            feet = [k for k in same if k >= num_others and away[k] < model.geom_rbound[ids[k]]]
+            touches[geom] = tuple(k for k in feet or same if k < num_others or k in feet)
+            if geom in ids:
+                touches[geom] = (ids.index(geom),)
     return touches
-
-
-def _geom_ids(model: Any, names: tuple[str, ...]) -> list[int]:
-    """Indices of geoms, below 0 of shapes that the file does not name."""
-    ids = [_mj.mj_name2id(model, _mj.mjtObj.mjOBJ_GEOM.value, name) for name in names]
-    return [index if index >= 0 else -1 - k for k, index in enumerate(ids)]
-
-
-def _inside(model: Any, foot: int) -> list[int]:
-    """Seen geoms of a foot's body whose middle is in the foot, that itself among them."""
-    near = np.linalg.norm(model.geom_pos - model.geom_pos[foot], axis=1) < model.geom_rbound[foot]
-    near &= (model.geom_bodyid == model.geom_bodyid[foot]) & (model.geom_group < _FIRST_HIDDEN_GROUP)
-    return np.flatnonzero(near).tolist() if foot >= 0 else []
 
 
 def _not_shown(file: Path, error: Exception) -> ValueError:
     return ValueError(f"{file} cannot be shown: {' '.join(str(error).split())}")
 
 
-def _dress(spec: Any, robot: RobotCfg) -> None:
-    looks = _read_look(robot)
+def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: RobotCfg) -> None:
+    """Says what is seen of a body, and colours what has no colour by its role."""
+    visual = [geom for geom in body.geoms if geom not in touching and geom.group < _HIDDEN]
+    for geom in visual:
+        geom.group = _HIDDEN if look else _VISUAL
+    for shape in look:
+        _add_shape(body, group=_VISUAL, **shape)
+    for geom in touching:
+        foot = geom.name in robot.foot_geoms
+        geom.group = _HIDDEN if (visual or look) and not foot else _BARE
+        if not geom.material and tuple(geom.rgba) == _NO_COLOR:
+            geom.rgba = _FOOT if foot else _BASE if geom.name in robot.base_geoms else _LIMB
+
+
+def _add_bones(spec: Any, robot: RobotCfg) -> None:
+    """Capsules from the joint of every body without visual shapes to those of its children, and to its feet."""
     sizes = [geom.size[0] for name in (*robot.limb_geoms, *robot.foot_geoms) if (geom := spec.geom(name)) is not None]
     radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE
     for body in spec.bodies[1:]:
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        seen = [geom for geom in body.geoms if geom not in touching and geom.group < _FIRST_HIDDEN_GROUP]
-        look = looks.pop(body.name, [])
-        for geom in touching:
-            hidden = (seen or look) and geom.name not in robot.foot_geoms
-            geom.group = _FIRST_HIDDEN_GROUP if hidden else 0
-            if not geom.material and tuple(geom.rgba) == _NO_COLOR:
-                geom.rgba = (
-                    _BASE if geom.name in robot.base_geoms else _FOOT if geom.name in robot.foot_geoms else _LIMB
-                )
-        if look:
-            for geom in seen:
-                geom.group = _FIRST_HIDDEN_GROUP
-            for shape in look:
-                _add_shape(body, **shape)
-        elif not seen and not any(geom.type == _mj.mjtGeom.mjGEOM_MESH for geom in touching):
-            feet = [geom for geom in touching if geom.name in robot.foot_geoms]
-            for end in (part.pos for part in (*body.bodies, *feet)):
-                if np.linalg.norm(end) > radius:
-                    kind = _mj.mjtGeom.mjGEOM_CAPSULE
-                    _add_shape(body, type=kind, fromto=[0.0, 0.0, 0.0, *end], size=[radius, 0.0, 0.0], rgba=_LIMB)
-    if looks:
-        raise ValueError(
-            f"{_look_file(robot)} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
-            f"{', '.join(body.name for body in spec.bodies[1:])}"
-        )
+        if any(geom.group == _VISUAL or geom.type == _KIND.mjGEOM_MESH for geom in body.geoms):
+            continue
+        for part in (*body.bodies, *(geom for geom in body.geoms if geom.name in robot.foot_geoms)):
+            if np.linalg.norm(part.pos) > radius:
+                ends = {"fromto": [0.0, 0.0, 0.0, *part.pos], "size": [radius, 0.0, 0.0]}
+                _add_shape(body, group=_BONES, type=_KIND.mjGEOM_CAPSULE, rgba=_LIMB, **ends)
 
 
 def _add_shape(body: Any, **shape: Any) -> None:
-    body.add_geom(group=0, mass=0.0, contype=0, conaffinity=0, **shape)
+    body.add_geom(mass=0.0, contype=0, conaffinity=0, **shape)
 
 
 def _look_file(robot: RobotCfg) -> Path:
@@ -149,15 +149,6 @@ def _read_look(robot: RobotCfg) -> dict[str, list[dict[str, Any]]]:
     return looks
 
 
-def _mjcf_spec(robot: RobotCfg) -> Any:
-    spec = _mj.MjSpec.from_file(str(robot.model_file))
-    for body in spec.bodies:
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        for number, geom in enumerate(touching):
-            geom.name = geom.name or f"{body.name}_geom_{number}"
-    return spec
-
-
 def _urdf_spec(robot: RobotCfg) -> Any:
     """With what it shows of its links, unless MuJoCo cannot read that."""
     try:
@@ -173,109 +164,65 @@ def _imported_urdf(root: ET.Element) -> Any:
     ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false")
     spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     spec.worldbody.first_body().add_freejoint()
-    for body in spec.bodies:
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        for number, geom in enumerate(touching):
-            geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
     return spec
-
-
-_KINDS = {
-    int(getattr(_mj.mjtGeom, f"mjGEOM_{kind.upper()}")): kind
-    for kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
-}
-_FREE_COORDINATES = 7  # position and quaternion of the base
-
-
-@dataclass(frozen=True, kw_only=True)
-class Geom:
-    """One shape, fixed to a body."""
-
-    name: str
-    """As the simulation calls it; may be empty of one that touches nothing."""
-    body: int
-    """Index into the skeleton's bodies."""
-    kind: str
-    """One of sphere, capsule, ellipsoid, cylinder, box and mesh."""
-    size: NDArray[np.float64]
-    """MuJoCo's: radius; radius and half length; half sides; unused of a mesh; shape (3,) [m]."""
-    position: NDArray[np.float64]
-    """Centre in the body's frame [m], shape (3,)."""
-    quaternion: NDArray[np.float64]
-    """Geom to body frame, w x y z; capsules and cylinders lie along z."""
-    color: tuple[float, float, float] = _NO_COLOR[:3]
-    """RGB, 0 to 1."""
-    touches: tuple[int, ...] = ()
-    """Columns of ``robot.geom_names`` whose touch it shows."""
-    vertices: NDArray[np.float64] | None = None
-    """Of a mesh, in the geom's frame [m], shape (num_vertices, 3)."""
-    faces: NDArray[np.int64] | None = None
-    """Of a mesh, indices into ``vertices``, shape (num_faces, 3)."""
 
 
 class Skeleton:
     """A robot's bodies; the world is none of them."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        self._model = model = robot_model(robot_spec(robot), robot)
-        self.num_coordinates = _FREE_COORDINATES + robot.num_joints
-        """Columns of ``qpos``."""
-        self.body_names: tuple[str, ...] = tuple(model.body(k).name for k in range(1, model.nbody))
-        self.parents: tuple[int, ...] = tuple(int(parent) - 1 for parent in model.body_parentid[1:])
-        """Index of each body's parent; -1 of one that hangs on the world."""
-        self.offsets: NDArray[np.float64] = np.array(model.body_pos[1:])
-        """Origin of each body in its parent's frame [m], shape (num_bodies, 3)."""
-        touches = touches_of(model, robot)
-        self.geoms: tuple[Geom, ...] = tuple(self._geom(k, columns) for k, columns in touches.items())
-        """What is to be seen of it, in the file's order."""
+        self.model: Any = robot_model(robot_spec(robot), robot)
+        """The ``MjModel``, whose body 0 is the world."""
+        self.touches = touches_of(self.model, robot)
+        """What is seen of it, and what it shows (:func:`touches_of`)."""
 
-    def geom(self, name: str) -> Geom:
-        """A shape by the name that the simulation has for it, to be seen or not."""
-        model = self._model
-        names = [model.geom(k).name for k in range(model.ngeom)]
-        if name not in names:
-            raise ValueError(f"no geom named {name}: the robot's file has {', '.join(filter(None, names))}")
-        return self._geom(names.index(name))
+    @property
+    def num_bodies(self) -> int:
+        """Without the world."""
+        return self.model.nbody - 1
 
-    def _geom(self, index: int, touches: tuple[int, ...] = ()) -> Geom:
-        model = self._model
-        kind = _KINDS[int(model.geom_type[index])]
-        vertices = faces = None
-        if kind == "mesh":
-            mesh = model.mesh(model.geom_dataid[index])
-            first, count = int(mesh.vertadr[0]), int(mesh.vertnum[0])
-            vertices = np.array(model.mesh_vert[first : first + count], dtype=np.float64)
-            first, count = int(mesh.faceadr[0]), int(mesh.facenum[0])
-            faces = np.array(model.mesh_face[first : first + count], dtype=np.int64)
-        material, color = int(model.geom_matid[index]), tuple(model.geom_rgba[index].tolist())
-        if material >= 0 and color == _NO_COLOR:
-            color = tuple(model.mat_rgba[material].tolist())
-        return Geom(
-            color=color[:3],
-            touches=touches,
-            name=model.geom(index).name,
-            body=int(model.geom_bodyid[index]) - 1,
-            kind=kind,
-            size=np.array(model.geom_size[index]),
-            position=np.array(model.geom_pos[index]),
-            quaternion=np.array(model.geom_quat[index]),
-            vertices=vertices,
-            faces=faces,
-        )
+    def shape(self, geom: int) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
+        """A geom in its body's frame [m], and its colour, RGB 0 to 1."""
+        model = self.model
+        kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+        if kind == _KIND.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
+            faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
+            shape = trimesh.Trimesh(vertices, faces, process=False)
+        else:
+            shape = trimesh.graph.smooth_shade(_primitive(kind, size), angle=_CREASE)
+        transform = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])  # w x y z too
+        transform[:3, 3] = model.geom_pos[geom]
+        color, material = model.geom_rgba[geom], model.geom_matid[geom]
+        if material >= 0 and tuple(color) == _NO_COLOR:
+            color = model.mat_rgba[material]
+        return shape.apply_transform(transform), color[:3].astype(np.float64)
 
     def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where the bodies are: origins in the world [m] and body-to-world quaternions w x y z.
 
         Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
-        (num_frames, num_coordinates), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
+        (num_frames, nq), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
         """
-        if qpos.ndim != 2 or qpos.shape[1] != self.num_coordinates:
-            raise ValueError(f"qpos must have shape (num_frames, {self.num_coordinates}), got {qpos.shape}")
-        data = _mj.MjData(self._model)
-        positions = np.empty((len(qpos), len(self.body_names), 3))
-        quaternions = np.empty((len(qpos), len(self.body_names), 4))
+        if qpos.ndim != 2 or qpos.shape[1] != self.model.nq:
+            raise ValueError(f"qpos must have shape (num_frames, {self.model.nq}), got {qpos.shape}")
+        data = _mj.MjData(self.model)
+        positions, quaternions = (np.empty((len(qpos), self.num_bodies, count)) for count in (3, 4))
         for frame, row in enumerate(qpos):
             data.qpos[:] = row
-            _mj.mj_kinematics(self._model, data)
+            _mj.mj_kinematics(self.model, data)
             positions[frame], quaternions[frame] = data.xpos[1:], data.xquat[1:]
         return positions, quaternions
+
+
+def _primitive(kind: int, size: NDArray[np.float64]) -> trimesh.Trimesh:
+    """A shape about its own centre, along z."""
+    radius, length = float(size[0]), 2.0 * float(size[1])
+    if kind == _KIND.mjGEOM_CAPSULE:
+        return trimesh.creation.capsule(height=length, radius=radius, count=(_SEGMENTS, _SEGMENTS))
+    if kind == _KIND.mjGEOM_CYLINDER:
+        return trimesh.creation.cylinder(radius=radius, height=length, sections=_SEGMENTS)
+    if kind == _KIND.mjGEOM_BOX:
+        return trimesh.creation.box(extents=2.0 * size)
+    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _KIND.mjGEOM_ELLIPSOID else radius)

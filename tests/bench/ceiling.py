@@ -14,10 +14,9 @@ import warp as wp
 
 from tests.bench.timing import Timing, fit_launches, repeat_torch, repeat_warp, time_in_turns
 
-FLOPS_PER_STEP = 2 * 8 * 16
-"""Multiplications and additions that :func:`multiply_add` does a step and thread."""
-SPECIALS_PER_STEP = 4 * 4
-"""Exponentials that :func:`exponentials` computes a step and thread."""
+CHAINS, UNROLLED = 8, 16
+"""Independent chains of a thread, so that none waits for the result before; links of each a step."""
+_Chains = wp.types.vector(CHAINS, float)
 
 
 @wp.kernel
@@ -26,35 +25,35 @@ def do_nothing(out: wp.array[float]):
     out[0] = 0.0
 
 
-@wp.kernel
-def multiply_add(steps: int, factor: float, addend: float, out: wp.array[float]):
-    """Grid (num_threads,): eight independent chains, so that none waits for the result before."""
-    i = wp.tid()
-    a = wp.vec4(float(i), float(i) + 1.0, float(i) + 2.0, float(i) + 3.0)
-    b = a + wp.vec4(4.0, 4.0, 4.0, 4.0)
-    more = wp.vec4(addend, addend, addend, addend)
-    for _step in range(steps):
-        for _unrolled in range(16):
-            a = a * factor + more
-            b = b * factor + more
-    out[i] = a[0] + a[1] + a[2] + a[3] + b[0] + b[1] + b[2] + b[3]
+@wp.func
+def multiply_add(x: float) -> float:
+    """Two flops."""
+    return x * 0.999 + 0.001
 
 
-@wp.kernel
-def exponentials(steps: int, out: wp.array[float]):
-    """Grid (num_threads,): four independent chains."""
-    i = wp.tid()
-    a = float(i) * 1.0e-6
-    b = a + 0.1
-    c = a + 0.2
-    d = a + 0.3
-    for _step in range(steps):
-        for _unrolled in range(4):
-            a = wp.exp(-a)
-            b = wp.exp(-b)
-            c = wp.exp(-c)
-            d = wp.exp(-d)
-    out[i] = a + b + c + d
+@wp.func
+def exponential(x: float) -> float:
+    """One special function."""
+    return wp.exp(-x)
+
+
+def chains_of(link: Any) -> Any:
+    """A kernel on a grid (num_threads,) that applies a function :data:`UNROLLED` times a step to each chain."""
+
+    @wp.kernel(module="unique")
+    def run_chains(steps: int, out: wp.array[float]):
+        i = wp.tid()
+        chains = _Chains()
+        for c in range(wp.static(CHAINS)):
+            chains[c] = float(i) * 1.0e-6 + 0.1 * float(c)
+        for _step in range(steps):
+            for _unrolled in range(wp.static(UNROLLED)):
+                for c in range(wp.static(CHAINS)):
+                    chains[c] = link(chains[c])
+        for c in range(wp.static(CHAINS)):
+            out[i] += chains[c]
+
+    return run_chains
 
 
 BOUND_SHARE = 0.25
@@ -106,34 +105,33 @@ class Ceiling:
         return shares[nearest], "launch" if self.launch_s / seconds >= LAUNCH_SHARE else "latency"
 
 
-def launch(kernel: Any, out: Any, *inputs: float) -> None:
+def launch(kernel: Any, out: Any, *inputs: int) -> None:
     """Launches one of the kernels above, one thread an entry of ``out``."""
     wp.launch(kernel, dim=out.shape[0], inputs=inputs, outputs=[out], device=out.device)
 
 
 def measure_ceiling(device: str, timing: Timing) -> Ceiling:
     """Measures the best rates of a device, all in turns; torch works on Warp's stream already."""
-    threads = 1 << 20 if device.startswith("cuda") else 64
+    on_gpu = device.startswith("cuda")
+    threads = 1 << 20 if on_gpu else 64
     out: Any = wp.zeros(threads, dtype=float, device=device)
-    launches = {
+    works = {
         "nothing": partial(launch, do_nothing, out[:1]),
-        "flops": partial(launch, multiply_add, out, _STEPS, 0.999, 0.001),
-        "specials": partial(launch, exponentials, out, _STEPS),
+        "flops": partial(launch, chains_of(multiply_add), out, _STEPS),
+        "specials": partial(launch, chains_of(exponential), out, _STEPS),
     }
-    variants = {
-        name: fit_launches(partial(repeat_warp, work, device=device), device, timing) for name, work in launches.items()
-    }
-    where = wp.to_torch(out).device
+    makers = {name: partial(repeat_warp, work) for name, work in works.items()}
     # Bytes moved: 1 MB to 4 GB on CUDA, 16 KB to 64 MB on the CPU, in powers of 2.
-    sizes = [1 << k for k in (range(20, 33) if device.startswith("cuda") else range(14, 27))]
+    sizes = [1 << k for k in (range(20, 33) if on_gpu else range(14, 27))]
     for size in sizes:
-        source, target = (torch.zeros(size // 8, dtype=torch.float32, device=where) for _ in range(2))
-        copy = partial(target.copy_, source)
-        variants[str(size)] = fit_launches(partial(repeat_torch, copy, device=device), device, timing)
+        source, target = (torch.zeros(size // 8, dtype=torch.float32, device=wp.to_torch(out).device) for _ in range(2))
+        makers[str(size)] = partial(repeat_torch, partial(target.copy_, source))
+    variants = {name: fit_launches(partial(make, device=device), device, timing) for name, make in makers.items()}
     seconds = time_in_turns(variants, device, timing)
+    links = threads * _STEPS * CHAINS * UNROLLED
     return Ceiling(
         copies={size: size / seconds[str(size)] for size in sizes},
-        flops_per_s=threads * _STEPS * FLOPS_PER_STEP / seconds["flops"],
-        specials_per_s=threads * _STEPS * SPECIALS_PER_STEP / seconds["specials"],
+        flops_per_s=2 * links / seconds["flops"],
+        specials_per_s=links / seconds["specials"],
         launch_s=seconds["nothing"],
     )

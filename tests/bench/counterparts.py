@@ -39,10 +39,8 @@ def rasterise(genes: Tensor, lower: Tensor, upper: Tensor, x: Tensor, y: Tensor)
 
 def node_heights(heights: Tensor, terrain_of_env: Tensor, row: Tensor, col: Tensor) -> Tensor:
     """Heights [m] of nodes (E, ...), the nearest edge node's beyond the grid; ``heights`` is (T, rows, cols)."""
-    num_rows, num_cols = heights.shape[1:]
-    terrain = terrain_of_env.view(-1, *[1] * (row.ndim - 1)).long()
-    index = (terrain * num_rows + row.clamp(0, num_rows - 1)) * num_cols + col.clamp(0, num_cols - 1)
-    return heights.view(-1)[index]
+    terrain = terrain_of_env.view(-1, *[1] * (row.ndim - 1))
+    return heights[terrain, row.clamp(0, heights.shape[1] - 1), col.clamp(0, heights.shape[2] - 1)]
 
 
 def surface(heights: Tensor, terrain_of_env: Tensor, spacing: float, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
@@ -50,8 +48,7 @@ def surface(heights: Tensor, terrain_of_env: Tensor, spacing: float, x: Tensor, 
     u, v = x / spacing, y / spacing
     col, row = u.floor(), v.floor()
     fx, fy = u - col, v - row
-    low = fx + fy < 1.0
-    row, col = row.long(), col.long()
+    low, row, col = fx + fy < 1.0, row.long(), col.long()
     h10 = node_heights(heights, terrain_of_env, row, col + 1)
     h01 = node_heights(heights, terrain_of_env, row + 1, col)
     corner = (~low).long()
@@ -211,10 +208,8 @@ def _from_faces(h: Tensor, gap: Tensor, dx: Tensor, dy: Tensor, spacing: float, 
     slope_x, slope_y = h[0] / spacing, h[1] / spacing
     along = (gap - slope_x * dx - slope_y * dy) / (slope_x * slope_x + slope_y * slope_y + 1.0)
     foot_x, foot_y = dx + along * slope_x, dy + along * slope_y  # from the right angle
-    if low:
-        inside = (foot_x >= 0) & (foot_y >= 0) & (foot_x + foot_y <= spacing)
-    else:
-        inside = (foot_x <= 0) & (foot_y <= 0) & (foot_x + foot_y >= -spacing)
+    side = 1.0 if low else -1.0
+    inside = (side * foot_x >= 0) & (side * foot_y >= 0) & (side * (foot_x + foot_y) <= spacing)
     vector = torch.stack([-along * slope_x, -along * slope_y, along], dim=-1)
     return vector.masked_fill(~inside[..., None], _FAR)
 
@@ -255,14 +250,6 @@ def from_surface(
     return vectors.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
 
 
-def _pick(values: Tensor, probe: Tensor) -> Tensor:
-    """Rows of (E, P, 3) or entries of (E, P) that belong to the chosen probes (E, S, 3)."""
-    flat = probe.flatten(1)
-    if values.ndim == 2:
-        return values.gather(1, flat).view(probe.shape)
-    return values.gather(1, flat[..., None].expand(-1, -1, 3)).view(*probe.shape, 3)
-
-
 def probe_contacts(
     body_q: Tensor, rotation: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -273,10 +260,10 @@ def probe_contacts(
         for radius, window, group in tables.groups
     ]
     vector = torch.cat(vectors, dim=1)[:, tables.order]
-    size = vector.norm(dim=2)
     ground, slope_x, slope_y = surface(heights, terrain_of_env, spacing, centre[..., 0], centre[..., 1])
     upward = torch.nn.functional.normalize(torch.stack([-slope_x, -slope_y, torch.ones_like(slope_x)], dim=-1), dim=-1)
-    below, gap = centre[..., 2] < ground, centre[..., 2] - ground
+    size, gap = vector.norm(dim=2), centre[..., 2] - ground
+    below = gap < 0.0
     deep = below & (size > tables.radius)  # too deep for the window: straight up to the triangle above
     distance = torch.where(deep, gap * upward[..., 2], torch.where(below, -size, size))
     vertical = deep | (size <= _ON_SURFACE)
@@ -314,8 +301,9 @@ def collide(
     centre, distance, normal = probe_contacts(body_q, rotation, terrain_of_env, heights, spacing, tables)
     chosen = choose_probes(distance, tables)
     probe = chosen.clamp(min=0)
-    normal = _pick(normal, probe)
-    point = _pick(centre, probe) - normal * _pick(distance, probe)[..., None]
+    of_slot = torch.arange(len(probe), device=probe.device)[:, None, None], probe
+    normal = normal[of_slot]
+    point = centre[of_slot] - normal * distance[of_slot][..., None]
     to_body = rotation[:, tables.strip_body][:, :, None]  # a world vector times it: its coordinates in the body
     offset = -tables.strip_radius[:, None, None] * (normal[..., None] * to_body).sum(-2)
     return chosen, point, tables.position[probe], normal, offset

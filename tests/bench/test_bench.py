@@ -9,15 +9,7 @@ import warp as wp
 
 from tests.bench.__main__ import file_name, main
 from tests.bench.cases import build_scene, make_cases
-from tests.bench.ceiling import (
-    FLOPS_PER_STEP,
-    SPECIALS_PER_STEP,
-    Ceiling,
-    Work,
-    exponentials,
-    launch,
-    multiply_add,
-)
+from tests.bench.ceiling import CHAINS, UNROLLED, Ceiling, Work, chains_of, exponential, launch, multiply_add
 
 KERNELS = ("rasterise", "contact", "observation", "penalties", "contact_forces")
 
@@ -76,21 +68,16 @@ def test_another_output_is_refused(cases):
 
 
 @pytest.mark.parametrize(
-    ("kernel", "inputs", "starts", "repeated", "step", "work"),
-    [  # chains of each of three threads, what a step does to a chain, how often, and the work that is counted
-        (multiply_add, (0.999, 0.001), np.arange(3)[:, None] + np.arange(8.0), 16, lambda x: x * 0.999 + 0.001,
-         FLOPS_PER_STEP // 2),
-        (exponentials, (), np.arange(3)[:, None] * 1e-6 + np.array([0, 0.1, 0.2, 0.3]), 4, lambda x: np.exp(-x),
-         SPECIALS_PER_STEP),
-    ],
-)  # fmt: skip
-def test_the_work_of_a_ceiling_is_done(device, kernel, inputs, starts, repeated, step, work):
+    ("link", "step"), [(multiply_add, lambda x: x * 0.999 + 0.001), (exponential, lambda x: np.exp(-x))]
+)
+def test_the_work_of_a_ceiling_is_done(device, link, step):
     out = wp.zeros(3, dtype=float, device=device)
-    launch(kernel, out, 2, *inputs)
-    for _ in range(2 * repeated):
-        starts = step(starts)
-    np.testing.assert_allclose(out.numpy(), starts.sum(1), rtol=1e-5)
-    assert work == starts.shape[1] * repeated
+    launch(chains_of(link), out, 2)
+    chains = np.arange(3)[:, None] * 1e-6 + 0.1 * np.arange(8)
+    for _ in range(2 * 16):
+        chains = step(chains)
+    np.testing.assert_allclose(out.numpy(), chains.sum(1), rtol=1e-5)
+    assert chains.shape[1] * 16 == CHAINS * UNROLLED
 
 
 # 1 TB/s from memory, 4 in a cache of 1 MB, 10 TFLOP/s, 1 T exponentials/s, 2 us a launch.

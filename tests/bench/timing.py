@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -53,16 +54,15 @@ def repeat_torch(call: Callable[[], object], launches: int, device: str) -> Vari
     """Calls of torch: in one captured graph on CUDA, on the stream that Warp uses too; in a plain loop on the CPU."""
     outputs: list[Any] = []
 
+    @torch.no_grad()
     def call_all() -> None:
-        with torch.no_grad():
-            for _ in range(launches):
-                outputs[:] = [call()]
+        for _ in range(launches):
+            outputs[:] = [call()]
 
     if not device.startswith("cuda"):
         return Variant(replay=call_all, launches=launches, work=call, outputs=outputs)
-    with torch.no_grad():
-        for _ in range(3):  # compiles, and lets the allocator and the autotuner settle
-            call()
+    for _ in range(3):  # compiles, and lets the allocator and the autotuner settle
+        call_all()
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
@@ -71,7 +71,7 @@ def repeat_torch(call: Callable[[], object], launches: int, device: str) -> Vari
 
 
 def time_once(variant: Variant, device: str) -> float:
-    """Seconds a launch in one replay."""
+    """Seconds a launch in one replay, by the device's clock."""
     if device.startswith("cuda"):
         start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
         start.record()
@@ -94,10 +94,5 @@ def fit_launches(make: Callable[[int], Variant], device: str, cfg: Timing) -> Va
 
 def time_in_turns(variants: dict[str, Variant], device: str, cfg: Timing) -> dict[str, float]:
     """Median seconds a launch of each variant; all are replayed in every round, so that they share its conditions."""
-    for variant in variants.values():
-        time_once(variant, device)
-    seconds = {name: [] for name in variants}
-    for _ in range(cfg.rounds):
-        for name, variant in variants.items():
-            seconds[name].append(time_once(variant, device))
-    return {name: float(torch.tensor(values, dtype=torch.float64).median()) for name, values in seconds.items()}
+    rounds = [[time_once(variant, device) for variant in variants.values()] for _ in range(cfg.rounds + 1)]
+    return dict(zip(variants, np.median(rounds[1:], axis=0).tolist(), strict=True))  # the first warms up

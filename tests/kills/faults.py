@@ -60,9 +60,8 @@ class Steps:
             return
         number, self._count = self._count, self._count + 1
         if self._log is not None:
-            handle = self._os_open(self._log, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
-            os.write(handle, f"{name} {path}\n".encode())
-            os.close(handle)
+            with self._open(self._log, "a") as log:
+                log.write(f"{name} {path}\n")
         if self._at is not None and number >= self._at:
             self._fault(name, path)
 

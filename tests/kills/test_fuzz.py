@@ -6,6 +6,8 @@ import io
 import os
 import pickle
 import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -58,31 +60,23 @@ def read_crossings(file: Path) -> Any:
 
 
 @pytest.fixture(scope="module")
-def formats(tmp_path_factory) -> dict[str, Path]:
-    """A whole file of each format."""
+def formats(tmp_path_factory) -> dict[Callable[[Path], Any], Path]:
+    """A whole file of each format, by what reads it."""
     folder = tmp_path_factory.mktemp("formats")
     assert run_child(folder / "log", runs.train, folder / "training", iterations=1)[0] == 0
     state = {"metrics": [{"iteration": 1, "elites": 3}], "genes": np.linspace(-1, 1, 200, dtype=np.float32)}
     save_checkpoint(folder / "checkpoint.bin", state)
     Cache(folder).write("key", {"outcome": np.arange(80, dtype=np.uint8), "duration_s": np.linspace(0, 20, 80)})
-    return {
-        "search": folder / "checkpoint.bin",
-        "training": folder / "training" / "checkpoint.pt",
-        "crossings": folder / "key.npz",
-    }
+    files = ("checkpoint.bin", "training/checkpoint.pt", "key.npz")
+    return dict(zip((read_search, read_training, read_crossings), map(folder.joinpath, files), strict=True))
 
 
-READERS = {"search": read_search, "training": read_training, "crossings": read_crossings}
-
-
-@pytest.mark.parametrize("kind", READERS)
-def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, kind):
-    read, whole = READERS[kind], formats[kind].read_bytes()
-    expected = read(formats[kind])
+@pytest.mark.parametrize("read", [read_search, read_training, read_crossings])
+def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, read):
+    whole, expected, num_refused = formats[read].read_bytes(), read(formats[read]), 0
     assert expected is not None
-    num_refused = 0
     for number in range(MUTATIONS):
-        file = tmp_path / formats[kind].name
+        file = tmp_path / formats[read].name
         file.write_bytes(mutated(whole, np.random.default_rng([SEED, number])))
         try:
             content = read(file)
@@ -94,11 +88,11 @@ def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, k
     assert num_refused > MUTATIONS / 2
 
 
+@dataclass
 class Bomb:
     """A pickle that would make a file."""
 
-    def __init__(self, target: Path):
-        self.target = target
+    target: Path
 
     def __reduce__(self):
         return os.system, (f"touch {self.target}",)

@@ -4,10 +4,8 @@ import json
 import os
 import shutil
 import signal
-from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,12 +14,10 @@ from qd.commands import Archive
 from qd.judge import judge
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
-from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
 from tests.qd.searches import crossing_by, without_figures
-from tests.sim.spaces.spaces import move, write_ridges
 
 SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "1", "--iterations", "1"]
 TINY = ["--device", "cpu", *SIZE]
@@ -185,27 +181,3 @@ def test_code_runs_only_if_the_command_line_names_it(capsys):
         Path("a", name).write_bytes(content)
     assert archive("--resume", "a", *MORE, "2", "--policy", fine) == 0
     assert read_archive("a").iterations == 2
-
-
-@contextmanager
-def crossing_three_genes(cfg):
-    """The stand-in over a space of three genes, which come again and again."""
-    yield stand_in.Stub(lambda genes, seeds: stand_in.evaluate(np.tile(genes, 22)[:, :64], seeds, cfg.num_replicas))
-
-
-def test_a_space_of_the_users_may_move_but_not_change(capsys):
-    space, size = write_ridges(Path("mine")), [*TINY, "--method", "hard_random", "--scheduler.batch-size", "6"]
-    with crossing_by(crossing_three_genes):
-        assert archive(*size, "--space", space, "--run-dir", "a") == 0
-        stored = read_archive("a")
-        assert (stored.space, stored.space_sha256, stored.genes.shape[1]) == (space, controller_hash(space), 3)
-        assert archive(*size, "--space", space, "--run-dir", "whole", "--iterations", "3") == 0
-        moved = move(space, Path("elsewhere"))  # its hash says that it is the same
-        assert archive("--resume", "a", *MORE, "3", "--space", moved) == 0
-        assert Path("a/archive.npz").read_bytes() == Path("whole/archive.npz").read_bytes()
-        judged = judge(Path("a"), compute=Compute(workers="1"), space=moved, stages=("fresh",),
-                       open_evaluator=crossing_three_genes)  # fmt: skip
-        assert (judged.fresh.episodes == 40).all()
-        file = Path("elsewhere/space.py")
-        file.write_text(file.read_text().replace("0.9", "0.8"))
-        assert "space" in fails(capsys, "--resume", "a", *MORE, "4", "--space", moved)

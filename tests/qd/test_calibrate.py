@@ -26,15 +26,12 @@ def crossed(penalties, late, invalid=None):
     return make_result([penalties], late=[late], invalid=None if invalid is None else [invalid])
 
 
-def test_scales_are_means_over_failing_episodes():
+def test_scales_are_means_over_failing_episodes_or_over_all_if_under_200_fail():
     # 100 episodes fail with 1, 4 and 100 with 3, 0: means 2 and 2. That 300 reach the goal with 9, 8 changes nothing.
     rows = [[1, 4]] * 100 + [[3, 0]] * 100 + [[9, 8]] * 300
     numbers = measured(crossed(rows, [True] * 200 + [False] * 300))
     assert numbers["scales"] == {"yaw_rate": 2.0, "vel_x": 2.0} and numbers["scaled_by"] == "failing"
     assert numbers["share_of_episodes_with"] == {"yaw_rate": 1.0, "vel_x": 0.5}
-
-
-def test_with_fewer_than_200_failing_episodes_scales_are_means_over_all():
     # One of the 200 is invalid: 199 of 1, 4 fail, 199 reach the goal with 3, 8. Means (1 + 3) / 2 and (4 + 8) / 2.
     rows = [[1, 4]] * 199 + [[np.nan, np.nan]] + [[3, 8]] * 199
     numbers = measured(crossed(rows, [True] * 200 + [False] * 199, invalid=[False] * 199 + [True] + [False] * 199))

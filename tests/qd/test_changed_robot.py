@@ -48,13 +48,6 @@ def test_what_was_made_with_the_robot_before_it_changed_is_refused(dog):
             read()
 
 
-def test_numbers_of_another_definition_are_refused(dog, monkeypatch):
-    monkeypatch.setattr("sim.files.records.PENALTY_DEFINITION", "cubed")
-    for read in readers(dog):
-        with pytest.raises(ValueError, match="squared"):
-            read()
-
-
 def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):
     robot = get_robot(str(dog))
     policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())

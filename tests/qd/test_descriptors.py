@@ -8,21 +8,13 @@ from qd.descriptors import Cells, episode_ratios, terrain_ratios
 
 
 def test_ratios_of_an_episode():
-    # 1 + 3 + 0 + 4 = 8
+    # 1 + 3 + 0 + 4 = 8; without penalties one nth each
     assert episode_ratios([1.0, 3.0, 0.0, 4.0]).tolist() == [0.125, 0.375, 0.0, 0.5]
-
-
-def test_an_episode_without_penalties_counts_one_nth_each():
     assert episode_ratios(np.zeros((2, 5))).tolist() == [[0.2] * 5] * 2
 
 
-def test_terrain_ratio_is_the_mean_of_ratios_not_the_ratio_of_means():
+def test_terrain_ratio_is_the_mean_of_the_valid_episodes_ratios():
     # episodes (1, 3) -> (1/4, 3/4) and (10, 0) -> (1, 0): mean (5/8, 3/8); the ratio of means would be (11/14, 3/14)
-    ratios = terrain_ratios([[[1.0, 3.0], [10.0, 0.0]]], [[True, True]])
-    assert ratios.tolist() == [[0.625, 0.375]]
-
-
-def test_invalid_episodes_are_left_out_even_when_they_hold_nan():
     penalties = [[[1.0, 3.0], [np.nan, np.inf], [10.0, 0.0]], [[np.nan, 1.0]] * 3]
     ratios = terrain_ratios(penalties, [[True, False, True], [False] * 3])
     assert ratios.tolist() == [[0.625, 0.375], [0.5, 0.5]]
@@ -80,8 +72,7 @@ def test_knife_edges(ratios, expected):
 
 
 def test_edges_of_other_intervals_are_exact():
-    # floor(1/49 * 49) = 0 in float64; the edge belongs to interval 1
-    cells = Cells(2, 49)
+    cells = Cells(2, 49)  # floor(1/49 * 49) = 0 in float64; the edge belongs to interval 1
     assert cells.tuples[cells.cell_of([[1 / 49, 48 / 49]])[0]].tolist() == [1, 47]
 
 

@@ -10,7 +10,6 @@ from qd.faults import (
     count_faults,
     elite_words,
     fault_numbers,
-    fault_words,
     fresh_counts,
     fresh_numbers,
     judgement,
@@ -84,10 +83,6 @@ def test_numbers_of_fresh_episodes_by_hand():
 
 def test_words_say_counts_and_verdicts():
     archive = judged_archive()
-    # Wilson of 2 of 4: 15 to 85 %
-    words = " ".join(fault_words(archive))
-    for part in ("4 failing elites", "2 of 4 (50%, 15 to 85%)", "1 fault:", "C-G or S"):
-        assert part in words
     words = [elite_words(archive, number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
     assert [("a fault" in text[-1], "not known" in text[-1]) for text in words] == [
@@ -95,7 +90,7 @@ def test_words_say_counts_and_verdicts():
     ]  # fmt: skip
     assert "9 of 20 (45%, 26 to 66%)" in words[0][0]
     unjudged = dataclasses.replace(archive, faults=None)
-    assert fault_words(unjudged) == elite_words(unjudged, 0) == []
+    assert elite_words(unjudged, 0) == []
 
 
 def test_rates_and_certificates_of_an_elite():

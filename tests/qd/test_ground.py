@@ -13,7 +13,6 @@ from qd.commands import Archive
 from qd.minimise import minimise
 from qd.show.commands import Export
 from qd.show.recordings import Recordings, on_heights
-from qd.show.view.meshes import terrain_mesh
 from qd.workers.evaluator import Compute
 from sim.bank import terrains_of
 from sim.files.command import run_command
@@ -110,16 +109,6 @@ def test_recordings_are_found_again_by_their_ground(anymal, tmp_path):
         recordings = Recordings(anymal, folder=tmp_path, cross=cross).all_of(wanted)
         assert [recording.base_position[0, 0, -1, 0] for recording in recordings] == [3.0, 14.0]
         assert len(crossed) == 2
-
-
-def test_slippery_and_soft_patches_are_tinted():
-    bare, same, tinted = (
-        terrain_mesh(FLAT, maps).visual.vertex_colors[:, :3].reshape(161, 321, 3)
-        for maps in (None, GroundMaps.plain(1), slippery_and_soft())
-    )
-    np.testing.assert_array_equal(bare, same)
-    changed = np.argwhere((bare != tinted).any(axis=2))  # rows 40 to 80 and columns 80 to 120, and the other patch
-    assert changed.min(axis=0).tolist() == [40, 80] and changed.max(axis=0).tolist() == [119, 239]
 
 
 def test_effects_of_patches_are_parts_like_bumps():

@@ -3,18 +3,14 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from kernels.super_gaussian import LOWER, UPPER
 from qd.archive import FaultCounts
 from qd.groups import (
     KIN_M,
-    MAX_MODES,
     ORDERS,
     elites_of,
-    failure_modes,
     families_of,
-    find_modes,
     rank,
     rms_distances,
     summary_of,
@@ -66,63 +62,17 @@ def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid(
     assert [corrected.place_of(number) for number in (0, 2, 3)] == [0, 1, 2]
 
 
-def test_the_worst_and_the_steadiest_by_hand():
+def test_what_fails_and_how_it_ends_by_hand():
     archive = dataclasses.replace(
         small_archive(4),
         fitness=np.array([1.0, 4.0, 2.0, 3.0]),
-        penalty_mean=np.array([[1.0, 1.0], [1.0, 1.0], [1.0, 0.0], [1.0, 1.0]]),
-        penalty_std=np.array([[0.1, 0.1], [0.2, 0.3], [0.1, 0.1], [0.0, 0.0]]),
         goal_rate=np.array([0.0, 0.4, 0.0, 0.9]),
         collision_rate=np.array([0.25, 0.6, 0.5, 0.1]),
     )
     elites = elites_of(archive)
-    np.testing.assert_allclose(elites.variation, [0.1, 0.25, 0.2, 0.0])  # .2 of 2, .5 of 2, .2 of 1, 0 of 2
     assert elites.failing.tolist() == [True, True, True, False]
     np.testing.assert_allclose(elites.other_rate, [0.75, 0.0, 0.5, 0.0], atol=1e-12)
-    # the last is the steadiest of all, but the robots cross it
-    assert elites.most_reproducible(4) == [0, 2, 1, 3] and rank(archive, SUPER_GAUSSIAN).worst(4)[3] == 3
-    fresh = dataclasses.replace(fresh_values(archive), reproduced=np.array([False, True, True, True]))
-    assert elites_of(dataclasses.replace(archive, fresh=fresh)).most_reproducible(4) == [2, 1, 0, 3]
-
-
-def test_modes_are_the_kinds_that_were_made():
-    archive, kinds = grouped_archive()
-    grouped = find_modes(elites_of(archive))
-    assert len(grouped.modes) == 3
-    # the lowest goal rate first; stuck and collided share a rate of none, and are told apart by what they do
-    by_kind = {int(kinds[mode.members[0]]): mode for mode in grouped.modes}
-    assert all(set(kinds[mode.members]) == {kind} for kind, mode in by_kind.items())
-    assert {kind: len(mode.members) for kind, mode in by_kind.items()} == {0: 6, 1: 9, 2: 5}
-    assert [by_kind[kind].marked_by for kind in range(2)] == ["yaw_rate", "vel_x"]
-    assert grouped.modes[-1] is by_kind[2] and len({mode.ending for mode in grouped.modes}) == 3
-    assert all(mode.typical in mode.members for mode in grouped.modes)
-    assert sorted(grouped.silhouettes) == list(range(2, MAX_MODES + 1))
-    assert max(grouped.silhouettes, key=lambda count: grouped.silhouettes[count]) == 3
-    np.testing.assert_array_equal(grouped.labels[by_kind[1].members], by_kind[1].number)
-    fallen = dataclasses.replace(archive, fallen_rate=np.where(kinds == 1, 0.8, 0.0))
-    assert "topples" in {mode.ending for mode in find_modes(elites_of(fallen)).modes}
-
-
-def equal_archive():
-    same = {name: np.zeros(12) for name in ("goal_rate", "collision_rate", "fallen_rate")}
-    return dataclasses.replace(small_archive(12), ratios=np.full((12, 2), 0.5), **same)
-
-
-@pytest.mark.parametrize("archive", [small_archive(1), small_archive(9), equal_archive()])
-def test_few_or_equal_elites_are_one_mode(archive):
-    (mode,) = find_modes(elites_of(archive)).modes
-    assert mode.members.tolist() == list(range(len(archive)))
-
-
-def test_failure_modes_are_of_failing_elites_alone():
-    archive, kinds = grouped_archive()
-    grouped = failure_modes(elites_of(archive))
-    assert {tuple(sorted(set(kinds[mode.members]))) for mode in grouped.modes} == {(0,), (1,)}
-    assert (grouped.labels[kinds == 2] == 0).all() and (grouped.labels[kinds != 2] > 0).all()
-    for mode in grouped.modes:
-        assert mode.typical in mode.members and (grouped.labels[mode.members] == mode.number).all()
-    crossed = dataclasses.replace(archive, goal_rate=np.ones(len(kinds)))
-    assert failure_modes(elites_of(crossed)).modes == []
+    assert rank(archive, SUPER_GAUSSIAN).worst(4)[3] == 3
 
 
 def test_verdicts_come_before_rates_and_rates_before_fitness():

@@ -135,12 +135,6 @@ def test_too_many_invalid_episodes_say_nothing():
     assert minimal.cause({0: 0.1, 1: 0.3}) == 0  # without 1 nothing is known
 
 
-def test_where_flat_parts_alone_are_left_nothing_is_scaled():
-    slippery = replace(case(parts=range(3)), flat=(1,))
-    minimal = solve(slippery, lambda trial: 0 if 1 in trial.parts else 20)
-    assert (minimal.parts, minimal.scale, minimal.scales) == ((1,), None, {})
-
-
 @pytest.mark.parametrize(("on_gpu", "how"), [(False, "greedy"), (True, "exhaustive")])
 def test_parts_go_from_the_lowest_under_the_robot_on(on_gpu, how):
     archive = small_archive(1)

@@ -47,14 +47,6 @@ def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
     )  # fmt: skip
 
 
-def test_asks_for_clipped_genes_of_every_emitter():
-    genes = make_search(SchedulerCfg(method="cma_mae", emitters=3, batch_size=5, sigma0=2.0)).ask()
-    assert genes.shape == (15, 64)
-    assert genes.min() == -1.0
-    assert genes.max() == 1.0
-    assert len(np.unique(genes[:, 0])) > 3  # emitters do not share a stream
-
-
 def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     search = make_search()
     genes = search.ask()
@@ -67,13 +59,6 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     assert elites["fitness"].tolist() == [5.0, 0.0]
     assert elites["iteration"].tolist() == [1, 1]
     assert np.array_equal(elites["genes"][0], genes[0])
-
-
-def test_an_invalid_terrain_is_never_an_elite():
-    search = make_search()
-    search.ask()
-    search.tell(evaluation_with(np.arange(12), [FITNESS_FLOOR] * 6 + [1.0] * 6, invalid=[4] * 6 + [0] * 6), 1)
-    assert sorted(search.elites()["cell"].tolist()) == [6, 7, 8, 9, 10, 11]
 
 
 @pytest.mark.parametrize("method", [*METHODS, *JOINED, "cma_mae+map_elites", "cma_mae+map_elites+surrogate"])

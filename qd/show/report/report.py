@@ -1,31 +1,24 @@
-"""One page about a run, with its figures beside it."""
+"""One page about a run."""
 
-from dataclasses import replace
 from pathlib import Path
 
+from qd.archive import ARCHIVE_FILE, Archive
 from qd.groups import elites_of, rank
-from qd.run.directory import ROUNDS_FILE
+from qd.minimise import read_minimal
+from qd.run.directory import CONFIG_FILE, METRICS_FILE, ROUNDS_FILE, Metrics, RunDirectory, folder_for
 from qd.run.settings import find_policy
-from qd.show.crossed import crossed_of
-from qd.show.recordings import Cross, Recordings, on_elite
-from qd.show.report import elites, evaluation, minimal, search
-from qd.show.report.material import Material, Shown, gather
-from qd.show.report.page import Section, publish_page
+from qd.show.elites import OpenedRun, open_run
+from qd.show.recordings import Cross, Recordings
+from qd.show.report.cases import Case, cross_cases
+from qd.show.report.evaluation import read_compared
+from qd.show.report.page import check_page, publish_page
+from qd.show.report.pictures import why_no_pictures
 from qd.show.report.rounds import write_rounds
+from qd.show.report.search import Material, content_of
 from qd.workers.evaluator import check_policy, resolve_device
-from sim.files.records import without_machine
+from sim.policy.spec import SHIPPED, spec_of
 
-_CHAPTERS = {
-    ("What breaks the controller", "outcome"): search.outcome_section,
-    ("The smallest terrains that still break it", "minimal"): minimal.minimal_section,
-    ("Terrains worth a look", "terrains"): elites.detail_section,
-    ("Failure modes", "modes"): elites.modes_section,
-    ("The search", "search"): search.curves_section,
-    ("The archive", "archive"): search.archive_section,
-    ("Controllers compared", "tables"): evaluation.tables_section,
-    ("All elites", "all"): elites.all_section,
-    ("Where this comes from", "origin"): search.origin_section,
-}
+_OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown
 
 
 def write_report(
@@ -35,7 +28,8 @@ def write_report(
     policy: str | None = None,
     space: str | None = None,
     out: Path | None = None,
-    num_elites: int = 5,
+    num_elites: int = 3,
+    tables: Path | None = None,
     episodes: int = 20,
     device: str | None = None,
     cross: Cross | None = None,
@@ -48,60 +42,92 @@ def write_report(
         policy: The controller to cross with; the search's if None.
         space: A user's own terrain space that the run names.
         out: File to write, *.html.
-        num_elites: How many of the worst and of the most reproducible elites to show.
+        num_elites: How many of the worst terrains to show close up, with another controller beside.
+        tables: Tables of an evaluation to show, ``tables.json``; none if left out.
         episodes: Crossings of each.
         device: Warp device name.
         cross: Crosses terrains; by default the simulation.
     """
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
-    material = gather(robot, run, policy=policy, space=space, out=out)
-    if not len(elites_of(material.archive, judged=True)):
-        raise ValueError(f"{material.run} must have elites to report on, got only invalid ones: let its search go on")
-    ranking = rank(material.archive, material.space, judged=True)
-    shown = Shown(
-        material=material,
-        ranking=ranking,
-        worst=ranking.worst(num_elites),
-        steady=ranking.elites.most_reproducible(num_elites),
-        episodes=episodes,
-    )
-    shown = _with_crossings(shown, resolve_device(device), cross)
-    sections = [Section(*name, blocks) for name, make in _CHAPTERS.items() if (blocks := make(shown))]
-    return publish_page(material.out, f"How {material.archive.robot} breaks", _lead(shown), sections)
-
-
-def _with_crossings(shown: Shown, device: str, cross: Cross | None) -> Shown:
-    """Crosses the elites to be shown."""
-    material, archive = shown.material, shown.material.archive
+    opened_run = _opened(robot, run, space)
+    suffix = "" if policy is None else opened_run.suffix(spec_of(policy, opened_run.robot))
+    out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
+    check_page(out)
+    compared = None if tables is None else read_compared(tables, opened_run.robot, opened_run.archive.policy_sha256)
+    material = _material(opened_run, policy)
+    ranking, missing = material.ranking, list[str]()
+    heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
+    heads = heads or ranking.worst(num_elites)
+    causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}
+    firsts = [int(ranking.elites.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
+    others, cases = firsts[:_OTHER_CAUSES], dict[int, Case]()
     if reason := _why_not_crossed(material, device):
-        return replace(shown, not_crossed=reason)
-    recordings = Recordings(material.robot, device=device, cross=cross)
-    wanted = [
-        on_elite(archive, number, policy=material.policy, replicas=shown.episodes, label=None)
-        for number in shown.numbers
-    ]
-    crossed = [crossed_of(recording, archive.penalties, archive.scales) for recording in recordings.all_of(wanted)]
-    return replace(shown, crossed=dict(zip(shown.numbers, crossed, strict=True)))
+        missing.append(reason)
+    else:
+        no_pictures = why_no_pictures()
+        recordings = Recordings(opened_run.robot, device=resolve_device(device), cross=cross)
+        cases = cross_cases(material, heads, others, recordings, episodes=episodes, pictured=not no_pictures)
+        missing += [no_pictures] if no_pictures else []
+        missing += [f"All crossings of elite {n} were invalid this time." for n in (*heads, *others) if n not in cases]
+    return publish_page(
+        out, "search.html", **content_of(material), missing=missing, compared=compared,
+        heads=[cases[number] for number in heads if number in cases],
+        others=[cases[number] for number in others if number in cases],
+    )  # fmt: skip
 
 
-def _why_not_crossed(material: Material, device: str) -> str:
+def _opened(robot: str | None, run: Path | None, space: str | None) -> OpenedRun:
+    """The run, which must have elites to report on."""
+    if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
+        raise ValueError(f"{run} must hold a search that has ended an iteration, got no {ARCHIVE_FILE}: let it go on")
+    opened_run = open_run(robot, run, space=space)
+    if not len(elites_of(opened_run.archive, judged=True)):
+        raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
+    return opened_run
+
+
+def _material(opened_run: OpenedRun, policy: str | None) -> Material:
+    """Reads what there is beside the archive."""
+    archive, folder, search = opened_run.archive, RunDirectory(opened_run.folder), opened_run.search()
+    minima = read_minimal(opened_run.folder, archive)
+    gpus = folder.read_summary().get("gpus")
+    searched = SHIPPED if search is None else search.policy
+    return Material(
+        opened_run=opened_run,
+        ranking=rank(archive, opened_run.space, minima, judged=True),
+        minima=minima,
+        metrics=_metrics_of(folder, archive),
+        search=search,
+        origin={} if search is None else folder.read_config(),
+        gpus=gpus if type(gpus) is int else 0,
+        policy=spec_of(policy or searched, opened_run.robot),
+        named_policy=policy,
+    )
+
+
+def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
+    """The rows up to the archive's iteration; a run that goes on meanwhile may have some more."""
+    if not (folder.path / METRICS_FILE).exists():
+        return None
+    rows = folder.read_metrics()[: archive.iterations]
+    if len(rows) < archive.iterations:
+        raise ValueError(
+            f"{folder.path / METRICS_FILE} must have a row for each of {archive.iterations} iterations, got "
+            f"{len(rows)}: resume the search, which writes it again"
+        )
+    return rows
+
+
+def _why_not_crossed(material: Material, device: str | None) -> str:
     """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
+    opened_run = material.opened_run
     try:
         if material.named_policy is None and material.search is not None:
-            find_policy(material.run, material.search, material.robot)
-        check_policy(material.policy, material.robot, device)
+            find_policy(opened_run.path, material.search, opened_run.robot)
+        check_policy(material.policy, opened_run.robot, resolve_device(device))
     except ValueError as error:
         if material.named_policy is not None:
             raise
-        return f"Left out: the controller of the search cannot be loaded: {error}. Name one with --policy"
+        return f"No terrain is crossed, since the search's controller cannot be loaded: {error}. Name it with --policy."
     return ""
-
-
-def _lead(shown: Shown) -> str:
-    """What stands under the title; another controller than was searched is named here."""
-    lead, material = search.lead_words(shown), shown.material
-    if material.named_policy is None:
-        return lead
-    other = without_machine(material.policy)
-    return f"{lead} The crossings shown are of another controller than was searched: {other}."

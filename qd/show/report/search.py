@@ -1,154 +1,195 @@
-"""The page's chapters about the search: what was done, what came out, its curves and its archive."""
+"""The page about a search, in data: how the controller fails, on which terrains, and where the numbers come from."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from qd.faults import any_of, count_faults, fault_words
-from qd.fitness import FAILING_GOAL_RATE
-from qd.run.progress import clock
-from qd.show.figures import draw_archive, draw_curves, draw_spread, label_of
-from qd.show.report.elites import failures
-from qd.show.report.material import Shown
-from qd.show.report.page import (
-    Block,
-    Folded,
-    absent,
-    at_a_glance,
-    counted,
-    origin_table,
-    paragraph,
-    percent,
-    picture,
-    table,
-)
+from qd.archive import Archive
+from qd.faults import any_of, fault_numbers
+from qd.groups import VERDICTS, Ranking, summary_of
+from qd.minimise import MinimalTerrains
+from qd.run.directory import Metrics
+from qd.run.settings import SearchCfg
+from qd.show.crossed import Rate
+from qd.show.elites import OpenedRun
+from qd.show.figures import draw_archive, draw_curves
+from qd.show.report.page import figure_source, origin_rows, percent
+from qd.show.report.pictures import sheet_of
 from sim.files.command import command_line
 from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
 
+_MOST_BARS = 10
+_FAULT = VERDICTS.index("fault")
+_MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
-def lead_words(shown: Shown) -> str:
-    """What the page leads with: faults where they are known, how many terrains fail, and in which ways."""
-    elites, archive = shown.elites, shown.material.archive
-    failing = int(elites.failing.sum())
-    faults, count = archive.faults, count_faults(archive)
-    words = ""
-    if faults is not None and faults.certifiers and count is not None:
-        what = "fault: a terrain" if count == 1 else "faults: terrains"
-        words = f"{count:,} {what} that {any_of(faults.certifiers)} crosses and this controller does not. "
-    words += f"The controller fails on {failing:,} of {counted(len(elites), 'elite')}"
-    most_first = sorted(shown.modes.modes, key=lambda mode: -len(mode.members))
-    if not most_first:
-        return f"{words}."
-    ways = "; ".join(
-        f"{mode.deed} ({len(mode.members):,}, marked by {label_of(mode.marked_by)})" for mode in most_first
-    )
-    return f"{words}, in {counted(len(most_first), 'way')}. The robot {ways}."
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """Everything that was read."""
+
+    opened_run: OpenedRun
+    ranking: Ranking
+    minima: MinimalTerrains | None
+    metrics: Metrics | None
+    """One row an iteration, up to those of the archive; None where there are none."""
+    search: SearchCfg | None
+    """None where the archive lies without its config."""
+    origin: Mapping[str, Any]
+    """Command, commit, device, versions, seed and date of the search, as far as they are known."""
+    gpus: int
+    """That the search took; 0 where that is not on record."""
+    policy: str
+    """Controller that crosses."""
+    named_policy: str | None
+    """The same where it is not the search's."""
+
+    @property
+    def archive(self) -> Archive:
+        """The elites."""
+        return self.opened_run.archive
+
+    @property
+    def controller(self) -> str:
+        """The controller that was searched, in words."""
+        searched = SHIPPED if self.search is None else self.search.policy
+        return "its shipped controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
+
+    @property
+    def crosser(self) -> str:
+        """The controller of the pictures, in words."""
+        return ControllerSpec.parse(self.policy).label
+
+    @property
+    def place(self) -> str:
+        """Where the archive lies."""
+        return without_machine(str(self.opened_run.path))
+
+    def command(self, word: str, **flags: object) -> str:
+        """A command about this run as a user types it."""
+        robot = self.opened_run.robot.spec
+        return without_machine(command_line(word, robot=robot, run=self.opened_run.path, **flags))
 
 
-def outcome_section(shown: Shown) -> list[Block]:
-    """In how many ways the controller breaks how often, a picture of each, and what was searched at what cost."""
-    elites, archive = shown.elites, shown.material.archive
-    failing, ways = int(elites.failing.sum()), elites.failing_cells
-    basis = (
-        f"by {int(elites.counted.max(initial=0))} fresh episodes each, free of the luck that made them elites"
-        if elites.fresh.any()
-        else "by the episodes that found them, which flatter themselves"
-    )
-    faults, count = archive.faults, count_faults(archive)
-    facts = []
-    if faults is not None and faults.certifiers and count is not None:
-        what = f"faults: elites that {any_of(faults.certifiers)} crosses and this controller does not"
-        facts.append((what, f"{count:,}"))
-    facts += [
-        ("elites that under half of the robots cross", f"{failing:,} of {len(elites):,}"),
-        ("failure modes: kinds of these", f"{len(shown.modes.modes)}"),
-        ("cells that these fall into: different shares of what goes wrong", f"{ways:,}"),
-        ("robots that reach the goal, mean over the elites", _rate(elites.goal_rate)),
-        ("robots that end in a base collision, mean over the elites", _rate(elites.collision_rate)),
-        ("robots that end fallen, mean over the elites", _rate(elites.fallen_rate)),
-    ]
-    text = (
-        f"The controller fails on {failing:,} of {counted(len(elites), 'elite')} judged ({basis}): there under "
-        f"{percent(FAILING_GOAL_RATE)} of the robots reach the goal, on {int((elites.goal_rate == 0.0).sum()):,} none. "
-        f"Means over the elites{' have 95 % intervals (bootstrap over terrains)' * (len(elites) >= _MIN_TERRAINS)}."
-    )
-    known, material = fault_words(archive), shown.material
-    judge = without_machine(command_line("judge", robot=material.robot.spec, run=material.run))
-    unknown = "Which of these are faults, terrains that another controller crosses, is not known yet. Next:"
-    about = [paragraph(" ".join([*known, text]))] if known else [absent(unknown, judge), paragraph(text)]
-    return [at_a_glance(facts), *failures(shown), *about, _searched(shown)]
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """A bar: how many terrains stop the robot by a cause."""
+
+    name: str
+    failing: int
+    faults: int
+    share: float
+    """Of the longest bar, in percent."""
+    tile: int | None
+    """Row of its worst elite; None of several causes together."""
 
 
-def _rate(rates: np.ndarray) -> str:
-    """Mean over terrains with its interval; of few terrains without, since resampling them says too little."""
-    mean = percent(float(rates.mean()))
-    limits = bootstrap_interval(rates, 0) if len(rates) >= _MIN_TERRAINS else None
-    return mean if limits is None else f"{mean} ({percent(limits[0])} to {percent(limits[1])})"
+@dataclass(frozen=True, kw_only=True)
+class Listing:
+    """Terrains in a table, each with a small picture."""
+
+    head: Sequence[str]
+    rows: Sequence[tuple[int, Sequence[str]]]
+    """Place of the picture, and words; the first are the number of the elite."""
+    wide: tuple[int, ...]
+    """Columns, from 1, that a phone has no room for."""
 
 
-def _searched(shown: Shown) -> Block:
-    """Robot, controller, method and cost in a sentence."""
-    material, numbers = shown.material, shown.material.summary
-    archive, search = material.archive, material.search
-    policy = SHIPPED if search is None else search.policy
-    controller = "its shipped controller" if policy == SHIPPED else f"controller {ControllerSpec.parse(policy).label}"
-    if search is None:
-        controller = "a controller that is not on record (the archive lies without its config.json)"
-    text = f"{archive.robot} with {controller}, after {counted(archive.iterations, 'iteration')}"
-    if search is not None:
-        text += f" of {search.scheduler.method.replace('+', ' and ')} (seed {search.seed})"
-    text += f": {counted(len(archive), 'elite')} in {percent(archive.reachable_coverage)} of the "
-    text += f"{archive.cells.num_cells:,} reachable cells"
-    if numbers is None or material.metrics is None:
-        return paragraph(f"{text}. What that cost is not on record: there is no metrics.jsonl beside the archive.")
-    text += f", from {counted(numbers['terrains_evaluated'], 'terrain')} and {numbers['episodes']:,} episodes"
-    where = f" on {'up to ' if material.gpus > 1 else ''}{counted(material.gpus, 'GPU')}" if material.gpus else ""
-    invalid = counted(numbers["invalid_episodes"], "episode was", "episodes were")
-    return paragraph(f"{text}, in {clock(numbers['wall_s'])} of searching{where}. {invalid} invalid and left out.")
+def content_of(material: Material) -> dict[str, Any]:
+    """What the template takes, beside the terrains that were crossed for the page."""
+    archive, ranking, minima, metrics = material.archive, material.ranking, material.minima, material.metrics
+    elites, space = ranking.elites, material.opened_run.space
+    certifiers = () if archive.faults is None else archive.faults.certifiers
+    return {
+        "material": material,
+        "summary": summary_of(ranking, archive),
+        "failing": int(elites.failing.sum()),
+        "certifiers": any_of(certifiers) if certifiers else "",
+        "numbers": fault_numbers(archive),
+        "fault_families": len(np.unique(ranking.families[elites.verdict == _FAULT])),
+        "means": {name: mean_words(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},
+        "causes": causes_of(ranking),
+        "tiles": sheet_of(archive.genes[elites.numbers], space),
+        "elites": _listed_elites(ranking),
+        "minimal_tiles": None if minima is None else sheet_of(np.array([*minima.genes.values()]), space),
+        "minimal": None if minima is None else _listed_minima(minima),
+        "curves": figure_source(draw_curves(archive, metrics)) if metrics else "",
+        "parallel": figure_source(draw_archive(archive)),
+        "origin": origin_rows(material.origin),
+    }
 
 
-def curves_section(shown: Shown) -> list[Block]:
-    """How the search went."""
-    rows, archive = shown.material.metrics, shown.material.archive
-    if not rows:
-        left_out = "The curves are left out: there is no metrics.jsonl beside the archive. A search writes one:"
-        return [absent(left_out, without_machine(command_line("archive", robot=shown.material.robot.spec)))]
-    first, last = rows[0], rows[-1]
-    half = next(row["iteration"] for row in rows if row["elites"] >= last["elites"] / 2)
-    text = (
-        f"From iteration {first['iteration']} to {last['iteration']} the archive grew from {first['elites']:,} to "
-        f"{counted(last['elites'], 'elite')}, half of them found by iteration {half}; the QD score, the sum of fitness "
-        f"above -20, rose from {first['qd_score']:,.0f} to {last['qd_score']:,.0f}, the mean fitness went from "
-        f"{first['mean_fitness']:.1f} to {last['mean_fitness']:.1f}."
-    )
-    shows = "QD score, number of elites with reachable coverage, and mean fitness over the iterations"
-    return [paragraph(text), picture("curves", draw_curves(archive, rows), shows)]
+def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
+    """Mean over terrains, with its interval over families where they are not few."""
+    limits = bootstrap_interval(rates, 0, families=families) if len(rates) >= _MIN_TERRAINS else None
+    return percent(float(rates.mean())) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
-def archive_section(shown: Shown) -> list[Block]:
-    """The archive on parallel axes, and its spread over each share."""
-    elites, archive = shown.elites, shown.material.archive
-    lines = (
-        f"Each line is one of {counted(len(elites), 'elite')}; each axis a penalty, the height its share of all that "
-        "went wrong."
-    )
+def causes_of(ranking: Ranking) -> list[Cause]:
+    """The bars, the longest first; the rarest causes share one."""
+    groups = [*ranking.by_cause().items()]
+    count = len(groups) if len(groups) <= _MOST_BARS else _MOST_BARS - 1
+    first, rest = groups[:count], groups[count:]
+    tiles: list[int | None] = [int(rows[0]) for _, rows in first]
+    if rest:
+        first = [*first, (f"{len(rest)} other causes", np.concatenate([rows for _, rows in rest]))]
+        tiles.append(None)
+    longest = max((len(rows) for _, rows in first), default=1)
     return [
-        paragraph(lines),
-        picture("archive", draw_archive(archive), "Parallel axes: a line an elite, an axis a penalty's share"),
-        Folded(
-            "Show the elites by interval of each share",
-            [picture("spread", draw_spread(archive), "Number of elites in each interval of each share")],
-        ),
-    ]
+        Cause(
+            name=name, failing=len(rows), faults=int((ranking.elites.verdict[rows] == _FAULT).sum()),
+            share=100.0 / longest, tile=tile,
+        )
+        for (name, rows), tile in zip(first, tiles, strict=True)
+    ]  # fmt: skip
 
 
-def origin_section(shown: Shown) -> list[Block]:
-    """Where the numbers come from."""
-    origin = shown.material.origin
-    if not origin:
-        lost = "The search is not on record: there is no config.json beside the archive. A search writes one:"
-        return [absent(lost, without_machine(command_line("archive", robot=shown.material.robot.spec)))]
-    text = f"The archive read is {without_machine(str(shown.material.run))}. Its search began with:"
-    return [paragraph(text), table(["", ""], origin_table(origin), words=True)]
+def _listed_elites(ranking: Ranking) -> Listing:
+    """Every elite, faults first, then what fails most."""
+    elites, rows = ranking.elites, []
+    for row in elites.by_severity().tolist():
+        rates = (elites.collision_rate[row], elites.fallen_rate[row])
+        rate = Rate(elites.hits("goal_rate", row), int(elites.counted[row]))
+        cells = [
+            f"{elites.numbers[row]}", ranking.name(row), VERDICTS[int(elites.verdict[row])],
+            f"{100 * elites.goal_rate[row]:.0f}", rate.limits, *(f"{100 * value:.0f}" for value in rates),
+            f"{ranking.families[row]}", f"{elites.fitness[row]:.1f}",
+        ]  # fmt: skip
+        rows.append((row, cells))
+    head = ["elite", "what happens", "verdict", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]",
+            "family", "fitness"]  # fmt: skip
+    return Listing(head=head, rows=rows, wide=(5, 6, 7, 8, 9))
+
+
+def _listed_minima(minima: MinimalTerrains) -> Listing:
+    """Every minimal terrain."""
+    rows = []
+    for place, entry in enumerate(minima.numbers["elites"]):
+        cells = [
+            f"{entry['elite']}",
+            _shape_words(entry["cause"]),
+            f"{len(entry['bumps'])} of {entry['of']}",
+            "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
+            "{:.0f} to {:.0f} %".format(*(100 * limit for limit in entry["goal_interval"])),
+            "-" if entry["margin_m"] is None else f"{100 * entry['margin_m']:.1f}",
+            str(entry.get("verdict", "")),
+        ]
+        rows.append((place, cells))
+    head = ["elite", "cause", "parts left", "goal [%]", "95 % interval", "margin [cm]", "verdict"]
+    return Listing(head=head, rows=rows, wide=(3, 5, 6))
+
+
+def _shape_words(cause: Mapping[str, Any] | None) -> str:
+    """A cause with its size: ``ridge, 0.25 m high, 53 degrees steep``."""
+    if cause is None:
+        return "unclear"
+    height = cause.get("height_m")
+    if not height:
+        return cause["kind"]
+    steep = f", {cause['slope_deg']:.0f} degrees steep" if "slope_deg" in cause else ""
+    return f"{cause['kind']}, {abs(height):.2f} m {'high' if height > 0 else 'deep'}{steep}"

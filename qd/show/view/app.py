@@ -13,7 +13,7 @@ from qd.show.recordings import Recordings
 from qd.show.view.bar import Bar
 from qd.show.view.common import Common
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import first_view_of, shapes_of, sky
+from qd.show.view.scene import SKY, first_view_of, shapes_of
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
@@ -55,7 +55,7 @@ class App:
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
-        self.page.scene.set_background_image(sky())
+        self.page.scene.set_background_image(SKY)
         self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
         self.page.on_client_connect(self._come)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))

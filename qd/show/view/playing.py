@@ -80,8 +80,8 @@ def crossing_of(
     newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
     size = np.linalg.norm(newtons, axis=-1)
     arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
-    shapes = [skeleton.geom(name) for name in recording.foot_names]
-    bodies, centres = [foot.body for foot in shapes], np.stack([foot.position for foot in shapes])
+    shapes = [skeleton.model.geom(name) for name in recording.foot_names]
+    bodies, centres = [foot.bodyid[0] - 1 for foot in shapes], np.stack([foot.pos for foot in shapes])
     feet = positions[:, bodies] + rotated(quaternions[:, bodies], centres)
     command = recording.command[0, replica, :frames].astype(np.float64)
     columns = [recording.penalty_names.index(name) for name in penalties]

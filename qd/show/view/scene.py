@@ -9,17 +9,7 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import (
-    Color,
-    Part,
-    arrow_mesh,
-    arrow_pose,
-    in_bytes,
-    joined,
-    path_mesh,
-    robot_parts,
-    terrain_mesh,
-)
+from qd.show.view.meshes import Color, Part, arrow_mesh, arrow_pose, in_bytes, robot_parts, terrain_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
@@ -34,12 +24,13 @@ FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
 GHOST_COLOR = in_bytes(OTHER_CONTROLLER)
 """Of the second robot, which is translucent."""
 _START_COLOR, _GOAL_COLOR, _WAY_COLOR = (255, 255, 255), (0, 158, 115), (240, 200, 60)
-_SKY = np.array([[140, 178, 214], [232, 238, 243]])  # above and below
+SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
+"""What is behind all, blue above and pale below, as an image of one column."""
 _BEHIND = np.array([-1.6, -2.4, 1.5])
 """From the robot to the camera that follows it [m]."""
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
-_PATH_RADIUS, _PATH_OPACITY = 0.008, 0.35
+_PATH_WIDTH = 1.2  # [pixels]
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _START_RADIUS, _DISC_HEIGHT, _DISC_OPACITY = 0.25, 0.02, 0.5
@@ -68,12 +59,6 @@ def first_view_of(width: int, height: int) -> View:
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
 
 
-def sky() -> NDArray[np.uint8]:
-    """What is behind all: blue above, pale below, shape (256, 1, 3)."""
-    share = np.linspace(0.0, 1.0, 256)[:, None, None]
-    return np.rint((1.0 - share) * _SKY[0] + share * _SKY[1]).astype(np.uint8)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
     """What all tabs show of the robot, in the frames of its bodies."""
@@ -81,16 +66,12 @@ class Shapes:
     parts: list[Part]
     num_bodies: int
     feet: tuple[str, ...]
-    """Names of the feet, which are the last geoms of the robot."""
-    num_others: int
-    """Geoms before the feet."""
+    """Their names."""
 
 
 def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
     """The shapes of a robot."""
-    num_others = len(robot.geom_names) - len(robot.foot_geoms)
-    bodies = len(skeleton.body_names)
-    return Shapes(parts=robot_parts(skeleton), num_bodies=bodies, feet=robot.foot_geoms, num_others=num_others)
+    return Shapes(parts=robot_parts(skeleton, robot), num_bodies=skeleton.num_bodies, feet=robot.foot_geoms)
 
 
 class Scene:
@@ -106,7 +87,7 @@ class Scene:
         for k, part in enumerate(shapes.parts):
             name = f"/robot/{part.body}/{k}"
             self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
-            color = FOOT_TOUCH_COLOR if max(part.touches, default=0) >= shapes.num_others else TOUCH_COLOR
+            color = FOOT_TOUCH_COLOR if part.is_foot else TOUCH_COLOR
             self.touched.append(self._add_mesh(f"{name}-touched", part.mesh, color, cast_shadow=True))
         self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
         self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
@@ -173,14 +154,14 @@ class Scene:
         self.paths = []
 
     def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], Color]]) -> None:
-        """Show the way of the base in every episode as points [m] and colour, thin and translucent."""
+        """Show the way of the base in every episode as points [m] and colour, thin."""
         self._drop_paths()
-        for color in dict.fromkeys(color for _, color in paths):
-            tubes = [path_mesh(points, _PATH_RADIUS) for points, other in paths if other == color and len(points) > 1]
-            if tubes:
-                mesh: Any = trimesh.util.concatenate(tubes)
-                name = f"/paths/{len(self.paths)}"
-                self.paths.append(self._add_mesh(name, mesh, color, opacity=_PATH_OPACITY))
+        ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
+        colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
+        if paths:
+            look: Any = {"colors": np.concatenate(colors), "thickness": _PATH_WIDTH, "thickness_units": "screen"}
+            add = self._client.scene.add_line_segments
+            self.paths = [add("/paths", np.concatenate(ends), visible=False, **look)]
         self._show_paths()
 
     def switch_paths(self, shown: bool) -> None:
@@ -222,12 +203,9 @@ class Scene:
         positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
             if not self._ghost_parts:
-                for body in range(self._shapes.num_bodies):
-                    meshes = [part.mesh for part in self._shapes.parts if part.body == body]
-                    if meshes:
-                        mesh = self._add_mesh(f"/ghost/{body}/all", joined(meshes), GHOST_COLOR, opacity=_GHOST_OPACITY)
-                        mesh.visible = True
-                        self._ghost_parts.append(mesh)
+                for k, part in enumerate(self._shapes.parts):
+                    name_of_part, look = f"/ghost/{part.body}/{k}", {"opacity": _GHOST_OPACITY, "visible": True}
+                    self._ghost_parts.append(self._add_mesh(name_of_part, part.mesh, GHOST_COLOR, **look))
             self.ghost.visible = True
             for handle, position, quaternion in zip(self.ghost_bodies, positions, quaternions, strict=True):
                 _place(handle, position, quaternion)
@@ -238,14 +216,12 @@ class Scene:
         """Show the robot alone."""
         self.ghost.visible = False
 
-    def _add_mesh(
-        self, name: str, mesh: trimesh.Trimesh, color: Color, *, opacity: float | None = None, cast_shadow: bool = False
-    ) -> Any:
-        """A shape of one colour, not visible yet."""
+    def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:
+        """A shape of one colour, without shadow and not visible yet unless its look is another."""
+        look = {"visible": False, "cast_shadow": False, "receive_shadow": False} | look
         return self._client.scene.add_mesh_simple(
-            name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, opacity=opacity, visible=False,
-            cast_shadow=cast_shadow, receive_shadow=False,
-        )  # fmt: skip
+            name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, **look
+        )
 
     def _go_along(self, base: Points) -> None:
         """Move the camera as the base has moved, if it is to follow."""

@@ -74,7 +74,6 @@ def test_rows_are_by_value():
     [
         # From .9 at 0.2 m to .1 at 0.4 m: half at 0.3 m. The limits pass it from .8 to 0 and from 1 to .3.
         ("ditch", (0.9, 0.1), [(0.8, 1.0), (0.0, 0.3)], 0.3, [0.2 + 0.2 * 0.3 / 0.8, 0.2 + 0.2 * 0.5 / 0.7]),
-        ("ditch", (0.4, 0.1), [(0.3, 0.6), (0.0, 0.3)], None, [None, 0.2 + 0.2 * 0.1 / 0.3]),
         # Friction gets harder as it falls: .9 at 0.4 and .1 at 0.2.
         ("friction", (0.9, 0.1), [(0.8, 1.0), (0.0, 0.3)], 0.3, [0.4 - 0.2 * 0.5 / 0.7, 0.4 - 0.2 * 0.3 / 0.8]),
         ("friction", (0.9, 0.7), [(0.8, 1.0), (0.6, 0.8)], None, [None, None]),

@@ -31,12 +31,3 @@ def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(inside, t
     content = torch.load(path, weights_only=True)
     torch.save(content | ({"extra": part} if inside == "checkpoint" else part), path)
     assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(part[TRAINED_ON])
-
-
-def test_a_file_of_another_kind_has_no_marks(tmp_path):
-    torch.jit.script(torch.nn.Linear(2, 3)).save(tmp_path / "script.pt")
-    torch.save([1, 2], tmp_path / "list.pt")
-    torch.save({"extra": 5}, tmp_path / "number.pt")
-    (tmp_path / "text.pt").write_text("no weights")
-    for file in tmp_path.iterdir():
-        assert recorded_marks(str(file)) == set()

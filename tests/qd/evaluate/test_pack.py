@@ -92,16 +92,13 @@ def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
         return make_pack(run, controllers, compute=CPU, open_evaluator=crosser.open, out=Path("pack"), **changes)
 
     given = {"compute": CPU, "open_evaluator": judges}
-    with pytest.raises(ValueError, match="judge"):
-        make(base)
     judge(run, stages=("resolved",), **given)
     with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
         make(base)
     judge(run, stages=("others",), certifiers=TUNED, **given)
     minimise(run, elite=" ".join(map(str, first)), judged=True, certifiers=TUNED, **given)
-    for changes in ({"robot": "cassie"}, {"controllers": {"C-G": TUNED["C-G"].replace("anymal", "cassie")}}):
-        with pytest.raises(ValueError, match="anymal"):
-            make(**{"controllers": base, **changes})
+    with pytest.raises(ValueError, match="anymal"):
+        make(base, robot="cassie")
     assert not Path("pack").exists() and not crosser.opened
 
     content, archive = make(base | TUNED), read_archive(run)
@@ -112,19 +109,15 @@ def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
     faults = int((archive.confirmed & archive.certified).sum())
     assert verdicts == sorted(verdicts) and verdicts.count("fault") == faults + 2
     assert len(minimal) == 2 and all(about["parts"] == [4] and about["cause"] == "rise" for about in minimal)
-    assert {about["cause"] for about in content["terrains"] if about["elite"] == minimal[0]["elite"]} == {"rise"}
     for about in content["terrains"]:
         assert about["searched"]["goal_rate"] < 0.75 and about["certificates"][0]["controller"] == "C-G"
         assert about["rates"]["C-G"]["goal_rate"] == 1.0 and about["rates"]["base"]["valid_episodes"] == 20
-    assert content["searched"] == "base" and content["rates"]["C-G"]["goal_rate"] == 1.0
-    assert content["certifiers"] == ["C-G"]
+    assert (content["searched"], content["certifiers"]) == ("base", ["C-G"])
     failing = sum(about["rates"]["base"]["goal_rate"] < 0.5 for about in content["terrains"])
     assert content["rates"]["base"]["failing"] == failing
-    heights = read_pack(Path("pack")).heights
     few = make(TUNED, size=3)  # the first of the same; the searched controller is always among those that cross
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [about["name"] for about in few["terrains"]] == [about["name"] for about in content["terrains"][:3]]
-    np.testing.assert_array_equal(read_pack(Path("pack")).heights, heights[:3])
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
 
 
@@ -148,11 +141,6 @@ def pack(tmp_path, anymal, monkeypatch):
     return heights
 
 
-def change_json(**changes):
-    content = json.loads(Path("pack/pack.json").read_text()) | changes
-    Path("pack/pack.json").write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
-
-
 def test_a_pack_is_read_as_it_was_written(pack):
     stored = read_pack(pack_folder("pack"))
     assert len(stored) == 3 and stored.terrains[1]["verdict"] == "near-fault"
@@ -164,24 +152,18 @@ def test_a_pack_is_read_as_it_was_written(pack):
         pack_folder("dog")
 
 
-@pytest.mark.parametrize("damage", ["json", "npz", "other", "key"])
+@pytest.mark.parametrize("damage", ["npz", "other", "key"])
 def test_a_damaged_pack_is_refused(pack, damage):
-    file = Path("pack/pack.json" if damage == "json" else "pack/pack.npz")
-    data = file.read_bytes()
+    file, content = Path("pack/pack.npz"), json.loads(Path("pack/pack.json").read_text())
     if damage == "other":  # of another making
         write_terrains(Path("pack"), round_heights(pack[::-1]), np.zeros((3, 64), np.float32))
     elif damage == "key":
-        change_json(rates=None)
+        del content["rates"]
+        Path("pack/pack.json").write_text(json.dumps(content))
     else:
-        file.write_bytes(data[:-9])
+        file.write_bytes(file.read_bytes()[:-9])
     with pytest.raises(ValueError, match="pack"):
         read_pack(Path("pack"))
-
-
-def test_a_pack_of_the_robot_before_it_changed_is_refused(pack, capsys):
-    change_json(robot_sha256="0" * 64)
-    assert run_command(Evaluate, ["--pack", "pack", "--device", "cpu"], name="evaluate") == 2
-    assert "pack/pack.json" in capsys.readouterr().err
 
 
 def test_rates_over_a_pack_are_means_with_families_drawn_together():

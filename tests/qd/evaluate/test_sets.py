@@ -98,18 +98,6 @@ def test_a_set_is_the_same_whenever_it_is_made():
             make_sets(names, 6, 0)
 
 
-def test_validation_sets_have_other_terrains_and_starts_and_hard_random_ones_are_of_a_space():
-    archive, names = make_archive(60), ("hand_crafted", "hard_random", "generated")
-    test, validation = (make_sets(names, 6, 0, archive=archive, part=part, space=COURSE) for part in PARTS)
-    for name in names:
-        assert (validation[name].seeds[:5] != test[name].seeds[:5]).all()
-    assert test["hard_random"].terrains.shape == (6, 36) and test["hard_random"].space == "course"
-    assert (validation["hard_random"].terrains != test["hard_random"].terrains).any()
-    assert validation["generated"].numbers.tolist() == split_elites(archive).validation.tolist()
-    with pytest.raises(ValueError, match="validation"):
-        make_sets((), 6, 0, archive=archive, independent=make_archive(9, seed=1), part="validation")
-
-
 def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
     archive = make_archive(10)
     many = generated_set(archive, 300, 0)

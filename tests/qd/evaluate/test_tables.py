@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.evaluate.figures import draw_tables
 from qd.evaluate.labels import FATES
 from qd.evaluate.measures import measure
 from qd.evaluate.sets import Certificates
@@ -139,10 +138,13 @@ def test_one_training_is_not_several(tmp_path):
 
 def test_tables_are_read_as_they_were_written(certified, report, anymal, tmp_path):
     assert as_tables(json.loads(json.dumps(certified))) == certified
-    (tmp_path / "tables.json").write_text(json.dumps({**report, **robot_identity(anymal), "part": "validation"}))
-    for file, error in (("tables.json", ValueError), ("none.json", FileNotFoundError)):
-        with pytest.raises(error, match=file):
-            read_tables(tmp_path / file, anymal)
+    file = tmp_path / "tables.json"
+    file.write_text(json.dumps({**report, **robot_identity(anymal)}))
+    assert read_tables(file, anymal)["goal"] == report["goal"]
+    file.write_text(json.dumps({**report, "robot": "cassie"}))
+    for bad, error in ((file, ValueError), (tmp_path / "none.json", FileNotFoundError)):
+        with pytest.raises(error, match=bad.name):
+            read_tables(bad, anymal)
 
 
 @pytest.mark.parametrize(
@@ -168,15 +170,8 @@ def test_the_terminal_shows_the_numbers(report, capsys):
     assert any("C-G on generated: 4 episodes are invalid (33.3%)" in line for line in lines)
 
 
-def test_the_figure_shows_the_tables(report):
-    *_, reward = draw_tables(report).axes
-    points = next(line for line in reward.lines if line.get_marker() == "s")
-    np.testing.assert_allclose(points.get_ydata(), [report["reward"][name]["C-G"] for name in report["reward"]])
-
-
 def test_tables_without_a_valid_terrain_are_shown_too(anymal, capsys):
     nothing = tables_of(anymal, {"generated": {"base": make_measured([0, 0], of=4, bad=[0, 1])}}, {})
     assert nothing["success"]["generated"]["base"] is None and nothing["differences"] == {"generated": {}}
     show_tables(nothing)
-    draw_tables(nothing).canvas.draw()
     assert "base" in capsys.readouterr().out

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.faults import fresh_numbers
-from qd.show.figures import draw_archive, draw_curves, draw_spread, spread, summary, write_figures
+from qd.show.figures import draw_archive, draw_curves, relief, spread, summary, write_figures
 from tests.builders import fresh_values, small_archive
 
 ROW = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5, "reachable_coverage": 0.1}
@@ -83,9 +83,18 @@ def test_spread_by_hand():
     assert counts.shape == (2, 10, 2) and counts.sum() == 8
     assert counts[0, :3].tolist() == [[1, 1], [0, 1], [1, 0]]
     assert counts[1, 7:].tolist() == [[1, 0], [0, 1], [1, 1]]
-    without, collides = draw_spread(archive).axes[0].containers
-    assert [bar.get_height() for bar in without][:3] == [1, 0, 1]
-    assert [(bar.get_y(), bar.get_height()) for bar in collides][:3] == [(1, 1), (0, 1), (1, 0)]
     # a collision bit puts a second copy of the 10 cells behind the first
     bit = dataclasses.replace(archive, collision_bit=True, cell=np.array([0, 10, 11, 2]))
     assert np.array_equal(spread(bit), counts)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_relief_is_blue_below_the_start_and_brown_above_with_start_and_goal(every):
+    heights = np.zeros((161, 321), np.float32)
+    heights[:, 100:160], heights[:, 160:220] = -0.4, 0.4
+    pixels = relief(heights[::every, ::every])
+    low, high = (pixels[40 // every, column // every].astype(int) for column in (130, 190))
+    assert low[2] > low[0] and high[0] > high[2]
+    # start at (2, 4) m and goal at (14, 4) m, nodes 0.05 m apart
+    assert pixels[80 // every, 40 // every].tolist() == [240, 200, 60]
+    assert pixels[80 // every, 280 // every].tolist() == [0, 158, 115]

@@ -7,7 +7,7 @@ import pytest
 
 from qd.show.recordings import Recordings, on_elite
 from tests.builders import small_archive
-from tests.qd.recordings import recording_of, stand_in_cross
+from tests.qd.recordings import stand_in_cross
 
 
 @pytest.fixture
@@ -47,16 +47,6 @@ def test_a_damaged_file_counts_as_none_and_is_written_again(anymal, wanted, reco
     assert again.read(wanted) is None
     again.keep(wanted, recording)
     assert Recordings(anymal, folder=tmp_path).read(wanted) is not None
-
-
-def test_of_code_without_a_file_only_the_last_recording_is_known(anymal, wanted, tmp_path):
-    wanted, recording = dataclasses.replace(wanted, policy="builtins:abs"), recording_of([1], [14.0])
-    recordings = Recordings(anymal, folder=tmp_path / "none")
-    recordings.keep(wanted, recording)
-    assert recordings.read(wanted) is recording
-    assert recordings.read(dataclasses.replace(wanted, terrain=-wanted.terrain)) is None
-    assert Recordings(anymal, folder=tmp_path / "none").read(wanted) is None
-    assert not (tmp_path / "none").exists()
 
 
 def test_what_is_missing_is_crossed_in_batches_of_one_controller(anymal, tmp_path):

@@ -158,7 +158,7 @@ def test_geoms_without_a_name_are_called_by_their_body_and_shown_so(tmp_path):
     file = write_dog(tmp_path, model=re.sub(r'name="\w+_thigh" (?=type)', "", mjcf()))
     replace_once(file, '("thigh", "shank")', '("thigh_geom_0", "shank")')
     dog = get_robot(str(file))
-    assert "HR_thigh_geom_0" in geom_names(build_robot(dog)) and Skeleton(dog).geom("HR_thigh_geom_0")
+    assert "HR_thigh_geom_0" in geom_names(build_robot(dog)) and Skeleton(dog).model.geom("HR_thigh_geom_0")
 
 
 def test_the_digest_tells_models_apart(tmp_path):

@@ -35,37 +35,32 @@ def test_bodies_and_shapes_stand_where_mujoco_has_them(robot, skeleton):
     model = mujoco.MjModel.from_xml_path(str(robot.model_file))
     data, qpos = mujoco.MjData(model), random_coordinates(robot, 4)
     positions, quaternions = skeleton.body_poses(qpos)
-    assert skeleton.parents[0] == -1
     for frame, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(positions[frame], data.xpos[1:], atol=1e-12)
-        for geom in map(skeleton.geom, robot.geom_names):
-            turn = matrix_of(quaternions[frame, geom.body])
-            centre = positions[frame, geom.body] + turn @ geom.position
-            np.testing.assert_allclose(centre, data.geom(geom.name).xpos, atol=1e-12)
-            expected = data.geom(geom.name).xmat.reshape(3, 3)
-            np.testing.assert_allclose(turn @ matrix_of(geom.quaternion), expected, atol=1e-12)
-        for child, parent in enumerate(skeleton.parents[1:], start=1):
-            joint = positions[frame, parent] + matrix_of(quaternions[frame, parent]) @ skeleton.offsets[child]
-            np.testing.assert_allclose(positions[frame, child], joint, atol=1e-9)
-    with pytest.raises(ValueError, match="wing"):
-        skeleton.geom("wing")
+        for name in robot.geom_names:
+            geom = skeleton.model.geom(name)
+            turn = matrix_of(quaternions[frame, geom.bodyid[0] - 1])
+            centre = positions[frame, geom.bodyid[0] - 1] + turn @ geom.pos
+            np.testing.assert_allclose(centre, data.geom(name).xpos, atol=1e-12)
+            expected = data.geom(name).xmat.reshape(3, 3)
+            np.testing.assert_allclose(turn @ matrix_of(geom.quat), expected, atol=1e-12)
     with pytest.raises(ValueError, match="qpos"):
         skeleton.body_poses(np.zeros((2, 7)))
 
 
 def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot, skeleton):
     """No shape that collides is seen; each role shows its touch, feet by what is where they are."""
-    assert {geom.body for geom in skeleton.geoms} == set(range(len(skeleton.body_names)))
-    assert not {geom.name for geom in skeleton.geoms} & set(robot.geom_names)
+    model, touches = skeleton.model, skeleton.touches
+    assert {model.geom_bodyid[geom] - 1 for geom in touches} == set(range(skeleton.num_bodies))
     for column, name in enumerate(robot.geom_names):
-        shapes, geom = [shape for shape in skeleton.geoms if column in shape.touches], skeleton.geom(name)
-        assert shapes and {shape.body for shape in shapes} == {geom.body}
-        away = min(np.linalg.norm(shape.position - geom.position) for shape in shapes)
+        own, shapes = model.geom(name), [geom for geom, columns in touches.items() if column in columns]
+        assert own.id not in touches and {model.geom_bodyid[geom] for geom in shapes} == set(own.bodyid)
+        away = min(np.linalg.norm(model.geom_pos[geom] - own.pos) for geom in shapes)
         assert away < (0.01 if name in robot.foot_geoms else 0.12)
     if robot.name == "anymal":  # a shank's touch is not its foot's
-        assert all(len(shape.touches) <= 1 for shape in skeleton.geoms)
+        assert all(len(columns) <= 1 for columns in touches.values())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -82,16 +77,21 @@ def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
         state.joint_q.assign(row[[0, 1, 2, 4, 5, 6, 3, *range(7, len(row))]].astype(np.float32))
         newton.eval_fk(model, state.joint_q, model.joint_qd, state)
         for name in (*dog.limb_geoms, *dog.foot_geoms):
-            shape, geom = names.index(name), skeleton.geom(name)
+            shape, geom = names.index(name), skeleton.model.geom(name)
             pose = wp.transform(*state.body_q.numpy()[builder.shape_body[shape]])
             expected = np.array((pose * builder.shape_transform[shape]).p)
-            shown = position[geom.body] + matrix_of(quaternion[geom.body]) @ geom.position
-            np.testing.assert_allclose(shown, expected, atol=1e-5)
+            body = geom.bodyid[0] - 1
+            np.testing.assert_allclose(position[body] + matrix_of(quaternion[body]) @ geom.pos, expected, atol=1e-5)
 
 
-LOOK = (
-    '<mujoco><worldbody><body name="{}"><geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/></body></worldbody></mujoco>'
-)
+BOX = '<geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/>'
+LOOK = f'<mujoco><worldbody><body name="{{}}">{BOX}</body></worldbody></mujoco>'
+
+
+def kinds_of(dog, body):
+    """Types of what is seen of a body, and what touches they show."""
+    shapes = [geom for geom in dog.touches if dog.model.body(dog.model.geom_bodyid[geom]).name == body]
+    return [(mujoco.mjtGeom(dog.model.geom_type[geom]).name[7:], dog.touches[geom]) for geom in shapes]
 
 
 def test_what_is_seen_of_a_users_robot(tmp_path):
@@ -101,22 +101,20 @@ def test_what_is_seen_of_a_users_robot(tmp_path):
     visual = '<visual><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
     model.write_text(model.read_text().replace('<link name="FL_thigh">', f'<link name="FL_thigh">{visual}'))
     robot = get_robot(str(file))
+    thigh, other, third = ((robot.geom_names.index(f"{leg}_thigh"),) for leg in ("FL", "FR", "HR"))
     dog = Skeleton(robot)
-    kinds = {name: [geom.kind for geom in dog.geoms if geom.body == k] for k, name in enumerate(dog.body_names)}
-    assert kinds["FL_thigh"] == ["box"] and kinds["FR_thigh"] == ["capsule", "capsule"]  # the second is its bone
-    assert dog.geom("FL_thigh").kind == "capsule"  # what touches is known all the same
-    thigh, other = (robot.geom_names.index(f"{leg}_thigh") for leg in ("FL", "HR"))
-    assert [shape.touches for shape in dog.geoms if shape.kind == "box"] == [(0,), (thigh,)]
+    assert kinds_of(dog, "FL_thigh") == [("BOX", thigh)] and dog.model.geom("FL_thigh").type == [3]  # still a capsule
+    assert kinds_of(dog, "FR_thigh") == [("CAPSULE", other), ("CAPSULE", other)]  # itself and its bone
     file.with_suffix(".look.xml").write_text(LOOK.format("HR_thigh"))
-    (red,) = (shape for shape in Skeleton(robot).geoms if shape.color == (1.0, 0.0, 0.0))
-    assert red.touches == (other,) and red.size.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    dog = Skeleton(robot)
+    assert kinds_of(dog, "HR_thigh") == [("BOX", third)]
+    shape, color = dog.shape(next(geom for geom, columns in dog.touches.items() if columns == third))
+    assert color.tolist() == [1.0, 0.0, 0.0] and shape.extents.tolist() == pytest.approx([0.2, 0.4, 0.6])
     file = with_mesh(tmp_path / "more", "mjcf")
     model = file.with_suffix(".xml")
     cover = '<geom type="mesh" mesh="trunk" contype="0" conaffinity="0"/><geom name="trunk" size="0.1"'
     model.write_text(model.read_text().replace('<geom name="trunk" type="mesh" mesh="trunk"', cover, 1))
-    dog = Skeleton(get_robot(str(file)))
-    assert [geom.kind for geom in dog.geoms if geom.body == 0] == ["mesh"] and dog.geom("trunk").kind == "sphere"
-    assert any(geom.kind != "mesh" for geom in dog.geoms)
+    assert kinds_of(Skeleton(get_robot(str(file))), "trunk") == [("MESH", (0,))]
 
 
 def test_a_look_of_no_body_of_the_robot_is_named(tmp_path):
@@ -125,3 +123,25 @@ def test_a_look_of_no_body_of_the_robot_is_named(tmp_path):
         file.with_suffix(".look.xml").write_text(text)
         with pytest.raises(ValueError, match=rf"dog\.look\.xml.*{words}"):
             Skeleton(get_robot(str(file)))
+
+
+SHAPES = {"sphere": ".2", "capsule": ".1 .3", "ellipsoid": ".1 .2 .3", "cylinder": ".1 .3", "box": ".1 .2 .3"}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_the_vertices_of_a_shape_lie_on_it(tmp_path, kind):
+    """By MuJoCo's rays toward its middle from a metre off."""
+    file = write_dog(tmp_path, **KINDS["mjcf"])
+    box = f'type="{kind}" size="{SHAPES[kind]}" pos=".3 -.2 .1" quat=".5 .5 -.5 .5"'
+    file.with_suffix(".look.xml").write_text(LOOK.format("trunk").replace('type="box" size=".1 .2 .3"', box))
+    dog = Skeleton(get_robot(str(file)))
+    (geom,) = (geom for geom in dog.touches if dog.model.geom_bodyid[geom] == 1)
+    mesh, model, turn = dog.shape(geom)[0], dog.model, np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    points = np.float64(np.float32(mesh.vertices))  # a ray along an edge misses it
+    inward = model.geom_pos[geom] - points
+    size = np.linalg.norm(inward, axis=1)
+    for point, way in zip(points[size > 1e-6], (inward / size[:, None])[size > 1e-6], strict=True):
+        cast = (model.geom_pos[geom], turn, model.geom_size[geom], point - way, way, model.geom_type[geom])
+        assert mujoco.mju_rayGeom(*cast) == pytest.approx(1.0, abs=1e-5)
+    assert mesh.volume > 0.0  # faces look outward

@@ -1,8 +1,9 @@
 """Fixtures of the report's tests."""
 
 import pytest
+from PIL import Image
 
-from tests.qd.show.report.pages import DOT, make_run, reporter
+from tests.qd.show.report.pages import make_run, reporter
 
 
 @pytest.fixture
@@ -12,7 +13,7 @@ def run(tmp_path):
 
 @pytest.fixture
 def reported(run, monkeypatch):
-    """Makes reports whose figures are a dot, without rendered pictures: drawing takes most of the time."""
+    """Makes reports whose figures are a dot, without close pictures: drawing takes most of the time."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
-    monkeypatch.setattr("sim.files.figures._png_of", lambda figure: DOT)
+    monkeypatch.setattr("qd.show.report.page.as_image", lambda figure: Image.new("RGB", (1, 1)))
     return reporter(run, monkeypatch)

@@ -1,8 +1,9 @@
 """Pages and runs for the tests of the report."""
 
 import dataclasses
+import html
 import json
-from html.parser import HTMLParser
+import re
 
 import numpy as np
 
@@ -16,34 +17,11 @@ from tests.qd.recordings import stand_in_cross
 from tests.qd.show.test_figures import rows
 from tests.qd.test_groups import grouped_archive
 
-DOT = bytes.fromhex("89504e470d0a1a0a")
-VOID = {"meta", "img", "br", "link", "input", "hr"}
 
-
-class Page(HTMLParser):
-    """Text, resources, anchors and balance of a page."""
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__()
-        self.open, self.words, self.resources, self.links, self.ids = [], [], [], [], []
-        self.feed(content.decode())
-        self.close()
-        self.text = " ".join(" ".join(self.words).split())
-
-    def handle_starttag(self, tag, attrs):
-        given = dict(attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-        self.resources += [given[name] for name in ("src", "srcset", "data", "action") if name in given]
-        self.links += [given["href"]] if "href" in given else []
-        self.ids += [given["id"]] if "id" in given else []
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] not in ("style", "script"):
-            self.words.append(data)
+def text_of(content: bytes) -> str:
+    """What a page shows, in one line."""
+    words = re.sub(r"<(style|script)>.*?</\1>|<[^>]*>", " ", content.decode(), flags=re.DOTALL)
+    return " ".join(html.unescape(words).split())
 
 
 def make_run(root):
