@@ -88,20 +88,13 @@ def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_anoth
     assert_same(result, stand_in.evaluate(GENES[order], SEEDS[order], 20))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"replicas": 10},
-        {"how": "resolved"},
-        {"reward": True},
-        {"penalties_from_s": 1.0},
-        {"space": "course"},
-        {"policy": str(get_robot("cassie").policy_file)},
-        {"genes": -GENES},
-        {"seeds": SEEDS + np.uint32(100)},
-    ],
-    ids=lambda change: next(iter(change)),
-)
+CHANGES = [
+    {"replicas": 10}, {"how": "resolved"}, {"reward": True}, {"penalties_from_s": 1.0}, {"space": "course"},
+    {"policy": str(get_robot("cassie").policy_file)}, {"genes": -GENES}, {"seeds": SEEDS + np.uint32(100)},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: next(iter(change)))
 def test_crossings_of_another_kind_are_not_found(tmp_path, change):
     cross_all(StandIn(), tmp_path)
     other = StandIn()
@@ -120,11 +113,6 @@ def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path,
     changed = StandIn()
     cross_all(changed, tmp_path)
     assert len(changed.crossed) == len(GENES)
-
-
-def test_nothing_is_stored_of_a_controller_whose_code_has_no_file(tmp_path):
-    cross_all(StandIn(), tmp_path, policy="builtins:abs")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("damage", ["flip", "rename", "lacks"])
@@ -186,11 +174,13 @@ def test_lots_fill_the_device():
     assert (cpu.num_terrains, cpu.num_workers) == (6, 3)
 
 
-def test_no_terrains_open_nothing():
+def test_no_terrains_open_nothing_and_a_controller_whose_code_has_no_file_is_not_stored(tmp_path):
     opened = StandIn()
     result = cross_all(opened, genes=GENES[:0], seeds=SEEDS[:0], reward=True)
     assert result.penalties.shape == (0, 20, 6) and result.reward.shape == result.outcome.shape == (0, 20)
     assert opened.cfgs == []
+    cross_all(StandIn(), tmp_path, policy="builtins:abs")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
