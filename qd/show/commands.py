@@ -87,7 +87,7 @@ class Film(Replay):
     """Write a GIF 480 pixels wide, of at most 2 MB."""
     beside: str | None = None
     """Another controller to show as a ghost from the same start: C-G or another name of the robot's panel, or a file,
-    as --policy takes it. If left out, ghosts are two other episodes."""
+    as --policy takes it."""
     shadows: bool = True
     """Whether the sun casts shadows; without a GPU they take half of the time."""
 

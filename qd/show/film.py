@@ -39,7 +39,6 @@ MOST_BYTES = 2_000_000
 _COLORS = (256, 128, 96, 64, 48, 32, 16)  # of a GIF; fewer where it would be too large
 _FINER = 2  # than a GIF its pictures are rendered
 _SLOW_S = 1.0  # before the moment of failure
-_GHOSTS, _PALE = 2, 0.15  # other episodes shown, and their opacity
 _DISTANCE = 2.5  # of the camera, in heights or lengths of the robot
 _SMOOTH_S = 0.8  # over which the camera follows the base
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
@@ -65,15 +64,14 @@ class FilmCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One episode of a recording of one terrain, and others beside it as ghosts."""
+    """One episode of a recording of one terrain."""
 
     recording: Recording
     episode: int
     """Its index."""
     title: str = ""
     beside: tuple[str, Recording] | None = None
-    """Name of another controller, and what was recorded of it from the same starts; without it ghosts are others of
-    the recording's episodes."""
+    """Name of another controller, to be shown as a ghost, and what was recorded of it from the same starts."""
 
     @cached_property
     def end(self) -> float:
@@ -85,15 +83,6 @@ class Shot:
         """When the robot fails [s]; None if it does not."""
         outcome = self.recording.outcome[0, self.episode]
         return None if outcome == Outcome.GOAL else moment_of_failure(self.recording, self.episode)
-
-    @property
-    def ghosts(self) -> list[Ghost]:
-        """The others, with all their poses, shape (frames, 7 + num_joints)."""
-        if self.beside is not None:
-            name, other = self.beside
-            return [Ghost(other.qpos(0, self.episode), OTHER_CONTROLLER, name)]
-        others = [k for k in range(self.recording.num_episodes) if k != self.episode]
-        return [Ghost(self.recording.qpos(0, k), opacity=_PALE) for k in others[:_GHOSTS]]
 
     def times(
         self, fps: float, *, whole: bool = False, before_s: float = 3.0, after_s: float = 1.0, slowness: float = 4.0
@@ -166,7 +155,8 @@ def pictures_of(
     """
     recording, dt = shot.recording, shot.recording.dt
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
-    poses, ghosts, chart = recording.qpos(0, shot.episode), shot.ghosts, map_of(shot, size[0] // 5)
+    poses, chart = recording.qpos(0, shot.episode), map_of(shot, size[0] // 5)
+    others = [(other.qpos(0, shot.episode), name) for name, other in filter(None, [shot.beside])]
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
     width, height = (side * (1 if size[0] > GIF_SIZE[0] else _FINER) for side in size)
@@ -175,9 +165,9 @@ def pictures_of(
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
             frame = min(time_s / dt, float(len(poses) - 1))
             pose, here = pose_at(poses, frame), (0, shot.episode, int(frame + 0.5))
-            others = [ghost._replace(qpos=pose_at(ghost.qpos, time_s / dt)) for ghost in ghosts]
+            ghosts = [Ghost(pose_at(other, time_s / dt), OTHER_CONTROLLER, name) for other, name in others]
             touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
-            picture = Image.fromarray(renderer.render(pose, camera, ghosts=others, **touch))
+            picture = Image.fromarray(renderer.render(pose, camera, ghosts=ghosts, **touch))
             picture = picture.resize(size, Image.Resampling.BOX)
             _letter(picture, shot, time_s, slowness[number])
             inset = chart.copy()

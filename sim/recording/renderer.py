@@ -54,7 +54,6 @@ class Ghost(NamedTuple):
     color: Color = OTHER_EPISODE
     name: str = ""
     """Written over it."""
-    opacity: float = _GHOST_OPACITY
 
 
 def open_context(width: int, height: int) -> Any:
@@ -187,7 +186,7 @@ class Renderer:
         moving = _mj.mjtCatBit.mjCAT_DYNAMIC.value
         _mj.mjv_addGeoms(self.model, data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
-            geom.rgba[:] = *ghost.color, ghost.opacity
+            geom.rgba[:] = *ghost.color, _GHOST_OPACITY
             geom.matid, geom.transparent = -1, 1
 
     def _named(self, picture: NDArray[np.uint8], ghosts: Sequence[Ghost]) -> NDArray[np.uint8]:
