@@ -322,9 +322,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
             if names or self.independent:
                 raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
             names = (COMPARED,)
-        cfg = SetsCfg(
-            names=names, archive=self.archive, independent=self.independent, space=self.space, **size
-        )
+        cfg = SetsCfg(names=names, archive=self.archive, independent=self.independent, space=self.space, **size)
         report = evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
         return int(compared and is_regression(report))
 

@@ -36,7 +36,6 @@ _POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
 _START_RADIUS, _DISC_HEIGHT, _DISC_OPACITY = 0.25, 0.02, 0.5
 _GHOST_OPACITY = 0.4
 _GHOST_NAME_HEIGHT = 0.35  # over its base [m]
-_NAME_HEIGHT = 0.12  # of a foot's name over it [m]
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -96,14 +95,13 @@ class Scene:
         arrow = arrow_mesh()
         self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
         self._command = self._add_mesh("/command", arrow, COMMAND_COLOR)
-        self._names = [scene.add_label(f"/feet/{name}", name, visible=False) for name in shapes.feet]
         self.paths: list[Any] = []
         self._paths_wanted = True
         self._followed: Points | None = None
         self.follow = False
         """Whether the camera goes along with the robot."""
-        self.show_forces, self.show_names = True, False
-        """Whether forces on the feet, and the names of the feet, are shown."""
+        self.show_forces = True
+        """Whether forces on the feet are shown."""
 
     def _add_bodies(self, name: str) -> tuple[Any, list[Any]]:
         """A frame that is not visible yet, and a frame in it for each body of the robot."""
@@ -144,7 +142,7 @@ class Scene:
         self.robot.visible = False
         self.hide_ghost()
         self._followed = None
-        for handle in (*self.forces, self._command, *self._names):
+        for handle in (*self.forces, self._command):
             handle.visible = False
         self._drop_paths()
 
@@ -192,10 +190,8 @@ class Scene:
                 touched.visible = touching is not None and bool(touching[frame, list(part.touches)].any())
                 alone.visible = not touched.visible
             _set_arrow(self._command, crossing.command[frame], shown=True)
-            for handle, name, arrow in zip(self.forces, self._names, crossing.forces[frame], strict=True):
+            for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
                 _set_arrow(handle, arrow, shown=self.show_forces)
-                name.visible = self.show_names
-                name.position = tuple(arrow[0] + np.array([0.0, 0.0, _NAME_HEIGHT]))
         self._go_along(positions[0])
 
     def show_ghost(self, crossing: Crossing, frame: int, name: str = "") -> None:

@@ -53,11 +53,11 @@ def test_paint_tells_heights_and_metres_apart(ground):
     assert (at(9.0, 6.7) < 0.95 * hill).all()  # the hill's flank, a cell wide
 
 
-def test_the_ground_of_a_scene_is_the_simulations(robot):
+def test_the_ground_of_a_scene_is_the_simulations(anymal):
     rough = np.random.default_rng(1).uniform(-0.4, 0.4, (NUM_ROWS, NUM_COLS))
-    model = scene_model(robot, rough, width=64, height=64)
+    model = scene_model(anymal, rough, width=64, height=64)
     data = mujoco.MjData(model)
-    data.qpos[:] = standing(robot, 2, 4, 0.5)
+    data.qpos[:] = standing(anymal, 2, 4, 0.5)
     mujoco.mj_forward(model, data)
     hidden = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # of the groups, the ground's alone
     for x, y in np.random.default_rng(2).uniform([-1.9, -1.9], [12.9, 9.9], (200, 2)):

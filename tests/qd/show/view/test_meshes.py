@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from qd.show.view.meshes import arrow_mesh, arrow_pose, robot_parts, terrain_mesh
+from qd.show.view.meshes import arrow_mesh, arrow_pose, robot_parts
 from qd.show.view.playing import rotated
-from sim.mujoco_c.model import surface_heights
 from sim.robots.skeleton import Skeleton
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -27,21 +26,6 @@ def test_a_robots_parts_hold_together_and_each_shows_one_touch(robot):
     for k, (low, high) in enumerate(boxes):  # the box round each part overlaps that of another one
         others = boxes[:k] + boxes[k + 1 :]
         assert any((low <= top).all() and (high >= bottom).all() for bottom, top in others)
-
-
-def test_the_terrain_is_the_surface_of_the_physics():
-    rng = np.random.default_rng(5)
-    heights = rng.normal(size=(5, 7)).astype(np.float32)
-    mesh = terrain_mesh(heights)
-    triangles = mesh.vertices[mesh.faces]
-    assert len(triangles) == 2 * 4 * 6
-    weights = rng.dirichlet(np.ones(3), size=(len(triangles), 5))
-    points = np.einsum("tkc,tcd->tkd", weights, triangles).reshape(-1, 3)
-    np.testing.assert_allclose(
-        points[:, 2], surface_heights(heights.astype(float), points[:, 0], points[:, 1]), atol=1e-6
-    )
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    assert (normals[:, 2] > 0.0).all()
 
 
 @pytest.mark.parametrize("way", [(0.3, -0.4, 1.2), (0.0, 0.0, 2.0), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0)])
