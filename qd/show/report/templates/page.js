@@ -21,13 +21,13 @@ for (const table of document.querySelectorAll("table.sortable")) {
   });
 }
 
-// A table that is wider than the page says so.
+// A table or a figure that is wider than the page says so.
 const parts = document.querySelectorAll(".scroll");
 const mark = () => parts.forEach((part) => part.classList.toggle("over", part.scrollWidth > part.clientWidth + 1));
 for (const part of parts) {
   const hint = document.createElement("p");
   hint.className = "hint";
-  hint.textContent = "The table goes on to the right: drag or scroll it.";
+  hint.textContent = "It goes on to the right: drag or scroll it.";
   part.after(hint);
 }
 addEventListener("resize", mark);
