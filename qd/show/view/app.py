@@ -105,6 +105,7 @@ class App:
         """Store a recording, and tell all tabs how far it is."""
         if isinstance(report.result, Recording):
             self._common.recordings.keep(report.wanted, report.result)
+            self._common.recorder.cancel(report.wanted)  # a tab may have asked for it just before
         for tab in self.tabs.values():
             tab.show_report(report)
 

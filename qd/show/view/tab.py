@@ -31,6 +31,8 @@ _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
 _SETTLES_S = 3.0
 """How long a browser that has just come may still say where its camera stood before it was moved."""
+_AHEAD_S = 5.0
+"""How long the browser has the machine for itself before neighbours of an elite are recorded."""
 _BEFORE_S = 1.0
 """How long before the robot fails an episode begins to be shown."""
 
@@ -56,6 +58,7 @@ class Tab:
         self.replica: int | None = None  # the typical one of the recording that comes
         self._begin_s: float | None = None  # where the next crossing begins; just before the robot fails if None
         self.query, self._bar_at, self._near_until, self._address_at = "", 0.0, 0.0, time.perf_counter()
+        self._ahead_at = math.inf
         self.robot, self.ghost = Crosser(common, client.client_id), Crosser(common, (client.client_id, "ghost"))
         self.scene = Scene(client, common.shapes)
         title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
@@ -134,6 +137,9 @@ class Tab:
                 self._show_moment()
         if now - self._address_at > _ADDRESS_S:
             self.show_address()
+        if now > self._ahead_at:
+            self._ahead_at = math.inf
+            self._record_ahead()
 
     def show_address(self) -> None:
         """Have the browser's address say what the tab shows."""
@@ -397,7 +403,7 @@ class Tab:
         self._show_rates()
         self.scene.set_paths(paths_of(recording))
         self._show_episode()
-        self._record_ahead()
+        self._ahead_at = time.perf_counter() + _AHEAD_S
 
     def _show_episode(self) -> None:
         assert self.replica is not None
