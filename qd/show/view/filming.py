@@ -1,8 +1,6 @@
 """*Film this*: the film of an episode, made in a process of its own and offered for download."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import viser
@@ -11,22 +9,8 @@ from qd.run.directory import folder_for
 from qd.show.film import FilmCfg
 from qd.show.view.common import Common
 from qd.show.view.recorder import Report
+from qd.show.view.wanted_film import WantedFilm
 from sim.recording.recorder import Recording
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WantedFilm:
-    """A film of an episode."""
-
-    recording: Recording
-    scales: dict[str, float]
-    cfg: FilmCfg
-    by: str
-    """Name of the controller, where it is not the search's."""
-    beside: tuple[str, Recording] | None
-    """Name and recording of the ghost."""
-    file: Path
-    """Where it goes."""
 
 
 class Filming:

@@ -8,7 +8,7 @@ from typing import Any
 import sim.simulation  # noqa: F401  Newton takes seconds to load: now, and not when somebody waits
 from qd.show.film import film
 from qd.show.recordings import Simulation, Wanted
-from qd.show.view.filming import WantedFilm
+from qd.show.view.wanted_film import WantedFilm
 from sim.robots.robot import RobotCfg
 
 
