@@ -189,18 +189,16 @@ class CrossingPanel:
     def show_curves(self, crossing: Crossing | None) -> None:
         """Show the penalties of a crossing over its time; ``page.js`` draws the line of the present."""
         if self._curves is not None:
-            self._curves.remove()
-            self._curves = None
+            self._curves.visible = crossing is not None
         if crossing is None:
             return
         chosen = np.unique(np.linspace(0, crossing.num_frames - 1, _CURVE_POINTS).astype(int))
-        series = [uplot.Series(label=label_of(n), stroke=look_of(n).color, width=2.0) for n in self._penalties]
-        with self._curves_place:
-            self._curves = self._gui.add_uplot(
-                (crossing.times_s[chosen], *crossing.penalties[chosen].T),
-                (uplot.Series(label="time [s]"), *series),
-                height=170,
-            )
+        data = (crossing.times_s[chosen], *crossing.penalties[chosen].T)
+        if self._curves is None:
+            series = [uplot.Series(label=label_of(n), stroke=look_of(n).color, width=2.0) for n in self._penalties]
+            with self._curves_place:
+                self._curves = self._gui.add_uplot(data, (uplot.Series(label="time [s]"), *series), height=170)
+        self._curves.data = data
         self.stretch_curves(crossing.duration_s)
 
     def stretch_curves(self, duration_s: float) -> None:
