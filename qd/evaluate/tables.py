@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, RATES
 from qd.evaluate.measures import Families, Measured, interval_of, mean_of, of_terrains
-from qd.evaluate.paper import published
 from qd.evaluate.sets import TerrainSet
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.atomic import read_json
@@ -41,7 +40,7 @@ Tables = dict[str, Any]
   ``still_failing``, ``newly_broken`` and ``fine``, each with its ``count`` and the numbers of its ``terrains`` (not of
   the fine ones); how many changes are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
 - ``outcomes``: set -> controller -> episodes that ended so; ``terrains``: how many, by set; ``episodes``: on each.
-- ``paper``: the paper's numbers. ``controllers``: ``policy`` and ``sha256`` by name.
+- ``controllers``: ``policy`` and ``sha256`` by name.
 """
 _MEASURES = (*MEASURES, *CERTIFIED)
 
@@ -106,7 +105,6 @@ def make_tables(
             }
             for name, row in crossed.items()
         },
-        "paper": published(robot.name),
     }
 
 
