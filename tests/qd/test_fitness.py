@@ -27,6 +27,12 @@ def test_fitness_by_hand():
     assert CELLS.tuples[evaluation.cell[0]].tolist() == [4, 5]
 
 
+def test_weights_are_settings():
+    result = make_result([[[1, 20], [3, 20]]], base_collision=[[False, True]])
+    cfg = FitnessCfg(penalties=CFG.penalties, scales=CFG.scales, alpha=0.5, lam=4.0)
+    assert evaluation_of(result, CELLS, cfg).fitness[0] == pytest.approx(4.0 - 0.5 * 1.0 - 4.0 * 0.5)
+
+
 @pytest.mark.parametrize(("collided", "inconsistency"), [(0, 0.0), (1, 0.75), (3, 0.25), (4, 0.0)])
 def test_consistent_terrains_are_not_punished(collided, inconsistency):
     # identical episodes: no spread, so the fitness is 1 + 1 - 2 u; u is 0 if none collides and if all do

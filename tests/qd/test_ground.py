@@ -8,7 +8,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.archive import read_archive, write_archive
-from qd.causes import effects_of
+from qd.causes import causes_at, effects_of
 from qd.commands import Archive
 from qd.minimise import minimise
 from qd.show.commands import Export
@@ -122,3 +122,6 @@ def test_effects_of_patches_are_parts_like_bumps():
     assert changing == [8 + 8 + 3, 8 + 32 + 24]
     assert [effects.way(part, 0.3) for part in changing] == [(0.0, True), (0.0, False)]
     assert [effects.shape(part, 0.3).kind for part in changing] == ["slippery ground", "soft ground"]
+    # Robots end on each of the three patches, of which one is as ground always is.
+    ends = np.array([[7.0, 3.0], [1.0, 7.0], [7.0, 5.0]])
+    assert causes_at(genes[None].repeat(3, axis=0), ends, SPACE) == ["slippery ground", "soft ground", "unclear"]

@@ -146,11 +146,15 @@ def test_causes_are_by_number_and_the_unclear_last():
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
-    ridge, wall = bump(x=6.0, sigma_x=0.5, height=0.25), bump(x=10.0, sigma_x=1.5, height=-0.25)
-    genes = np.concatenate([ridge, wall, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 6])[None].repeat(3, axis=0)
-    ends = np.array([[5.2, 4.0], [8.3, 4.0], [2.0, 4.0]], np.float32)
-    archive = dataclasses.replace(small_archive(3), genes=genes, goal_rate=np.zeros(3), end_position=ends)
-    assert rank(archive, SUPER_GAUSSIAN).causes == ("ridge", "drop", "unclear")
+    bumps = (
+        bump(x=6.0, sigma_x=0.5, height=0.25),
+        bump(x=8.0, sigma_x=0.5, height=-0.2),
+        bump(x=10.0, sigma_x=1.5, height=-0.25),
+    )
+    genes = np.concatenate([*bumps, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 5])[None].repeat(4, axis=0)
+    ends = np.array([[5.6, 4.0], [7.8, 4.0], [9.2, 4.0], [2.0, 4.0]], np.float32)
+    archive = dataclasses.replace(small_archive(4), genes=genes, goal_rate=np.zeros(4), end_position=ends)
+    assert rank(archive, SUPER_GAUSSIAN).causes == ("ridge", "ditch", "drop", "unclear")
 
 
 def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families():

@@ -166,6 +166,7 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     assert numbers["elites"] == len(before) and set(numbers["judged_by"]) == {"fresh", "resolved", "others"}
     assert stored.confirmed.tolist() == archive.confirmed.tolist()
     assert stored.certified.tolist() == archive.certified.tolist()
+    assert (stored.cause != "").tolist() == failing.tolist() and len(stored.family) == len(archive)
     content = (path / "archive.npz").read_bytes()
     judged(path, Robots(result_of, stop_after=0))  # nothing is crossed twice, and nothing adds up
     assert (path / "archive.npz").read_bytes() == content
