@@ -122,7 +122,7 @@ def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Came
     width = max(1, round(_SMOOTH_S / recording.dt)) | 1
     padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
     smooth = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in padded.T]
-    targets = np.stack([np.interp(times, recording.times_s[: len(base)], axis) for axis in smooth], axis=1)
+    targets = np.stack([np.interp(times, recording.dt * np.arange(len(base)), axis) for axis in smooth], axis=1)
     elevation = clear_elevation(recording.heights[0], targets, distance)
     return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
 

@@ -236,7 +236,7 @@ def describe(source: Source, k: int, recording: Recording) -> str:
         ]
     if run is not None:
         rows["fitness"] = [f"{values.fitness[row]:.2f}" for _, values, row in columns]
-    lines = [f"  {label:36}" + "".join(f"{value:>28}" for value in row).rstrip() for label, row in rows.items()]
+    lines = [f"  {label:36}" + "".join(f"{value:>30}" for value in row).rstrip() for label, row in rows.items()]
     lines.append("  Rates have 95 % intervals (Wilson). A robot that stands still has no base collision either.")
     if reasons := invalid_reasons(recording.result()):
         lines.append(f"  {sum(reasons.values())} invalid episodes are left out: {reason_words(reasons)}.")
