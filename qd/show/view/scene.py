@@ -9,7 +9,16 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import Color, Part, arrow_mesh, arrow_pose, in_bytes, robot_parts, terrain_mesh
+from qd.show.view.meshes import (
+    Color,
+    Part,
+    arrow_mesh,
+    arrow_pose,
+    in_bytes,
+    in_linear_light,
+    robot_parts,
+    terrain_mesh,
+)
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
@@ -157,7 +166,11 @@ class Scene:
         ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
         colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
         if paths:
-            look: Any = {"colors": np.concatenate(colors), "thickness": _PATH_WIDTH, "thickness_units": "screen"}
+            look: Any = {
+                "colors": in_linear_light(np.concatenate(colors)),
+                "thickness": _PATH_WIDTH,
+                "thickness_units": "screen",
+            }
             add = self._client.scene.add_line_segments
             self.paths = [add("/paths", np.concatenate(ends), visible=False, **look)]
         self._show_paths()
