@@ -1,7 +1,6 @@
 """Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL on Linux, on a GPU or in software."""
 
 import importlib
-import itertools
 import os
 import sys
 from collections.abc import Sequence
@@ -27,7 +26,6 @@ _LEAST_LETTERS = 14  # [pixels]
 _ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
-_PATH_RADIUS = 0.009  # [m]
 _SUN_AWAY = 8.0  # from what one looks at [m]
 _CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
 
@@ -123,7 +121,6 @@ class Renderer:
         ghosts: Sequence[Ghost] = (),
         touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
-        paths: Sequence[tuple[NDArray[np.floating], tuple[float, float, float, float]]] = (),
     ) -> NDArray[np.uint8]:
         """A picture of one pose.
 
@@ -134,7 +131,6 @@ class Renderer:
             touching: Whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do are
                 yellow, base and limbs magenta.
             foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
-            paths: Ways, each by its points [m], shape (num_points, 3), and its colour, RGBA 0 to 1.
 
         Returns:
             RGB, shape (height, width, 3).
@@ -153,8 +149,6 @@ class Renderer:
         if foot_force is not None:
             for place, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
                 self._add_arrow(place, force)
-        for points, color in paths:
-            self._add_path(points, np.array(color, np.float32))
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         return self._named(self._image[::-1], ghosts)  # OpenGL's lowest row is first
@@ -207,10 +201,6 @@ class Renderer:
             font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
             draw.text(place, ghost.name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
         return np.array(image)
-
-    def _add_path(self, points: NDArray[np.floating], color: NDArray[np.float32]) -> None:
-        for begin, end in itertools.pairwise(np.asarray(points, dtype=np.float64)):
-            self._add_connector(_mj.mjtGeom.mjGEOM_CAPSULE.value, _PATH_RADIUS, begin, end, color)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:
         size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit

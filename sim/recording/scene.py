@@ -1,4 +1,4 @@
-"""A robot on its terrain as a MuJoCo model to look at: ground painted by height, light, goal, and bones between joints.
+"""A robot on its terrain as a MuJoCo model to look at: ground painted by height, light and goal.
 
 Nothing in it is simulated: poses come from a recording.
 """

@@ -22,10 +22,9 @@ _CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
 LOOK_SUFFIX = ".look.xml"
 """Of a file beside the model file: an MJCF whose bodies have names of the model's, with the shapes to show of them."""
-_BARE, _BONES, _VISUAL, _HIDDEN = range(4)  # groups, of which MuJoCo shows 0 to 2
+_BARE, _, _VISUAL, _HIDDEN = range(4)  # groups, of which MuJoCo shows 0 to 2
 _BASE, _LIMB, _FOOT = (0.27, 0.29, 0.33, 1.0), (0.47, 0.50, 0.55, 1.0), (0.30, 0.32, 0.36, 1.0)
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
-_BONE, _LEAST_BONE = 0.35, 0.02  # radius of a bone in that of limbs and feet, and at least [m]
 
 
 def robot_spec(robot: RobotCfg) -> Any:
@@ -33,7 +32,7 @@ def robot_spec(robot: RobotCfg) -> Any:
 
     Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
     touch anything ``<body>_geom_<k>``. A body shows the shapes of the file :data:`LOOK_SUFFIX` if there are some, else
-    those of its own that touch nothing, else all it has, with bones to its joints and feet.
+    those of its own that touch nothing, else all it has.
     """
     try:
         files = read_model_files(robot.model_file)
@@ -54,7 +53,6 @@ def robot_spec(robot: RobotCfg) -> Any:
                 geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
             geom.name = geom.name or f"{body.name}_geom_{number}"
         _dress(body, touching, looks.pop(body.name, []), robot)
-    _add_bones(spec, robot)
     if looks:
         raise ValueError(
             f"{_look_file(robot)} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
@@ -111,19 +109,6 @@ def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: Ro
         geom.group = _HIDDEN if (visual or look) and not foot else _BARE
         if not geom.material and tuple(geom.rgba) == _NO_COLOR:
             geom.rgba = _FOOT if foot else _BASE if geom.name in robot.base_geoms else _LIMB
-
-
-def _add_bones(spec: Any, robot: RobotCfg) -> None:
-    """Capsules from the joint of every body without visual shapes to those of its children, and to its feet."""
-    sizes = [geom.size[0] for name in (*robot.limb_geoms, *robot.foot_geoms) if (geom := spec.geom(name)) is not None]
-    radius = max(_LEAST_BONE, _BONE * float(np.median(sizes))) if sizes else _LEAST_BONE
-    for body in spec.bodies[1:]:
-        if any(geom.group == _VISUAL or geom.type == _KIND.mjGEOM_MESH for geom in body.geoms):
-            continue
-        for part in (*body.bodies, *(geom for geom in body.geoms if geom.name in robot.foot_geoms)):
-            if np.linalg.norm(part.pos) > radius:
-                ends = {"fromto": [0.0, 0.0, 0.0, *part.pos], "size": [radius, 0.0, 0.0]}
-                _add_shape(body, group=_BONES, type=_KIND.mjGEOM_CAPSULE, rgba=_LIMB, **ends)
 
 
 def _add_shape(body: Any, **shape: Any) -> None:

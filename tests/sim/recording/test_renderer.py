@@ -80,12 +80,9 @@ def pixel_of(camera, x, y, height=0.0):
 
 def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
     above = Camera(target=(8.0, 4.0, 0.0), distance=20.0, azimuth=90.0, elevation=-90.0)
-    near = dataclasses.replace(above, distance=5.0)
-    path = np.array([[6.5, 3.2, 0.5], [7.0, 3.2, 0.5], [9.5, 3.2, 0.5]])
     with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
         picture = renderer.render(standing(anymal, 2.5, 3.5, 0.0), above).astype(int)
         other = renderer.render(standing(anymal, 13.5, 2.5, 0.0), above).astype(int)
-        drawn = renderer.render(standing(anymal, 2.5, 3.5, 0.0), near, paths=[(path, (1.0, 0.0, 1.0, 1.0))]).astype(int)
     assert picture.shape == (320, 640, 3)
     hill = picture[pixel_of(above, 10.5, 6.7, 0.6)]
     pit = picture[pixel_of(above, 4.5, 1.3, -0.6)]
@@ -97,9 +94,6 @@ def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
     assert goal[1] > goal[0] + 20 and goal[1] > goal[2]
     base = picture[pixel_of(above, 2.5, 3.5, 0.6)]
     assert base.sum() < 320 < other[pixel_of(above, 2.5, 3.5)].sum()
-    rows, columns = np.nonzero(drawn[..., [0, 2]].min(axis=2) - drawn[..., 1] > 40)  # purple: the path alone
-    (row, left), (_, right) = (pixel_of(near, x, 3.2, 0.5) for x in (6.5, 9.5))
-    assert abs(rows.mean() - row) < 2 and abs(columns.min() - left) < 4 and abs(columns.max() - right) < 4
 
 
 def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
@@ -130,11 +124,9 @@ def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_robot_of_ones_own_is_shown_on_the_ground(tmp_path, kind):
-    """Bones join a robot of bare shapes, and its feet stand where its own model has them."""
+    """Its feet stand where its own model has them."""
     dog = get_robot(str(write_dog(tmp_path, **KINDS[kind])))
     model = scene_model(dog, np.full((NUM_ROWS, NUM_COLS), 0.3), width=64, height=64)
-    plain = mujoco.MjModel.from_xml_path(str(dog.model_file))
-    assert model.ngeom > plain.ngeom + dog.num_joints // 2
     data = mujoco.MjData(model)
     assert len(data.qpos) == 7 + dog.num_joints
     data.qpos[:] = standing(dog, 5.0, 4.0, 0.3)
