@@ -1,26 +1,17 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
-import hashlib
-import json
-import shutil
 import socket
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
-import warp as wp
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from kernels.heightfield import Terrain, ceiling_shape, max_blocks
-from qd.archive import ARCHIVE_FILE, FRESH, Archive, FaultCounts, FreshValues, read_archive, write_archive
-from qd.run.directory import CONFIG_FILE
-from sim.files.records import PENALTY_DEFINITION, robot_identity
+from qd.archive import FRESH, Archive, FaultCounts, FreshValues
+from sim.files.records import robot_identity
 from sim.robots.shipped import ROBOTS
 
-SPACING = 0.05
-RNG_SEED = 5
 OBSERVATIONS, ACTIONS = 235, 12
 
 
@@ -60,17 +51,6 @@ def small_archive(num_elites: int = 3) -> Archive:
     )
 
 
-def as_of_now(run: Path, copy: Path) -> Path:
-    """A copy of a published run that says its penalties are defined as now, whichever version searched it."""
-    shutil.copytree(run, copy)
-    write_archive(copy / ARCHIVE_FILE, replace(read_archive(copy), penalty_definition=PENALTY_DEFINITION))
-    config = copy / CONFIG_FILE
-    content = json.loads(config.read_text())
-    content["settings"]["penalty_definition"] = PENALTY_DEFINITION
-    config.write_text(json.dumps(content))
-    return copy
-
-
 def fresh_values(archive: Archive) -> FreshValues:
     """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
     same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
@@ -100,20 +80,6 @@ def judged_archive() -> Archive:
     return replace(archive, fresh=fresh, faults=faults)
 
 
-def make_terrain(grids, device, spacing=SPACING):
-    terrain = Terrain()
-    terrain.heights = wp.array(np.float32(grids), device=device)
-    terrain.ceilings = wp.zeros(ceiling_shape(*np.shape(grids)), dtype=float, device=device)
-    terrain.spacing = spacing
-    max_blocks(terrain.heights, terrain.ceilings)
-    return terrain
-
-
-def rough(nrow, ncol, size=0.2, seed=RNG_SEED):
-    """A grid with no two nodes alike: cells as steep as 76 degrees."""
-    return np.random.default_rng(seed).uniform(-size, size, (nrow, ncol)).astype(np.float32)
-
-
 def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
     """rsl_rl's own actor, with a normaliser that has seen something."""
     torch.manual_seed(0)
@@ -132,9 +98,3 @@ def save_checkpoint(path, state, **more):
     """As rsl_rl's runner saves it."""
     torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
     return path
-
-
-def hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of all files below a folder, but for what Python compiles."""
-    files = [file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
-    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

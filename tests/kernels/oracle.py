@@ -7,6 +7,8 @@ command and penalties; nothing in either is shared with the kernels or ported fr
 from typing import Any
 
 import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
 
 Array = Any  # an array, or a sequence of numbers: checked by what is computed
 
@@ -75,28 +77,14 @@ def surface_height(grid: Array, spacing: float, x: float, y: float) -> float:
     return float(weights[k] @ corners[k, :, 2])
 
 
-def _nearest_on_segments(p: Array, start: Array, end: Array) -> Array:
-    along = end - start
-    share = np.clip(((p - start) * along).sum(1) / (along * along).sum(1), 0, 1)
-    return start + share[:, None] * along
-
-
 def nearest_on_surface(grid: Array, spacing: float, p: Array, reach: float) -> tuple[float, Array | None]:
     """Signed distance of ``p`` to the surface and the nearest point; (inf, None) if nothing is within ``reach``.
 
-    Brute force: on every triangle near, the foot of the perpendicular where it falls inside, and the best of all edges.
+    Brute force: on every triangle near, and the best of all.
     """
     p = np.float64(p)
     corners = triangles(grid, spacing, p[0], p[1], reach)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    feet = p - ((p - corners[:, 0]) * normals).sum(1)[:, None] * normals
-    inside = np.ones(len(corners), bool)
-    for k in range(3):
-        edge = corners[:, (k + 1) % 3] - corners[:, k]
-        inside &= (np.cross(edge, feet - corners[:, k]) * normals).sum(1) >= 0
-    edges = [_nearest_on_segments(p, corners[:, k], corners[:, (k + 1) % 3]) for k in range(3)]
-    candidates = np.concatenate([feet[inside], *edges])
+    candidates = trimesh.triangles.closest_point(corners, np.tile(p, (len(corners), 1)))
     distances = np.linalg.norm(candidates - p, axis=1)
     best = np.argmin(distances)
     below = p[2] < surface_height(grid, spacing, p[0], p[1])
@@ -107,6 +95,4 @@ def nearest_on_surface(grid: Array, spacing: float, p: Array, reach: float) -> t
 
 def rotation_matrix(quaternion_xyzw: Array) -> Array:
     """Matrix that turns base-frame vectors into the world frame."""
-    x, y, z, w = np.float64(quaternion_xyzw) / np.linalg.norm(np.float64(quaternion_xyzw))
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    return Rotation.from_quat(quaternion_xyzw).as_matrix()

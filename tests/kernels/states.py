@@ -1,6 +1,32 @@
-"""Random robot states for kernel tests."""
+"""Robot states, terrains and filled structs for kernel tests."""
 
 import numpy as np
+import warp as wp
+
+from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+
+SPACING = 0.05
+
+
+def filled(struct, **values):
+    """A Warp struct with these values; arrays get the type that it names."""
+    result = struct()
+    for name, value in values.items():
+        kind = struct.vars[name].type
+        setattr(result, name, wp.array(value, dtype=kind.dtype) if hasattr(kind, "ndim") else value)
+    return result
+
+
+def make_terrain(grids, spacing=SPACING):
+    terrain = filled(Terrain, heights=np.float32(grids), spacing=spacing)
+    terrain.ceilings = wp.zeros(ceiling_shape(*np.shape(grids)), dtype=float)
+    max_blocks(terrain.heights, terrain.ceilings)
+    return terrain
+
+
+def rough(nrow, ncol, size=0.2, seed=5):
+    """A grid with no two nodes alike: cells as steep as 76 degrees."""
+    return np.random.default_rng(seed).uniform(-size, size, (nrow, ncol)).astype(np.float32)
 
 
 def random_states(num_envs, num_joints, seed=0, speed=2.0):

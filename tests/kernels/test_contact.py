@@ -7,57 +7,44 @@ import warp as wp
 from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING, crossing_terrain
-from tests.builders import make_terrain
 from tests.kernels import oracle
+from tests.kernels.states import filled, make_terrain
 
 RADII = (0.0175, 0.03, 0.06, 0.1)
 UNDECIDED = 1e-5  # a sphere this close to touching may go either way in float32
 FIRST_SHAPE, GROUND_SHAPE = 5, 2
 
 
-def make_probes(strips, device, spread=0.0):
+def make_probes(strips, spread=0.0):
     """Strips as (centres (n, 3), radius), each on a body and a shape of its own; how far from straight they are [m]."""
-    probes = Probes()
-    centres = np.concatenate([np.reshape(centres, (-1, 3)) for centres, _ in strips])
-    probes.position = wp.array(np.float32(centres), dtype=wp.vec3, device=device)
-    starts = np.cumsum([0] + [len(np.reshape(centres, (-1, 3))) for centres, _ in strips])
-    probes.strip_start = wp.array(starts, dtype=int, device=device)
-    probes.strip_radius = wp.array([radius for _, radius in strips], dtype=float, device=device)
-    probes.strip_spread = wp.full(len(strips), spread, dtype=float, device=device)
-    probes.strip_body = wp.array(np.arange(len(strips)), dtype=int, device=device)
-    probes.strip_shape = wp.array(np.arange(len(strips)), dtype=int, device=device)
-    return probes
+    centres, numbers = [np.reshape(row, (-1, 3)) for row, _ in strips], np.arange(len(strips))
+    return filled(
+        Probes, position=np.concatenate(centres), strip_start=np.cumsum([0, *map(len, centres)]),
+        strip_radius=[radius for _, radius in strips], strip_spread=np.full(len(strips), spread),
+        strip_body=numbers, strip_shape=numbers,
+    )  # fmt: skip
 
 
-def make_buffer(capacity, device):
-    buffer = ContactBuffer()
-    buffer.count = wp.zeros(1, dtype=int, device=device)
-    for name in ("shape0", "shape1"):
-        setattr(buffer, name, wp.full(capacity, -1, dtype=int, device=device))
-    for name in ("point0", "point1", "normal", "offset0", "offset1"):
-        setattr(buffer, name, wp.zeros(capacity, dtype=wp.vec3, device=device))
-    for name in ("margin0", "margin1"):
-        setattr(buffer, name, wp.full(capacity, -1.0, dtype=float, device=device))
-    return buffer
+def make_buffer(capacity):
+    vectors = dict.fromkeys(("point0", "point1", "normal", "offset0", "offset1"), np.zeros((capacity, 3)))
+    numbers = dict.fromkeys(("shape0", "shape1", "margin0", "margin1"), np.full(capacity, -1))
+    return filled(ContactBuffer, count=[0], **vectors, **numbers)
 
 
-def collide(poses, terrain_of_env, grids, strips, device, capacity=None, spread=0.0):
+def make_layout(shapes, first_shape):
+    return filled(
+        Layout, bodies_per_env=shapes, shapes_per_env=shapes, first_shape=first_shape, ground_shape=GROUND_SHAPE
+    )
+
+
+def collide(poses, terrain_of_env, grids, strips, capacity=None, spread=0.0):
     """Contact records as a dict of arrays, plus ``env``, ``strip`` and the world ``centre`` and ``distance``."""
     num_envs = len(terrain_of_env)
-    layout = Layout()
-    layout.bodies_per_env = layout.shapes_per_env = len(strips)
-    layout.first_shape, layout.ground_shape = FIRST_SHAPE, GROUND_SHAPE
-    probes = make_probes(strips, device, spread)
-    buffer = make_buffer(capacity or 3 * num_envs * len(strips), device)
+    layout = make_layout(len(strips), FIRST_SHAPE)
+    buffer = make_buffer(capacity or 3 * num_envs * len(strips))
     poses = np.float32(poses).reshape(-1, 7)
-    collide_strips(
-        wp.array(poses, dtype=wp.transform, device=device),
-        wp.array(terrain_of_env, dtype=int, device=device),
-        make_terrain(grids, device),
-        probes,
-        layout,
-        buffer,
-    )
+    world, on = wp.array(poses, dtype=wp.transform), wp.array(terrain_of_env, dtype=int)
+    collide_strips(world, on, make_terrain(grids), make_probes(strips, spread), layout, buffer)
     count = int(buffer.count.numpy()[0])
     records = {name: getattr(buffer, name).numpy()[:count] for name in ContactBuffer.vars if name != "count"}
     records["count"] = count
@@ -67,11 +54,6 @@ def collide(poses, terrain_of_env, grids, strips, device, capacity=None, spread=
     records["centre"] = origin + np.einsum("nij,nj->ni", records["rotation"].reshape(-1, 3, 3), records["point1"])
     records["distance"] = ((records["centre"] - records["point0"]) * records["normal"]).sum(1)
     return records
-
-
-def random_rotations(rng, count):
-    quaternion = rng.normal(size=(count, 4))
-    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
 
 
 def hard_terrain(kind):
@@ -91,15 +73,16 @@ def sphere_poses(rng, grid, count):
         ground = oracle.surface_height(grid, SPACING, pose[0], pose[1])
         low, high = (near.min(), near.max()) if rng.random() < 0.5 else (ground, ground)
         pose[2] = rng.uniform(low - 0.05, high + 0.12)
-    poses[..., 3:] = random_rotations(rng, poses.size // 7).reshape(count, len(RADII), 4)
+    quaternion = rng.normal(size=(count, len(RADII), 4))
+    poses[..., 3:] = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
     return np.float32(poses)
 
 
 @pytest.mark.parametrize("kind", ["genes", "boxes"])
-def test_random_spheres_against_the_oracle(device, kind):
+def test_random_spheres_against_the_oracle(kind):
     rng, grid = np.random.default_rng(7), hard_terrain(kind)
     poses = sphere_poses(rng, grid, 120)
-    records = collide(poses, np.zeros(120, int), grid[None], [(np.zeros(3), radius) for radius in RADII], device)
+    records = collide(poses, np.zeros(120, int), grid[None], [(np.zeros(3), radius) for radius in RADII])
     distance_of = dict(zip(zip(records["env"], records["strip"], strict=True), records["distance"], strict=True))
     assert len(distance_of) == records["count"], "one sphere gave two contacts"
     touching, sidelong = 0, 0
@@ -117,22 +100,22 @@ def test_random_spheres_against_the_oracle(device, kind):
     assert sidelong > 5 or kind == "genes"  # the case that approximate nearest points get wrong
 
 
-def test_a_row_that_sags_is_looked_at_where_it_touches(device):
+def test_a_row_that_sags_is_looked_at_where_it_touches():
     # The ends of the row stand 0.5 m over the ground, its middle in it: only the spread says so.
     sagging = [[-0.3, 0, 0.5], [0, 0.2, 0.02], [0.3, 0, 0.5]]
     poses = np.float32([[8, 4, 0, 0, 0, 0, 1]])
     flat = np.zeros((1, 161, 321), np.float32)
-    records = collide(poses, [0], flat, [(np.array(sagging), 0.05)], device, spread=0.52)
+    records = collide(poses, [0], flat, [(np.array(sagging), 0.05)], spread=0.52)
     assert records["count"] == 1
     np.testing.assert_allclose(records["point1"][0], sagging[1], atol=1e-6)
-    assert collide(poses, [0], flat, [(np.array(sagging), 0.05)], device)["count"] == 0
+    assert collide(poses, [0], flat, [(np.array(sagging), 0.05)])["count"] == 0
 
 
-def test_strips_report_first_deepest_and_last(device):
+def test_strips_report_first_deepest_and_last():
     grid = hard_terrain("boxes")
     centres, radius = np.linspace([0, 0, -0.2], [0, 0, 0.2], 9), 0.04
     poses = sphere_poses(np.random.default_rng(8), grid, 100)[:, :1]
-    records = collide(poses, np.zeros(100, int), grid[None], [(centres, radius)], device)
+    records = collide(poses, np.zeros(100, int), grid[None], [(centres, radius)])
     touched = 0
     for env, pose in enumerate(np.float64(poses[:, 0])):
         world = pose[:3] + centres @ oracle.rotation_matrix(pose[3:]).T
@@ -151,13 +134,11 @@ def test_strips_report_first_deepest_and_last(device):
     assert touched > 20
 
 
-def test_records_are_what_the_solver_reads(device):
+def test_records_are_what_the_solver_reads():
     rng = np.random.default_rng(9)
     grid = hard_terrain("genes")
     poses = sphere_poses(rng, grid, 100)
-    records = collide(
-        poses, np.zeros(100, int), grid[None], [(rng.normal(0, 0.02, 3), radius) for radius in RADII], device
-    )
+    records = collide(poses, np.zeros(100, int), grid[None], [(rng.normal(0, 0.02, 3), radius) for radius in RADII])
     assert records["count"] > 50
     radius = np.array(RADII)[records["strip"]]
     assert (records["shape0"] == GROUND_SHAPE).all()
@@ -172,26 +153,26 @@ def test_records_are_what_the_solver_reads(device):
         assert abs(oracle.nearest_on_surface(grid, SPACING, point, 0.05)[0]) < 1e-5
 
 
-def test_depth_by_hand(device):
+def test_depth_by_hand():
     # A sphere of radius 0.1 whose centre is 0.06 m over flat ground at 0.25: distance 0.06, normal up; 0.11 m over it:
     # no contact; 0.04 m under it: distance -0.04, still pushed up.
     poses = [[5, 4, 0.31, 0, 0, 0, 1], [5, 4, 0.36, 0, 0, 0, 1], [5, 4, 0.21, 0, 0, 0, 1]]
-    records = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)], device)
+    records = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)])
     order = np.argsort(records["env"])
     assert records["env"][order].tolist() == [0, 2]
     np.testing.assert_allclose(records["distance"][order], [0.06, -0.04], atol=1e-6)
     np.testing.assert_allclose(records["normal"], [[0, 0, 1]] * 2, atol=1e-6)
 
 
-def test_contacts_past_the_capacity_are_counted_but_not_written(device):
+def test_contacts_past_the_capacity_are_counted_but_not_written():
     poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (6, 1))
-    records = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], device, capacity=4)
+    records = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], capacity=4)
     assert records["count"] == 6
     assert (records["shape1"] >= FIRST_SHAPE).sum() == 4
 
 
-def test_a_state_that_is_not_finite_touches_nothing(device):
+def test_a_state_that_is_not_finite_touches_nothing():
     strip, flat = [(np.zeros(3), 0.1)], np.zeros((1, 161, 321))
-    assert collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip, device)["count"] == 0
+    assert collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"] == 0
     with pytest.raises(ValueError, match="body_q"):
-        collide(np.zeros((3, 7)), np.zeros(4, int), flat, strip, device)
+        collide(np.zeros((3, 7)), np.zeros(4, int), flat, strip)

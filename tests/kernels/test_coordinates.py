@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.coordinates import SolverState, ask_poses, ask_solver, tell_solver
 from sim.mujoco_c.model import to_mujoco
-from tests.kernels.states import random_states
+from tests.kernels.states import filled, random_states
 
 ENVS = 5
 COM = (0.03, -0.02, 0.1)
@@ -16,15 +16,16 @@ COLUMNS, FOLLOWED, BODIES = (9, 7, 8), (8, -1, 7, 9), (2, 1)
 @pytest.fixture
 def solver():
     """The data of five robots with three joints, four actuators and two bodies, all of it -5."""
-    state = SolverState()
-    for name, width in (("qpos", 10), ("qvel", 9), ("ctrl", 4)):
-        setattr(state, name, wp.full((ENVS, width), -5.0, dtype=float))
-    state.xpos = wp.zeros((ENVS, 3), dtype=wp.vec3)
-    state.xquat = wp.zeros((ENVS, 3), dtype=wp.quat)
-    state.column_of_joint, state.target_of_actuator = wp.array(COLUMNS, dtype=int), wp.array(FOLLOWED, dtype=int)
-    state.column_of_body = wp.array(BODIES, dtype=int)
-    state.base_com = wp.vec3(*COM)
-    return state
+    return filled(
+        SolverState,
+        **{name: np.full((ENVS, width), -5.0) for name, width in (("qpos", 10), ("qvel", 9), ("ctrl", 4))},
+        xpos=np.zeros((ENVS, 3, 3)),
+        xquat=np.zeros((ENVS, 3, 4)),
+        column_of_joint=COLUMNS,
+        target_of_actuator=FOLLOWED,
+        column_of_body=BODIES,
+        base_com=COM,
+    )
 
 
 @pytest.fixture

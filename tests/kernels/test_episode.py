@@ -185,16 +185,6 @@ def test_a_touch_noted_between_ends_the_episode_and_is_then_forgotten():
     assert state.base_force.numpy().tolist() == [0.0, 0.0]
 
 
-def test_masked_episodes_begin():
-    state = make_state(3, outcome=[Outcome.GOAL, Outcome.GOAL, Outcome.RUNNING], steps=[7, 8, 9])
-    state.base_force.fill_(5.0)
-    begin_episodes(wp.array([1, 0, 1], dtype=int), state)
-    assert state.outcome.numpy().tolist() == [Outcome.RUNNING, Outcome.GOAL, Outcome.RUNNING]
-    assert state.steps.numpy().tolist() == [0, 8, 0]
-    assert state.counted.numpy().tolist() == [0, 9, 0]
-    assert state.base_force.numpy().tolist() == [0.0, 5.0, 0.0]
-
-
 def commands(q, outcome=0):
     out = wp.zeros((len(q), 3), dtype=float)
     command_goal(wp.array(q), wp.array(np.broadcast_to(outcome, len(q)), dtype=int), task_of(), out)

@@ -13,8 +13,8 @@ from kernels.heightfield import (
     nearest_surface_point,
     normal_at,
 )
-from tests.builders import RNG_SEED, SPACING, make_terrain, rough
 from tests.kernels import oracle
+from tests.kernels.states import SPACING, make_terrain, rough
 
 
 def surface_normal(grid, spacing, x, y):
@@ -51,16 +51,16 @@ def _ceiling_kernel(terrain: Terrain, lower: wp.array[wp.vec2], upper: wp.array[
     out[k] = ceiling_over(terrain, 0, lower[k], upper[k])
 
 
-def sample(terrain, points, reach, device, t=0):
-    out = [wp.zeros(len(points), dtype=kind, device=device) for kind in (float, wp.vec3, float, wp.vec3)]
-    inputs = [terrain, t, wp.array(np.float32(points), dtype=wp.vec3, device=device), reach]
-    wp.launch(_sample_kernel, dim=len(points), inputs=inputs, outputs=out, device=device)
+def sample(terrain, points, reach, t=0):
+    out = [wp.zeros(len(points), dtype=kind) for kind in (float, wp.vec3, float, wp.vec3)]
+    inputs = [terrain, t, wp.array(np.float32(points), dtype=wp.vec3), reach]
+    wp.launch(_sample_kernel, dim=len(points), inputs=inputs, outputs=out)
     return [array.numpy() for array in out]
 
 
-def scatter(nrow, ncol, count, spacing=SPACING, seed=RNG_SEED):
+def scatter(nrow, ncol, count, spacing=SPACING):
     """Points over and up to 0.3 m beyond the grid, none closer than 1e-3 cells to an edge where the normal jumps."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(5)
     low, high = [-0.3, -0.3, -0.4], [(ncol - 1) * spacing + 0.3, (nrow - 1) * spacing + 0.3, 0.4]
     points = np.float32(rng.uniform(low, high, (4 * count, 3)))
     fraction = (points[:, :2] / spacing) % 1
@@ -69,10 +69,10 @@ def scatter(nrow, ncol, count, spacing=SPACING, seed=RNG_SEED):
 
 
 @pytest.mark.parametrize(("nrow", "ncol", "spacing"), [(33, 49, 0.05), (5, 12, 0.1)])
-def test_height_and_normal(device, nrow, ncol, spacing):
+def test_height_and_normal(nrow, ncol, spacing):
     grid = rough(nrow, ncol)
     points = scatter(nrow, ncol, 200, spacing)
-    height, normal, _, _ = sample(make_terrain(grid[None], device, spacing), points, 0.03, device)
+    height, normal, _, _ = sample(make_terrain(grid[None], spacing), points, 0.03)
     # x / spacing in float32 is off by 1e-5 cells, times 0.4 m from node to node.
     np.testing.assert_allclose(
         height, [oracle.surface_height(grid, spacing, *p[:2]) for p in np.float64(points)], atol=1e-5
@@ -81,10 +81,10 @@ def test_height_and_normal(device, nrow, ncol, spacing):
 
 
 @pytest.mark.parametrize("reach", [0.03, 0.1])
-def test_nearest_point(device, reach):
+def test_nearest_point(reach):
     grid = rough(33, 49)
     points = scatter(33, 49, 400)
-    _, _, distance, direction = sample(make_terrain(grid[None], device), points, reach, device)
+    _, _, distance, direction = sample(make_terrain(grid[None]), points, reach)
     near = 0
     for p, got, normal in zip(np.float64(points), distance, np.float64(direction), strict=True):
         expected, _ = oracle.nearest_on_surface(grid, SPACING, p, reach)
@@ -104,17 +104,17 @@ def test_nearest_point(device, reach):
     assert near > 8
 
 
-def test_the_cut_of_a_cell_by_hand(device):
+def test_the_cut_of_a_cell_by_hand():
     # One cell of 0.05 m, only its (high x, high y) corner raised to 0.1: the cut runs between the two other corners, so
     # the low triangle is flat, and at (0.04, 0.04) the high one stands at 0.1 * (0.8 + 0.8 - 1) = 0.06.
-    terrain = make_terrain([[[0, 0], [0, 0.1]]], device)
-    height, normal, _, _ = sample(terrain, [[0.02, 0.02, 0], [0.04, 0.04, 0]], 0.01, device)
+    terrain = make_terrain([[[0, 0], [0, 0.1]]])
+    height, normal, _, _ = sample(terrain, [[0.02, 0.02, 0], [0.04, 0.04, 0]], 0.01)
     np.testing.assert_allclose(height, [0, 0.06], atol=1e-6)
     # Its gradient is 0.1 / 0.05 = 2 along x and y: normal (-2, -2, 1) / 3.
     np.testing.assert_allclose(normal, [[0, 0, 1], [-2 / 3, -2 / 3, 1 / 3]], atol=1e-6)
 
 
-def test_nearest_point_by_hand(device):
+def test_nearest_point_by_hand():
     # A riser of 0.2 m in the cell between x = 0.2 and x = 0.25 (a 76 degree ramp): upward normal (-4, 0, 1) / sqrt(17).
     grid = np.zeros((9, 9), np.float32)
     grid[:, 5:] = 0.2
@@ -123,24 +123,22 @@ def test_nearest_point_by_hand(device):
     # Over the upper edge: (0.24, 0.2, 0.23) is nearest to the edge (0.25, 0.2, 0.2): sqrt(0.01^2 + 0.03^2) = 0.0316228.
     # Inside the riser by the same 0.0242536: (0.25, 0.2, 0.1).
     points = [[0.2, 0.2, 0.1], [0.24, 0.2, 0.23], [0.25, 0.2, 0.1]]
-    _, _, distance, normal = sample(make_terrain(grid[None], device), points, 0.06, device)
+    _, _, distance, normal = sample(make_terrain(grid[None]), points, 0.06)
     np.testing.assert_allclose(distance, [0.0242536, 0.0316228, -0.0242536], atol=1e-6)
     riser = np.array([-4, 0, 1]) / np.sqrt(17)
     np.testing.assert_allclose(normal, [riser, np.array([-1, 0, 3]) / np.sqrt(10), riser], atol=1e-5)
 
 
 @pytest.mark.parametrize(("nrow", "ncol"), [(161, 321), (2, 2), (10, 18)])
-def test_ceiling_is_an_upper_bound(device, nrow, ncol):
+def test_ceiling_is_an_upper_bound(nrow, ncol):
     grid = rough(nrow, ncol)
     rng = np.random.default_rng(0)
     size = np.array([ncol - 1, nrow - 1]) * SPACING
     lower = np.float32(rng.uniform(-1, size + 1, (300, 2)))
     upper = np.float32(lower + rng.uniform(0, 0.9, (300, 2)))
-    out = wp.zeros(300, dtype=float, device=device)
-    corners = [wp.array(corner, dtype=wp.vec2, device=device) for corner in (lower, upper)]
-    wp.launch(
-        _ceiling_kernel, dim=300, inputs=[make_terrain(grid[None], device), *corners], outputs=[out], device=device
-    )
+    out = wp.zeros(300, dtype=float)
+    corners = [wp.array(corner, dtype=wp.vec2) for corner in (lower, upper)]
+    wp.launch(_ceiling_kernel, dim=300, inputs=[make_terrain(grid[None]), *corners], outputs=[out])
     for low, high, ceiling in zip(np.float64(lower), np.float64(upper), out.numpy(), strict=True):
         # The highest surface point over a rectangle is bounded by the nodes of the cells it overlaps ...
         first, last = np.floor(low / SPACING).astype(int), np.ceil(high / SPACING).astype(int)
@@ -153,18 +151,7 @@ def test_ceiling_is_an_upper_bound(device, nrow, ncol):
         assert ceiling <= grid[np.ix_(rows, cols)].max()
 
 
-def test_block_maxima_share_the_border_nodes(device):
-    # 17 x 17 nodes are 2 x 2 blocks of 8 cells. A spike on their common corner lifts all four ceilings, one on node
-    # (3, 12) only that of block row 0, block column 1.
-    grid = np.zeros((1, 17, 17), np.float32)
-    grid[0, 3, 12] = 1
-    ceilings = make_terrain(grid, device).ceilings.numpy()
-    np.testing.assert_array_equal(ceilings, [[[0, 1], [0, 0]]])
-    grid[0, 8, 8] = 2
-    np.testing.assert_array_equal(make_terrain(grid, device).ceilings.numpy(), [[[2, 2], [2, 2]]])
-
-
-def test_wrong_ceiling_shape_is_named(device):
-    heights = wp.zeros((2, 17, 33), dtype=float, device=device)
+def test_wrong_ceiling_shape_is_named():
+    heights = wp.zeros((2, 17, 33), dtype=float)
     with pytest.raises(ValueError, match="ceilings_out"):
-        max_blocks(heights, wp.zeros((2, 2, 5), dtype=float, device=device))
+        max_blocks(heights, wp.zeros((2, 2, 5), dtype=float))

@@ -6,35 +6,24 @@ import warp as wp
 
 from kernels.observation import Noise, Sensors, apply_action, write_observation
 from sim.mujoco_c.model import observations, to_mujoco
-from tests.builders import make_terrain, rough
-from tests.kernels.states import random_states, upright
+from tests.kernels.states import filled, make_terrain, random_states, rough, upright
 
 BASE_COM = (-0.02, 0.01, 0.03)
 
 
-def make_sensors(num_joints, scan, device):
-    sensors = Sensors()
-    sensors.default_joint_pos = wp.array(np.linspace(-0.5, 0.5, num_joints), dtype=float, device=device)
-    sensors.scan_x = wp.array(np.float32([x for x, _ in scan]), dtype=float, device=device)
-    sensors.scan_y = wp.array(np.float32([y for _, y in scan]), dtype=float, device=device)
-    sensors.base_com = wp.vec3(*BASE_COM)
-    return sensors
+def make_sensors(num_joints, scan):
+    x, y = np.reshape(scan, (-1, 2)).T
+    default = np.linspace(-0.5, 0.5, num_joints)
+    return filled(Sensors, default_joint_pos=default, scan_x=x, scan_y=y, base_com=BASE_COM)
 
 
-def observe(states, command, last_action, terrain_of_env, grids, scan, device, *, noise=None, seed=0, columns=None):
+def observe(states, command, last_action, terrain_of_env, grids, scan, *, columns=None):
     num_envs, num_joints = np.shape(last_action)
     width = 12 + 3 * num_joints + len(scan) if columns is None else columns
-    out = wp.zeros((num_envs, width), dtype=float, device=device)
-    arrays = [wp.array(np.float32(array), device=device) for array in (*states, command, last_action)]
-    write_observation(
-        *arrays,
-        wp.array(terrain_of_env, dtype=int, device=device),
-        make_terrain(grids, device),
-        make_sensors(num_joints, scan, device),
-        noise or Noise(),
-        wp.array([seed], dtype=int, device=device),
-        out,
-    )
+    out = wp.zeros((num_envs, width), dtype=float)
+    arrays = [wp.array(np.float32(array)) for array in (*states, command, last_action)]
+    on, sensors = wp.array(terrain_of_env, dtype=int), make_sensors(num_joints, scan)
+    write_observation(*arrays, on, make_terrain(grids), sensors, Noise(), wp.array([0], dtype=int), out)
     return out.numpy()
 
 
@@ -49,9 +38,9 @@ def random_case(num_envs, num_joints, num_scan, num_terrains=2, seed=0):
 
 
 @pytest.mark.parametrize(("num_envs", "num_joints", "num_scan"), [(40, 12, 187), (7, 0, 0)])
-def test_parity_with_the_oracle(device, num_envs, num_joints, num_scan):
+def test_parity_with_the_oracle(num_envs, num_joints, num_scan):
     states, command, action, terrain_of_env, grids, scan = random_case(num_envs, num_joints, num_scan)
-    got = observe(states, command, action, terrain_of_env, grids, scan, device)
+    got = observe(states, command, action, terrain_of_env, grids, scan)
     default = np.float64(np.float32(np.linspace(-0.5, 0.5, num_joints)))
     plain = to_mujoco(*states, np.array(BASE_COM))
     for env in range(num_envs):
@@ -64,7 +53,7 @@ def test_parity_with_the_oracle(device, num_envs, num_joints, num_scan):
         np.testing.assert_allclose(got[env, split:], expected[split:], atol=3e-4)
 
 
-def test_one_row_by_hand(device):
+def test_one_row_by_hand():
     # A level base at 0.6 m turned by 90 degrees over a plateau of 0.2 m that starts at y = 4 (row 80).
     q, qd = upright(1, 2, x=2, y=3.9, z=0.6)
     q[0, 3:7] = 0, 0, np.sqrt(0.5), np.sqrt(0.5)
@@ -74,7 +63,7 @@ def test_one_row_by_hand(device):
     grids = np.zeros((1, 161, 321))
     grids[:, 80:] = 0.2
     # Ahead of the base is +y: the point 0.5 m ahead stands on 0.2 m, the one 0.5 m behind on 0.
-    row = observe((q, qd), [[0.75, -0.1, 0.4]], [[1.5, -3]], [0], grids, [(0.5, 0.0), (-0.5, 0.0)], device)[0]
+    row = observe((q, qd), [[0.75, -0.1, 0.4]], [[1.5, -3]], [0], grids, [(0.5, 0.0), (-0.5, 0.0)])[0]
     expected = [
         1.0, 0, 0.2,  # (0.5, 0, 0.1) m/s in the base frame, times 2
         0, 0, 0,
@@ -88,58 +77,40 @@ def test_one_row_by_hand(device):
     np.testing.assert_allclose(row, expected, atol=2e-6)
 
 
-def test_the_scan_is_clipped_at_a_metre(device):
+def test_the_scan_is_clipped_at_a_metre():
     # 0.5 m below the base is the zero: a base at 3 m sees (3 - 0.5) -> 1 m, times 5; one at -2 m sees -1 m.
     for z, expected in ((3.0, 5.0), (-2.0, -5.0), (1.2, 3.5)):
         q, qd = upright(1, 0, z=z)
-        row = observe((q, qd), [[0, 0, 0]], np.zeros((1, 0)), [0], np.zeros((1, 9, 9)), [(0, 0)], device)[0]
+        row = observe((q, qd), [[0, 0, 0]], np.zeros((1, 0)), [0], np.zeros((1, 9, 9)), [(0, 0)])[0]
         assert row[12] == pytest.approx(expected, abs=1e-5)
 
 
-def test_noise_stays_in_its_width_and_follows_the_seed(device):
-    noise = Noise()
-    widths = {"lin_vel": 0.1, "ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5, "scan": 0.1}
-    for name, width in widths.items():
-        setattr(noise, name, width)
-    case = (upright(400, 2), np.zeros((400, 3)), np.zeros((400, 2)), np.zeros(400, int), np.zeros((1, 9, 9)), [(0, 0)])
-    clean = observe(*case, device)
-    added = observe(*case, device, noise=noise, seed=3) - clean
-    # Widths times the columns' scales; the command and the last action are known exactly.
-    scaled = [0.2] * 3 + [0.05] * 3 + [0.05] * 3 + [0] * 3 + [0.01] * 2 + [0.075] * 2 + [0] * 2 + [0.5]
-    assert (np.abs(added) <= np.array(scaled) + 1e-6).all()
-    # 400 uniform draws reach 0.9 of the width in both directions (chance of failure 1e-8), with mean near 0.
-    assert (added.max(axis=0) >= 0.9 * np.array(scaled)).all()
-    assert (added.min(axis=0) <= -0.9 * np.array(scaled)).all()
-    np.testing.assert_array_equal(added, observe(*case, device, noise=noise, seed=3) - clean)
-    assert (observe(*case, device, noise=noise, seed=4) - clean != added).any()
-
-
-def test_a_wild_state_gives_a_bounded_row(device):
+def test_a_wild_state_gives_a_bounded_row():
     q, qd = upright(1, 1)
     qd[0] = 1e6
-    row = observe((q, qd), [[0, 0, 0]], np.zeros((1, 1)), [0], np.zeros((1, 9, 9)), [(0, 0)], device)
+    row = observe((q, qd), [[0, 0, 0]], np.zeros((1, 1)), [0], np.zeros((1, 9, 9)), [(0, 0)])
     assert np.abs(row).max() == 100
 
 
-def test_wrong_row_size_is_named(device):
+def test_wrong_row_size_is_named():
     states, command, action, terrain_of_env, grids, scan = random_case(3, 2, 4)
     with pytest.raises(ValueError, match="observation_out"):
-        observe(states, command, action, terrain_of_env, grids, scan, device, columns=21)
+        observe(states, command, action, terrain_of_env, grids, scan, columns=21)
 
 
-def act(action, device, num_joints=2, scale=0.5):
+def act(action, num_joints=2, scale=0.5):
     action = np.float32(action)
-    last = wp.zeros((len(action), num_joints), dtype=float, device=device)
-    targets = wp.full((len(action), 7 + num_joints), 9.0, dtype=float, device=device)
-    apply_action(wp.array(action, device=device), make_sensors(num_joints, [], device), scale, last, targets)
+    last = wp.zeros((len(action), num_joints), dtype=float)
+    targets = wp.full((len(action), 7 + num_joints), 9.0, dtype=float)
+    apply_action(wp.array(action), make_sensors(num_joints, []), scale, last, targets)
     return last.numpy(), targets.numpy()
 
 
-def test_action_by_hand(device):
+def test_action_by_hand():
     # Default pose (-0.5, 0.5), half a radian per unit; actions are clipped at 100, and what is not finite is no limit.
-    last, targets = act([[0.2, -1], [300, -300], [np.nan, np.inf]], device)
+    last, targets = act([[0.2, -1], [300, -300], [np.nan, np.inf]])
     np.testing.assert_array_equal(last, np.float32([[0.2, -1], [100, -100], [np.nan, np.nan]]))
     np.testing.assert_allclose(targets[:, 7:], [[-0.4, 0], [49.5, -49.5], [np.nan, np.nan]], atol=1e-6)
     assert (targets[:, :7] == 9).all()  # the base's columns are not targets
     with pytest.raises(ValueError, match="action"):
-        act(np.zeros((4, 3)), device)
+        act(np.zeros((4, 3)))

@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.penalties import BASE, FOOT, LIMB, SolverContacts, add_penalties, sum_geom_forces
 from sim.mujoco_c.model import step_penalties, to_mujoco
-from tests.kernels.states import random_states, upright
+from tests.kernels.states import filled, random_states, upright
 
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
 BASE_COM = (0.05, -0.02, 0.1)
@@ -14,23 +14,15 @@ LIMIT = 500.0
 DT = 0.005
 
 
-def sums_after(states, command, forces, device, *, counted=None, steps=1, roles=ROLES, sums=None):
+def sums_after(states, command, forces, *, counted=None, steps=1, sums=None):
     """Penalty sums after adding the same physics step ``steps`` times."""
     num_envs = len(command)
-    out = wp.array(np.zeros((num_envs, 6), np.float32) if sums is None else sums, device=device)
-    arrays = [wp.array(np.float32(array), device=device) for array in (*states, command)]
+    out = wp.array(np.zeros((num_envs, 6), np.float32) if sums is None else sums)
+    arrays = [wp.array(np.float32(array)) for array in (*states, command)]
+    on_geoms, roles = wp.array(np.float32(forces), dtype=wp.vec3), wp.array(ROLES, dtype=int)
+    counted = wp.array(np.ones(num_envs, int) if counted is None else counted, dtype=int)
     for _ in range(steps):
-        add_penalties(
-            *arrays[:2],
-            wp.vec3(*BASE_COM),
-            arrays[2],
-            wp.array(np.float32(forces), dtype=wp.vec3, device=device),
-            wp.array(roles, dtype=int, device=device),
-            LIMIT,
-            DT,
-            wp.array(np.ones(num_envs, int) if counted is None else counted, dtype=int, device=device),
-            out,
-        )
+        add_penalties(*arrays[:2], wp.vec3(*BASE_COM), arrays[2], on_geoms, roles, LIMIT, DT, counted, out)
     return out.numpy()
 
 
@@ -43,24 +35,24 @@ def random_forces(num_envs, num_geoms, seed=0):
 
 
 @pytest.mark.parametrize("num_envs", [1, 200])
-def test_parity_with_the_oracle(device, num_envs):
+def test_parity_with_the_oracle(num_envs):
     states = random_states(num_envs, 3)
     command = np.float32(np.random.default_rng(1).uniform(-1, 1, (num_envs, 3)))
     forces = random_forces(num_envs, 5)
     plain, feet = to_mujoco(*states, np.array(BASE_COM)), np.array(ROLES) == FOOT
     exact = (np.float64(command), np.float64(forces))
     expected = step_penalties(plain.qpos, plain.qvel, *exact, feet=feet, force_limit=LIMIT)
-    np.testing.assert_allclose(sums_after(states, command, forces, device), DT * expected, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(sums_after(states, command, forces), DT * expected, rtol=1e-5, atol=1e-7)
 
 
-def test_velocity_errors_by_hand(device):
+def test_velocity_errors_by_hand():
     # Level base turned by 90 degrees: it looks along world y. Its mass centre moving with (-0.2, 1, 0) m/s is
     # (1, 0.2) in the base frame. Commanded (0.75, 0, 0.1), not turning: errors 0.25, 0.2, yaw rate 0.1; squared
     # 0.0625, 0.04, 0.01. Two steps of 0.005 s: 0.000625, 0.0004, 0.0001.
     q, qd = upright(1, 3)
     q[0, 3:7] = 0, 0, np.sqrt(0.5), np.sqrt(0.5)
     qd[0, :3] = -0.2, 1, 0
-    sums = sums_after((q, qd), [[0.75, 0, 0.1]], np.zeros((1, 5, 3)), device, steps=2)
+    sums = sums_after((q, qd), [[0.75, 0, 0.1]], np.zeros((1, 5, 3)), steps=2)
     np.testing.assert_allclose(sums[0], [0.0001, 0.000625, 0.0004, 0, 0, 0], atol=1e-9)
 
 
@@ -79,59 +71,57 @@ def test_velocity_errors_by_hand(device):
         ({}, 0, 0, 0),
     ],
 )
-def test_contact_penalties_by_hand(device, forces, contact_force, stumble, collision):
+def test_contact_penalties_by_hand(forces, contact_force, stumble, collision):
     on_geoms = np.zeros((1, 5, 3))
     for geom, force in forces.items():
         on_geoms[0, geom] = force
-    sums = sums_after(upright(1, 3), [[0, 0, 0]], on_geoms, device)
+    sums = sums_after(upright(1, 3), [[0, 0, 0]], on_geoms)
     np.testing.assert_allclose(sums[0, 3:], [contact_force, stumble, collision], atol=1e-6)
 
 
-def test_steps_that_do_not_count_add_nothing(device):
+def test_steps_that_do_not_count_add_nothing():
     states, forces = random_states(4, 3), random_forces(4, 5)
     before = np.random.default_rng(0).random((4, 6)).astype(np.float32)
-    after = sums_after(states, np.zeros((4, 3)), forces, device, counted=[0, 1, 0, 1], sums=before)
+    after = sums_after(states, np.zeros((4, 3)), forces, counted=[0, 1, 0, 1], sums=before)
     np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
     assert (after[[1, 3], :3] > before[[1, 3], :3]).all()
 
 
-def test_wrong_number_of_columns_is_named(device):
+def test_wrong_number_of_columns_is_named():
     with pytest.raises(ValueError, match="sums_out"):
-        sums_after(upright(2, 3), np.zeros((2, 3)), np.zeros((2, 5, 3)), device, sums=np.zeros((2, 5), np.float32))
+        sums_after(upright(2, 3), np.zeros((2, 3)), np.zeros((2, 5, 3)), sums=np.zeros((2, 5), np.float32))
 
 
-def geom_forces(device, *, count, capacity, column_of_geom, num_geoms):
+def geom_forces(*, count, capacity, column_of_geom, num_geoms):
     """Two worlds; contact k is on geom k of world k % 2, with forces 10 k + (1, 2, 3) along its normal and tangents."""
-    contacts = SolverContacts()
-    total = 4
-    contacts.count = wp.array([count], dtype=int, device=device)
-    contacts.capacity = capacity
-    contacts.world = wp.array(np.arange(total) % 2, dtype=int, device=device)
-    contacts.geom = wp.array([[9, k] for k in range(total)], dtype=wp.vec2i, device=device)
-    # Normal along world y, tangents along z and x.
-    frame = np.tile([[0, 1, 0], [0, 0, 1], [1, 0, 0]], (total, 1, 1)).astype(np.float32)
-    contacts.frame = wp.array(frame, dtype=wp.mat33, device=device)
-    # World 0 has contacts 0 and 2 in rows 0.. and 3..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
-    contacts.efc_address = wp.array([[0, 1, 2], [0, 1, 2], [3, 4, 5], [-1] * 3], dtype=int, device=device)
-    efc_force = np.float32([[1, 2, 3, 21, 22, 23], [11, 12, 13, 0, 0, 0]])
-    contacts.efc_force = wp.array(efc_force, device=device)
-    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3, device=device)
-    sum_geom_forces(contacts, wp.array(column_of_geom, dtype=int, device=device), out)
+    contacts = filled(
+        SolverContacts,
+        count=[count],
+        capacity=capacity,
+        world=[0, 1, 0, 1],
+        geom=[[9, k] for k in range(4)],
+        frame=np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4),  # normal along world y, tangents along z and x
+        # World 0 has contacts 0 and 2 in rows 0.. and 3..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
+        efc_address=[[0, 1, 2], [0, 1, 2], [3, 4, 5], [-1] * 3],
+        efc_force=[[1, 2, 3, 21, 22, 23], [11, 12, 13, 0, 0, 0]],
+    )
+    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3)
+    sum_geom_forces(contacts, wp.array(column_of_geom, dtype=int), out)
     return out.numpy()
 
 
-def test_contact_forces_of_one_geom_add_up_and_others_are_left_out(device):
+def test_contact_forces_of_one_geom_add_up_and_others_are_left_out():
     # Contact 0: 1 N along y, 2 N along z, 3 N along x; contact 2 likewise 21, 22, 23; contact 1 11, 12, 13. Geoms 0 and
     # 2 share column 1, geom 1 has column 2.
-    forces = geom_forces(device, count=4, capacity=4, column_of_geom=[1, 2, 1, 0] + [-1] * 6, num_geoms=3)
+    forces = geom_forces(count=4, capacity=4, column_of_geom=[1, 2, 1, 0] + [-1] * 6, num_geoms=3)
     expected = np.zeros((2, 3, 3))
     expected[0, 1], expected[1, 2] = (26, 22, 24), (13, 11, 12)
     np.testing.assert_allclose(forces, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "capacity"), [(2, 4), (900, 2)])
-def test_only_contacts_that_exist_are_read(device, count, capacity):
+def test_only_contacts_that_exist_are_read(count, capacity):
     # Contact 2 is stale in the first case, and beyond the capacity in the second, whose count ran on past it.
-    forces = geom_forces(device, count=count, capacity=capacity, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
+    forces = geom_forces(count=count, capacity=capacity, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
     assert forces[0, 0, 1] == 1
     assert not forces[0, 2].any()

@@ -10,52 +10,50 @@ from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import clear_rows, restart_episodes
 from kernels.rewards import Rewards, make_rewards
 from sim.crossing import CrossingCfg, make_start_ranges
-from tests.builders import make_terrain, rough
 from tests.kernels import oracle
+from tests.kernels.states import filled, make_terrain, rough
 
 BASE_COM = (-0.02, 0.01, 0.03)
 
 
-def starts_of(seeds, replicas, device):
+def starts_of(seeds, replicas):
     """What each start is drawn from, as a queue hands it out: replica by replica, terrain by terrain."""
     num_envs = len(seeds) * replicas
-    queue = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=device)
-    waiting = make_episodes(num_envs, device)
+    queue = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=str(wp.get_device()))
+    waiting = make_episodes(num_envs)
     queue.seed.assign(np.uint32(seeds))
     make_ready(num_envs, queue)
-    sums, terrain_of_env = wp.zeros((num_envs, 1), device=device), wp.zeros(num_envs, dtype=int, device=device)
+    sums, terrain_of_env = wp.zeros((num_envs, 1)), wp.zeros(num_envs, dtype=int)
     turn_over(waiting.outcome, Rewards(), waiting, sums, terrain_of_env, queue)
-    return wp.array(waiting.rng.numpy()[np.argsort(queue.episode_of_env.numpy())], device=device)
+    return wp.array(waiting.rng.numpy()[np.argsort(queue.episode_of_env.numpy())])
 
 
-def start(seeds, replicas, grids, device, anymal, outcome=None, rewards=None):
+def start(seeds, replicas, grids, anymal, outcome=None, rewards=None):
     """Joint coordinates and velocities and the episodes after a restart; all have ended unless ``outcome`` is given."""
     num_envs, joints = len(seeds) * replicas, anymal.num_joints
-    q = wp.full((num_envs, 7 + joints), 3.0, dtype=float, device=device)
-    qd = wp.full((num_envs, 6 + joints), 3.0, dtype=float, device=device)
-    action = wp.full((num_envs, joints), 3.0, dtype=float, device=device)
-    state = make_episodes(num_envs, device)
+    q = wp.full((num_envs, 7 + joints), 3.0, dtype=float)
+    qd = wp.full((num_envs, 6 + joints), 3.0, dtype=float)
+    action = wp.full((num_envs, joints), 3.0, dtype=float)
+    state = make_episodes(num_envs)
     state.steps.fill_(77)
     ended = np.full(num_envs, 1) if outcome is None else np.int32(outcome) != Outcome.RUNNING
-    mask = wp.array(ended, dtype=int, device=device)
-    terrain_of_env = wp.array(np.repeat(np.arange(len(seeds)), replicas), dtype=int, device=device)
-    sensors = Sensors()
-    sensors.base_com = BASE_COM
-    sensors.default_joint_pos = wp.array(np.float32(anymal.default_joint_pos), device=device)
+    mask = wp.array(ended, dtype=int)
+    terrain_of_env = wp.array(np.repeat(np.arange(len(seeds)), replicas), dtype=int)
+    sensors = filled(Sensors, base_com=BASE_COM, default_joint_pos=anymal.default_joint_pos)
     ranges = make_start_ranges(CrossingCfg(), anymal)
-    state.rng = starts_of(seeds, replicas, device)
-    terrain = make_terrain(grids, device)
+    state.rng = starts_of(seeds, replicas)
+    terrain = make_terrain(grids)
     restart_episodes(mask, terrain_of_env, terrain, ranges, sensors, q, qd, action, state, rewards or Rewards())
     assert (action.numpy() == np.where(q.numpy()[:, :1] == 3.0, 3.0, 0.0)).all()
     return q.numpy(), qd.numpy(), state
 
 
-def test_running_episodes_are_left_alone(device, anymal):
-    rewards = make_rewards(3, 12, 2, device)
+def test_running_episodes_are_left_alone(anymal):
+    rewards = make_rewards(3, 12, 2)
     for array in (rewards.running, rewards.total, rewards.air_time, rewards.touched, rewards.terms):
         array.fill_(5)
     outcome = [Outcome.TILT, Outcome.RUNNING, Outcome.TIME_OUT]
-    q, qd, state = start([7], 3, np.zeros((1, 161, 321)), device, anymal, outcome=outcome, rewards=rewards)
+    q, qd, state = start([7], 3, np.zeros((1, 161, 321)), anymal, outcome=outcome, rewards=rewards)
     assert (q[1] == 3.0).all() and (qd[1] == 3.0).all()
     assert (q[[0, 2], 0] != 3.0).all() and not qd[[0, 2], 6:].any()
     assert state.steps.numpy().tolist() == [0, 77, 0]
@@ -66,8 +64,8 @@ def test_running_episodes_are_left_alone(device, anymal):
     assert (rewards.terms.numpy() == 5).all()  # sums over episodes
 
 
-def test_starts_fill_their_ranges(device, anymal):
-    q, qd, state = start(range(40), 20, np.zeros((40, 161, 321)), device, anymal)
+def test_starts_fill_their_ranges(anymal):
+    q, qd, state = start(range(40), 20, np.zeros((40, 161, 321)), anymal)
     default = np.array(anymal.default_joint_pos)
     moving = default != 0
     com_arm = np.array([oracle.rotation_matrix(row[3:7]) @ BASE_COM for row in q])
@@ -98,9 +96,9 @@ def test_starts_fill_their_ranges(device, anymal):
     np.testing.assert_array_equal(state.start.numpy(), q[:, :2])
 
 
-def test_the_start_stands_on_the_highest_ground_under_the_robot(device, anymal):
+def test_the_start_stands_on_the_highest_ground_under_the_robot(anymal):
     grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(2)])
-    q, _, _ = start([1, 2], 8, grids, device, anymal)
+    q, _, _ = start([1, 2], 8, grids, anymal)
     for env, row in enumerate(np.float64(q)):
         half = np.array(anymal.footprint)
         low, high = np.floor((row[:2] - half) / 0.05).astype(int), np.ceil((row[:2] + half) / 0.05).astype(int)
@@ -108,14 +106,14 @@ def test_the_start_stands_on_the_highest_ground_under_the_robot(device, anymal):
         assert row[2] == pytest.approx(ground + anymal.default_base_height, abs=1e-6)
 
 
-def test_a_start_depends_on_its_seed_and_replica_alone(device, anymal):
+def test_a_start_depends_on_its_seed_and_replica_alone(anymal):
     grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(4)])
     seeds, order = np.array([5, 2**32 - 1, 5, 0]), [3, 1, 0, 2]
-    q, qd, _ = start(seeds, 3, grids, device, anymal)
+    q, qd, _ = start(seeds, 3, grids, anymal)
     by_terrain = q.reshape(4, 3, 19)
-    again, _, _ = start(seeds[order], 3, grids[order], device, anymal)
+    again, _, _ = start(seeds[order], 3, grids[order], anymal)
     np.testing.assert_array_equal(again.reshape(4, 3, 19), by_terrain[order])
-    alone, _, _ = start(seeds[1:2], 3, grids[1:2], device, anymal)
+    alone, _, _ = start(seeds[1:2], 3, grids[1:2], anymal)
     np.testing.assert_array_equal(alone, by_terrain[1])
     # Seed 5 twice: the same draws on other ground. Seeds and replicas differ from each other.
     np.testing.assert_array_equal(by_terrain[0, :, 7:], by_terrain[2, :, 7:])
@@ -123,9 +121,9 @@ def test_a_start_depends_on_its_seed_and_replica_alone(device, anymal):
 
 
 @pytest.mark.parametrize("columns", [2, 64, 1801])
-def test_masked_rows_are_cleared_whole(device, columns):
-    rows = wp.array(np.full((3, columns), np.nan, np.float32), device=device)
-    clear_rows(wp.array([1, 0, 7], dtype=int, device=device), rows)
+def test_masked_rows_are_cleared_whole(columns):
+    rows = wp.array(np.full((3, columns), np.nan, np.float32))
+    clear_rows(wp.array([1, 0, 7], dtype=int), rows)
     assert not rows.numpy()[[0, 2]].any() and np.isnan(rows.numpy()[1]).all()
     with pytest.raises(ValueError, match="mask"):
-        clear_rows(wp.zeros(2, dtype=int, device=device), rows)
+        clear_rows(wp.zeros(2, dtype=int), rows)

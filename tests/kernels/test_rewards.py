@@ -10,6 +10,7 @@ from kernels.episode import Outcome
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.rewards import REWARDS, Motion, make_rewards, make_weights, remember_steps, reward_steps
 from sim.robots.training import RewardCfg
+from tests.kernels.states import filled
 
 JOINTS = 3
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
@@ -27,13 +28,12 @@ class Robots:
 
     def __init__(self, num_envs=1, *, least_air_time=0.5, **arrays):
         self.rewards = make_rewards(num_envs, JOINTS, len(ROLES), str(wp.get_device()))
-        self.motion, self.num_envs = Motion(), num_envs
-        self.motion.geom_role, self.motion.base_com = wp.array(ROLES, dtype=int), (0.05, -0.02, 0.1)
-        self.motion.force_limit, self.motion.dt, self.motion.min_air_time_s = 500.0, DT, least_air_time
-        limits = {"joint_lower": (-0.5, -1e10, 0.2), "joint_upper": (0.5, 1e10, 0.8)}
-        for name, row in {**limits, "default_joint_pos": (0.1, -0.2, 0.3)}.items():
-            setattr(self.motion, name, wp.array(row, dtype=float))
-        self.motion.joint_is_steady = wp.array([1, 0, 1], dtype=int)
+        self.num_envs = num_envs
+        self.motion = filled(
+            Motion, geom_role=ROLES, base_com=(0.05, -0.02, 0.1), force_limit=500.0, dt=DT,
+            min_air_time_s=least_air_time, joint_lower=(-0.5, -1e10, 0.2), joint_upper=(0.5, 1e10, 0.8),
+            default_joint_pos=(0.1, -0.2, 0.3), joint_is_steady=[1, 0, 1],
+        )  # fmt: skip
         widths = {"joint_qd": 6 + JOINTS, "joint_torque": 6 + JOINTS, "command": 3, "action": JOINTS}
         self.set(joint_q=(*STANDING, *REST), geom_force=np.zeros((5, 3)), **{n: np.zeros(w) for n, w in widths.items()})
         self.set(**arrays)
