@@ -36,13 +36,9 @@ def test_help_names_every_command_the_six_of_a_newcomer_first_and_loads_nothing(
 
 
 @pytest.mark.parametrize("name", WORDS)
-def test_help_of_a_command_is_quick(name):
+def test_a_command_is_a_frozen_dataclass_whose_help_teaches_and_is_quick(name):
     text, loaded = loaded_by(name, "--help")
     assert f"usage: faultline {name}" in text and loaded == set()
-
-
-@pytest.mark.parametrize("name", WORDS)
-def test_a_command_is_a_frozen_dataclass_whose_help_teaches(name):
     module, _, cls = WORDS[name].where.partition(":")
     command = getattr(importlib.import_module(module), cls)
     assert dataclasses.is_dataclass(command) and command.__dataclass_params__.frozen

@@ -71,19 +71,15 @@ def test_file_keeps_to_its_room(path):
     assert offences_of(path, (ROOT / path).read_text(encoding="utf-8")) == []
 
 
-def imported_modules() -> dict[str, set[str]]:
-    """What each module of the rooms imports of them, inside functions too, but for the door to Ray."""
+def test_no_modules_import_each_other_in_a_circle():
+    """Inside functions too, but for the door to Ray."""
     names = {str(path.with_suffix("")).replace("/", ".").removesuffix(".__init__"): path for path in FILES}
     modules = {}
     for name, path in names.items():
         tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
         imported = {full if full in names else full.rpartition(".")[0] for _, full in imported_names(path, tree)}
         modules[name] = (imported & names.keys()) - {name, "qd.workers.ray_workers"}
-    return modules
-
-
-def test_no_modules_import_each_other_in_a_circle():
-    modules = imported_modules()
+    assert {name.partition(".")[0] for name in modules} == set(ROOMS)
     while leaves := {name for name, imported in modules.items() if not imported & modules.keys()}:
         modules = {name: imported for name, imported in modules.items() if name not in leaves}
     while tops := modules.keys() - set().union(*modules.values()):
@@ -102,23 +98,15 @@ def test_few_imports_are_hidden_and_only_the_registry_loads_commands():
     assert hidden <= MAX_HIDDEN
 
 
-def test_every_room_is_walked():
-    assert {path.parts[0] for path in FILES} == set(ROOMS)
-
-
 @pytest.mark.parametrize(
     ("path", "source"),
     [
         ("kernels/a.py", "import sim"),
         ("sim/a.py", "def f():\n    from qd.archive import read"),
-        ("qd/a.py", "import train.base as base"),
         ("qd/a.py", "import importlib\nimportlib.import_module('train.base')"),
         ("qd/a.py", "__import__('torch')"),
         ("qd/a.py", "import numpy, warp"),
         ("qd/a.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),
-        ("train/a.py", "import warp as wp"),
-        ("sim/view/a.py", "import viser"),
-        ("train/a.py", "from ribs.archives import GridArchive"),
         ("train/a.py", "from qd import archive, show"),
         ("train/a.py", "from ..qd.show import figures"),
         ("sim/a.py", "from tests.oracles import height"),
@@ -127,21 +115,6 @@ def test_every_room_is_walked():
 )
 def test_an_offender_is_caught(path, source):
     assert len(offences_of(Path(path), source)) == 1
-
-
-@pytest.mark.parametrize(
-    ("path", "source"),
-    [
-        ("kernels/a.py", "import numpy as np\nimport warp as wp\nfrom kernels.contact import collide"),
-        ("sim/a.py", "import newton\nimport torch\nimport warp\nfrom . import robot\nfrom kernels import contact"),
-        ("qd/a.py", "from ribs.archives import GridArchive\nfrom sim.rollout import Rollout\nfrom .space import Space"),
-        ("train/a.py", "import torch, rsl_rl\nfrom qd import archive\nfrom qd.workers.evaluator import evaluate"),
-        ("qd/show/view/a.py", "import viser\nfrom sim.robots.skeleton import Skeleton"),
-        ("sim/a.py", "x = 1\n" * 500),
-    ],
-)
-def test_what_is_allowed_passes(path, source):
-    assert offences_of(Path(path), source) == []
 
 
 def test_a_wheel_has_every_file_of_the_rooms():

@@ -125,14 +125,6 @@ def test_a_full_disk_is_an_error_that_names_the_file(copied, monkeypatch):
     assert read_checkpoint(copied / "checkpoint.pt")["iter"] == 2
 
 
-def test_it_saves_every_so_often(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
-    seen = []
-    monkeypatch.setattr(training, "write_checkpoint", lambda path, content: seen.append(content["iter"]))
-    train(ROBOT, CFG, tmp_path / "run", ON_CPU)
-    assert seen == [1, 2, 2]
-
-
 def test_places_of_others_are_not_written_to(finished, tmp_path):
     (tmp_path / "archive.npz").write_bytes(b"")
     with pytest.raises(ValueError, match="search"):

@@ -105,11 +105,8 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
 
 def test_it_goes_on_with_the_same_terrains_by_equal_settings_alone(places, finished):
     before = read_checkpoint(finished / "checkpoint.pt")
-    task = cfg_of(places).task
-    heavier = replace(task, rewards=replace(task.rewards, termination=-1.0))
-    for changes, field in (({"task": heavier}, "rewards.termination"), ({"iterations": 2}, "iterations")):
-        with pytest.raises(ValueError, match=field):
-            finetune(ROBOT, cfg_of(places, **{"iterations": 9, **changes}), finished, ON_CPU)
+    with pytest.raises(ValueError, match="swap_every"):
+        finetune(ROBOT, cfg_of(places, iterations=9, swap_every=3), finished, ON_CPU)
     finetune(ROBOT, cfg_of(places), finished, ON_CPU)  # it is over
     assert read_checkpoint(finished / "checkpoint.pt")["progress"] == before["progress"]
     assert run_command(Finetune, ["--resume", str(finished), "--device", "cpu", "--iterations", "4"], name="x") == 0

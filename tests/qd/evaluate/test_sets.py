@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import Archive, write_archive
+from qd.archive import Archive, FaultCounts, write_archive
 from qd.evaluate.labels import SETS
 from qd.evaluate.marks import marks_of
 from qd.evaluate.sets import (
@@ -26,8 +26,9 @@ from sim.bank import heights_of
 from sim.files.records import robot_digest
 from sim.spaces.course import COURSE
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import fresh_values
 from tests.qd.searches import CFG
-from tests.train.archives import certified_archive, make_archive
+from tests.train.archives import make_archive
 
 PARTS = ("test", "validation")
 
@@ -111,7 +112,11 @@ def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
 
 
 def test_elites_carry_the_certificates_of_their_rows():
-    archive = certified_archive(30, 20, {"C-G": "a" * 64})
+    # The controller fails all of 30 elites, a certifier crosses the first 20.
+    ends = np.repeat([[[20, 0, 0, 0]], [[0, 20, 0, 0]]], [20, 10], axis=0)
+    counts = {"certifier_outcomes": ends, "certifier_resolved_outcomes": ends}
+    faults = replace(FaultCounts.none_of(30), certifiers=("C-G",), certifier_sha256=("a" * 64,), **counts)
+    archive = replace(make_archive(30), fresh=fresh_values(make_archive(30)), faults=faults, policy_sha256="f" * 64)
     generated = generated_set(archive, 300, 0)
     certified = split_elites(archive).test < 20
     np.testing.assert_array_equal(generated.certificates.certified, certified)

@@ -53,7 +53,6 @@ def parameters(runner: OnPolicyRunner) -> list[torch.Tensor]:
 
 
 CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=8, epochs=3, mini_batches=2)
-EXACT = {"rtol": 0.0, "atol": 0.0}
 
 
 def close(device: str) -> dict[str, float]:
@@ -75,23 +74,6 @@ def test_update_equals_rsl_rl(desired_kl: float, monkeypatch: pytest.MonkeyPatch
     assert ours.alg.learning_rate != cfg.learning_rate
     for mine, other in zip(parameters(ours), parameters(theirs), strict=True):
         torch.testing.assert_close(mine, other, **close(device))
-
-
-def test_checkpoint_continues_with_the_same_numbers(tmp_path: Any, device: str) -> None:
-    whole = make_runner(CapturedPPO, CFG, device)
-    whole.learn(1)
-    whole.save(str(tmp_path / "a.pt"))
-    saved = torch.load(tmp_path / "a.pt", weights_only=True)
-    assert isinstance(saved["optimizer_state_dict"]["param_groups"][0]["lr"], float)
-    half = make_runner(CapturedPPO, CFG, device)
-    half.load(str(tmp_path / "a.pt"))
-    assert half.alg.learning_rate == pytest.approx(whole.alg.learning_rate)
-    for runner in (whole, half):
-        runner.env = DummyEnv(device)
-        torch.manual_seed(9)
-        runner.learn(1)
-    for mine, other in zip(parameters(whole), parameters(half), strict=True):
-        torch.testing.assert_close(mine, other, **(EXACT if device == "cpu" else close(device)))
 
 
 def test_settings_reach_rsl_rl(device: str) -> None:

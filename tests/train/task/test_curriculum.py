@@ -29,12 +29,6 @@ def test_noise_grows_with_the_level(tiles):
     assert (tiles.heights[5] != tiles.heights[6]).any()
 
 
-def test_seed_decides(tiles):
-    cfg = CurriculumCfg(num_columns=5, noise_columns=2)
-    np.testing.assert_array_equal(make_tiles(cfg, 3).heights, tiles.heights)
-    assert (make_tiles(cfg, 2).heights != tiles.heights).any()
-
-
 def test_every_column_gets_its_share(tiles):
     counts = np.bincount(tiles.columns_of(700))
     assert counts.tolist() == [100] * 7
