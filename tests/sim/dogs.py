@@ -3,10 +3,10 @@
 :func:`write_dog` writes what docs/robots.md asks of a user: model, settings, and a scripted controller.
 """
 
-import struct
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 LEGS = {"FL": (0.2, 0.12), "FR": (0.2, -0.12), "HL": (-0.2, 0.12), "HR": (-0.2, -0.12)}
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee"))
@@ -174,12 +174,8 @@ KINDS = {"mjcf": {}, "urdf": {"model": urdf(), "suffix": "urdf", "more": GAINS}}
 
 
 def stl(half):
-    """A box as a binary STL file of twelve facets."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    facets = [corners[[a, *pair]] for a, b, c, d in quads for pair in ((b, c), (c, d))]
-    packed = [struct.pack("<12fH", 0, 0, 0, *np.ravel(facet), 0) for facet in facets]
-    return bytes(80) + struct.pack("<I", len(packed)) + b"".join(packed)
+    """A box as a binary STL file."""
+    return trimesh.creation.box(2 * np.array(half)).export(file_type="stl")
 
 
 def with_mesh(folder, kind):

@@ -31,3 +31,18 @@ def run(model: mujoco.MjModel, joint_q, duration_s: float):
     for _ in range(round(duration_s / model.opt.timestep)):
         mujoco.mj_step(model, data)
     return np.concatenate([data.qpos[:3], data.qpos[[4, 5, 6, 3]], data.qpos[7:]])
+
+
+def rays_from_above(model: mujoco.MjModel, points, qpos=None, groups=None):
+    """Where rays straight down from 9 m meet a model's geoms (of some groups alone): heights [m] and geoms."""
+    data, heights, geoms = mujoco.MjData(model), [], []
+    if qpos is not None:
+        data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    for x, y in points:
+        geom = np.zeros(1, np.int32)
+        heights.append(
+            9.0 - mujoco.mj_ray(model, data, np.array([x, y, 9.0]), np.array([0, 0, -1.0]), groups, 1, -1, geom)
+        )
+        geoms.append(int(geom[0]))
+    return np.array(heights), np.array(geoms)

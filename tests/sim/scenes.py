@@ -7,9 +7,13 @@ import pytest
 import warp as wp
 
 from sim.bank import TerrainBank
+from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
 from sim.robots.robot import RobotCfg
+from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from tests.sim.policies import stand
 
 NODE_X = np.arange(NUM_COLS) * SPACING
 NODE_Y = np.arange(NUM_ROWS) * SPACING
@@ -29,10 +33,10 @@ ONLY_ANYMAL = pytest.mark.parametrize("robot", ["anymal"], indirect=True)
 ONLY_CASSIE = pytest.mark.parametrize("robot", ["cassie"], indirect=True)
 
 
-def spike():
-    """A needle of 1 m under the start; the robot starts over its tip and falls on it."""
-    grid = FLAT.copy()
-    grid[79:82, 39:42] = 1.0
+def spike(x: float = 2.0):
+    """A needle of 1 m under (x, 4), by default the start; a robot over its tip falls on it."""
+    grid, col = FLAT.copy(), round(x / SPACING)
+    grid[79:82, col - 1 : col + 2] = 1.0
     return grid
 
 
@@ -68,10 +72,10 @@ def free_body(folder: Path, geom: str, *, mass: float, friction: float = 0.5) ->
     )
 
 
-def simulate(robot: RobotCfg, grids: np.ndarray, device: str) -> Simulation:
+def simulate(robot: RobotCfg, grids: np.ndarray, device: str, ground: GroundMaps | None = None) -> Simulation:
     """One robot on each grid."""
-    bank = TerrainBank(len(grids), device=device)
-    bank.set_heights(np.float32(grids))
+    bank = TerrainBank(len(grids), device=device, with_ground=ground is not None)
+    bank.set_heights(np.float32(grids), ground=ground)
     return Simulation(robot, bank, np.arange(len(grids)))
 
 
@@ -122,3 +126,15 @@ def lying(num: int, x: float, y: float, z: float, axis: tuple[float, float, floa
     q[:, 3:6] = np.array(axis) * np.sin(angle / 2)
     q[:, 6] = np.cos(angle / 2)
     return q
+
+
+def standing(robot: RobotCfg, num: int = 8, x: float = 8.0, y: float = 4.0, z: float | None = None):
+    """Robots in their default pose at their default height or ``z`` [m], shape (num, 7 + num_joints)."""
+    base = lying(num, x, y, robot.default_base_height if z is None else z)
+    return np.column_stack([base, np.tile(robot.default_joint_pos, (num, 1))])
+
+
+def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
+    """A rollout of 0.6 s, by default of robots that hold their pose; ``cfg`` are settings of the crossing."""
+    cfg = CrossingCfg(**{"max_duration_s": 0.6, "poll_every_s": 0.1} | cfg)
+    return Rollout(robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=cfg)

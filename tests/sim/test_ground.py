@@ -13,9 +13,9 @@ from sim.mujoco_c.crossing import cross, draw_starts
 from sim.mujoco_c.model import crossing_model
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
-from sim.simulation import Simulation
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.sim.scenes import FLAT, Stepper, free_body, lying, positions, put, slope
+from tests.sim.plain_mujoco import rays_from_above
+from tests.sim.scenes import FLAT, Stepper, free_body, lying, positions, put, simulate, slope
 
 GRAVITY = 9.81
 
@@ -26,13 +26,6 @@ def uniform(friction=(1.0,), tau=(0.0,)):
     return GroundMaps(
         friction=shape * np.float32(friction)[:, None, None], time_constant_s=shape * np.float32(tau)[:, None, None]
     )
-
-
-def on_ground(robot, grids, ground, device):
-    """A robot on each of some terrains."""
-    bank = TerrainBank(len(grids), device=device, with_ground=True)
-    bank.set_heights(np.float32(grids), ground=ground)
-    return Simulation(robot, bank, np.arange(len(grids)))
 
 
 def height_in_mujoco_c(robot, ground, z, duration_s):
@@ -51,7 +44,7 @@ def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device):
     # At 20 degrees a = g (sin - mu cos), or rest where mu exceeds the tangent, 0.36; the box's own friction is 1.
     robot, angle = free_body(tmp_path, 'type="box" size="0.15 0.15 0.03"', mass=4.0, friction=1.0), np.radians(20.0)
     frictions, duration_s = (0.15, 0.3, 0.5, 1.0), 0.8
-    sim = on_ground(robot, [slope(-angle)] * 4, uniform(friction=frictions), device)
+    sim = simulate(robot, [slope(-angle)] * 4, device, uniform(friction=frictions))
     start = lying(4, 8.0, 4.0, 0.0, (0, 1, 0), angle)
     start[:, :3] += 0.03 * np.array([np.sin(angle), 0.0, np.cos(angle)])
     stepper = Stepper(sim)
@@ -66,7 +59,7 @@ def test_a_ball_sinks_into_soft_ground_as_in_mujoco_c(tmp_path, device):
     # At rest by (1 - d) d^-2 dmax^2 tau^2 g with the impedance d = dmax = 0.95: 0.05 tau^2 g. Landing from 2 cm it
     # goes deeper; both simulators say how deep, step by step. Its own contacts have 0.02 s: no firmer ground is felt.
     robot, taus = free_body(tmp_path, 'type="sphere" size="0.1"', mass=3.0), (0.03, 0.045, 0.06)
-    sim = on_ground(robot, [FLAT] * 3, uniform(tau=taus), device)
+    sim = simulate(robot, [FLAT] * 3, device, uniform(tau=taus))
     start = lying(3, 7.0, 5.0, 0.12)
     stepper, seen = Stepper(sim, steps=1), []
     put(sim, start)
@@ -161,10 +154,7 @@ def test_mujoco_c_has_a_geom_where_the_ground_is_alike(anymal):
     box, field = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
     assert [geom.type[0] for geom in geoms] == [box, field, box]
     np.testing.assert_allclose([geom.friction[0] for geom in geoms], [1.0, 0.25, 1.0])
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    for x in (-3.0, 3.95, 4.05, 4.22, 4.33, 5.95, 6.05, 19.0):
-        hit = np.zeros(1, np.int32)
-        down = mujoco.mj_ray(model, data, [x, 5.03, 9.0], [0, 0, -1.0], None, 1, -1, hit)
-        assert 9.0 - down == pytest.approx(0.1 if x > 4.3 else 0.0, abs=1e-6), x
-        assert model.geom_friction[hit[0], 0] == (0.25 if 4.0 < x < 6.0 else 1.0)
+    along = np.array([-3.0, 3.95, 4.05, 4.22, 4.33, 5.95, 6.05, 19.0])
+    met, hit = rays_from_above(model, [(x, 5.03) for x in along])
+    np.testing.assert_allclose(met, np.where(along > 4.3, 0.1, 0.0), atol=1e-6)
+    np.testing.assert_array_equal(model.geom_friction[hit, 0], np.where((along > 4) & (along < 6), 0.25, 1.0))

@@ -21,7 +21,7 @@ SEEDS = np.array([5, 6, 7, 8, 9, 10], np.uint32)
 GENES = SUPER_GAUSSIAN.hard_random(2, 0)
 PIT = np.where(np.arange(321) >= 266, np.float32(-3.0), FLAT)  # level up to x = 13.3 m, then three metres down
 BUMPS = heights_of(GENES)
-GRIDS = np.stack([FLAT, np.roll(spike(), 210, axis=1), crossing_terrain("boxes", 9, 1), PIT, *BUMPS])
+GRIDS = np.stack([FLAT, spike(12.5), crossing_terrain("boxes", 9, 1), PIT, *BUMPS])
 # Begun 1 m before the edge of the goal, a walk of two seconds has every end there is.
 NEAR = CrossingCfg(start=(12.5, 4.0), max_duration_s=2.4, poll_every_s=0.2)
 SHORT = dataclasses.replace(NEAR, start=(2.0, 4.0), max_duration_s=1.0)

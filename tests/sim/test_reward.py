@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.crossing import CrossingCfg
 from sim.reward import make_motion, soft_joint_limits
 from sim.robots.training import RewardCfg, TrainingCfg
-from sim.rollout import Rollout
 from tests.sim.policies import stand
-from tests.sim.scenes import FLAT, ONLY_ANYMAL, ONLY_CASSIE, positions, put, spike
+from tests.sim.scenes import FLAT, ONLY_ANYMAL, ONLY_CASSIE, crossing, positions, put, spike
 
 NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
 DT = 0.02
@@ -29,22 +27,16 @@ def tracker(anymal):
     return paid_for(anymal, tracking_lin_vel=1.0)
 
 
-def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
+def rewarded(robot, device, policy=stand, **more):
     """By default robots that begin at rest."""
-    still = {"start_position_range": 0.0, "start_yaw_range": 0.0, "start_joint_range": 0.0, "start_velocity_range": 0.0}
-    cfg = CrossingCfg(**still | {"max_duration_s": 0.6, "poll_every_s": 0.1, "reward": True} | cfg)
-    return Rollout(robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=cfg)
-
-
-def spike_under(x):
-    """A needle of 1 m under (x, 4); a robot put over its tip falls on it."""
-    return np.roll(spike(), round((x - 2.0) / 0.05), axis=1)
+    ranges = ("start_position_range", "start_yaw_range", "start_joint_range", "start_velocity_range")
+    return crossing(robot, device, policy, **dict.fromkeys(ranges, 0.0) | {"reward": True} | more)
 
 
 def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
     # At the goal with the first physics step; the first command was to walk, the 29 after it to stand:
     # .02 s * (exp(-2.25) + 29) = .582.
-    rollout = crossing(tracker, device, start=(14.3, 4.0))
+    rollout = rewarded(tracker, device, start=(14.3, 4.0))
     result = rollout.evaluate(FLAT[None], np.array([1]))
     assert result.reached_goal.all()
     np.testing.assert_allclose(result.duration_s, tracker.physics_dt, atol=1e-6)
@@ -58,8 +50,8 @@ def test_after_a_base_collision_nothing_is_paid(tracker, device, start):
     # The same robots with 0.8 s and with 1.6 s: all have fallen on the spike before, from the start and at the goal.
     totals = []
     for duration in (0.8, 1.6):
-        rollout = crossing(tracker, device, start=(start, 4.0), max_duration_s=duration)
-        result = rollout.evaluate(spike_under(start)[None], np.array([1]))
+        rollout = rewarded(tracker, device, start=(start, 4.0), max_duration_s=duration)
+        result = rollout.evaluate(spike(start)[None], np.array([1]))
         assert (result.base_collision if start == 2.0 else result.reached_goal).all()
         assert result.physics_steps < 160  # it was noticed that nobody earns any more
         totals.append(result.reward)
@@ -71,20 +63,14 @@ def test_after_a_base_collision_nothing_is_paid(tracker, device, start):
 def test_a_base_collision_costs_its_price_once(anymal, device, start):
     # -200 a second for the one control step: -4; and nothing for the robot beside, which stands until time is up.
     robot = paid_for(anymal, only_positive=True, termination=-200.0)
-    rollout = crossing(robot, device, num_terrains=2, start=(start, 4.0), max_duration_s=1.6)
-    result = rollout.evaluate(np.stack([spike_under(start), FLAT]), np.array([1, 1]))
+    rollout = rewarded(robot, device, num_terrains=2, start=(start, 4.0), max_duration_s=1.6)
+    result = rollout.evaluate(np.stack([spike(start), FLAT]), np.array([1, 1]))
     assert not result.invalid.any()
     np.testing.assert_allclose(result.reward, [[-4.0] * 4, [0.0] * 4], atol=1e-5)
 
 
-def test_out_of_the_world_nothing_is_paid(tracker, device):
-    result = crossing(tracker, device, start=(-2.5, 4.0)).evaluate(FLAT[None], np.array([1]))
-    assert (result.outcome == Outcome.OUT).all()
-    np.testing.assert_allclose(result.reward, DT * math.exp(-2.25), rtol=0.05)  # the step it was found out in
-
-
 def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker, device):
-    rollout = crossing(tracker, device, num_terrains=2, replicas=2)
+    rollout = rewarded(tracker, device, num_terrains=2, replicas=2)
 
     def break_one(share):
         step = round(30 * share)  # of 0.6 s
@@ -107,11 +93,11 @@ def test_asking_for_the_reward_changes_nothing_else(anymal):
     """Bit for bit on the CPU: one goes past the goal, one meets a spike, one walks, and so without the reward."""
     results = []
     for reward in (False, True):
-        rollout = crossing(
+        rollout = rewarded(
             anymal, "cpu", anymal.policy_file, num_terrains=2, replicas=3, start=(13.3, 4.0), start_position_range=0.1,
             start_velocity_range=0.2, start_joint_range=0.2, max_duration_s=1.2, reward=reward,
         )  # fmt: skip
-        results.append(rollout.evaluate(np.stack([FLAT, spike_under(13.3)]), np.array([5, 6])))
+        results.append(rollout.evaluate(np.stack([FLAT, spike(13.3)]), np.array([5, 6])))
     without, paid = results
     assert len(np.unique(without.outcome)) >= 2 and without.reached_goal.any()
     for field in ("penalties", "outcome", "fallen", "duration_s", "final_position"):

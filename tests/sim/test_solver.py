@@ -18,7 +18,7 @@ from sim.solver import (
     solve_theirs,
     use_own_solver,
 )
-from tests.sim.scenes import lying, put
+from tests.sim.scenes import put, standing
 
 Mujoco: Any = mujoco  # it names its types at run time
 WORLDS = 16
@@ -148,7 +148,7 @@ def test_robots_that_fall(eight):
     m, d = eight.solver.mjw_model, eight.solver.mjw_data
     assert fits(m, d)
     states, mean_iterations = set(), []
-    q = np.column_stack([lying(8, 3, 4, eight.robot.default_base_height + 0.02), [eight.robot.default_joint_pos] * 8])
+    q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
     put(eight, q, np.random.default_rng(2).normal(0.0, 0.7, eight.joint_qd.shape))
     with wp.ScopedDevice(eight.device):
         for _ in range(120):

@@ -20,13 +20,6 @@ def sampled(function, size, nodes):
     return Heightmap(heights=function(x[None, :], y[:, None]) + np.zeros((nodes[1], nodes[0])), size_m=size)
 
 
-def test_a_map_of_the_terrains_own_nodes_is_taken_as_it_is():
-    heights = np.random.default_rng(0).normal(size=(NUM_ROWS, NUM_COLS)).astype(np.float32)
-    terrain = as_terrain(Heightmap(heights=heights.astype(np.float64), size_m=(16.0, 8.0)))
-    np.testing.assert_array_equal(terrain, heights)
-    assert terrain.dtype == np.float32
-
-
 @pytest.mark.parametrize("nodes", [(2, 2), (17, 33), (321, 161), (97, 401), (801, 1601)])
 def test_a_slope_stays_the_slope_whatever_the_nodes_of_the_map(nodes):
     # Linear interpolation and any symmetric mean keep a plane; at the rim a finer map's mean is one-sided, by a cell.

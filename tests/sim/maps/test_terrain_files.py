@@ -11,13 +11,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sim.ground import GroundMaps
 from sim.maps.heightmap import as_terrain, read_heightmap
 from sim.maps.hfield import as_hfield
-from sim.maps.terrain_files import FORMATS, ExportedTerrain, block_of, glb_of, mjcf_of, npy_of, stl_of, write_terrain
+from sim.maps.terrain_files import ExportedTerrain, block_of, glb_of, mjcf_of, npy_of, stl_of, write_terrain
 from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
+from tests.sim.plain_mujoco import rays_from_above
 
 FLAT = np.full((NUM_ROWS, NUM_COLS), 0.2, np.float32)
 
@@ -32,11 +32,7 @@ def ray_heights(heights, tmp_path, points):
     """Where rays from above meet the exported scene."""
     path = tmp_path / "terrain.xml"
     path.write_bytes(mjcf_of(ExportedTerrain(heights=heights)))
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
-    return [5.0 - mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom) for x, y in points]
+    return rays_from_above(mujoco.MjModel.from_xml_path(str(path)), points)[0]
 
 
 def test_rays_meet_the_exported_scene_where_the_simulations_surface_is(rough, tmp_path):
@@ -99,25 +95,12 @@ def test_an_image_reads_back_within_half_a_gray_level(rough, tmp_path, flat):
     np.testing.assert_allclose(as_terrain(read_heightmap(path)), heights, rtol=0, atol=0.51 * scale + 1e-7)
 
 
-def test_an_npz_is_the_grid_itself_and_an_sdf_a_static_model_of_the_mesh(rough, tmp_path):
-    genes = np.linspace(-1, 1, 64, dtype=np.float32)
-    patches = np.random.default_rng(2).uniform(0.4, 0.9, (2, 1, 4, 8)).astype(np.float32)
-    ground = GroundMaps(friction=patches[0], time_constant_s=0.05 * patches[1])
-    formats = list(FORMATS)
-    terrain = ExportedTerrain(heights=rough, name="elite-0.1", genes=genes, ground=ground)
-    paths = write_terrain(tmp_path, terrain, formats=formats, about={})
-    assert [path.name for path in paths] == [f"elite-0.1.{ending}" for ending in (*formats, "json")]
+def test_an_sdf_is_a_static_model_of_the_mesh(rough, tmp_path):
+    write_terrain(tmp_path, ExportedTerrain(heights=rough, name="elite-0.1"), formats=["stl", "sdf"], about={})
     model = ET.parse(tmp_path / "elite-0.1.sdf").getroot().find("model")
     assert model.get("name") == "elite-0.1" and model.findtext("static") == "true"
     uris = [model.findtext(f"link/{part}/geometry/mesh/uri") for part in ("collision", "visual")]
     assert uris == ["elite-0.1.stl"] * 2
-    with np.load(paths[0]) as content:
-        np.testing.assert_array_equal(content["heights"], rough)
-        np.testing.assert_array_equal(content["genes"], genes)
-    heightmap = read_heightmap(paths[0])
-    np.testing.assert_array_equal(as_terrain(heightmap), rough)
-    np.testing.assert_array_equal(heightmap.ground.friction, ground.friction)
-    np.testing.assert_array_equal(heightmap.ground.time_constant_s, ground.time_constant_s)
 
 
 def test_an_npy_is_what_terrain_generators_hold(rough):

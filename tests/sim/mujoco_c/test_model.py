@@ -26,8 +26,8 @@ from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 from tests.sim.dogs import KINDS, with_mesh, write_dog
-from tests.sim.plain_mujoco import on_plane
-from tests.sim.policies import stand
+from tests.sim.plain_mujoco import on_plane, rays_from_above
+from tests.sim.policies import Remembers, stand
 
 EPISODES = 3
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
@@ -66,15 +66,11 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     assert (fine.geom_solref == [0.003, 1.0]).all() and (model.geom_solref[:, 0] > 0.003).all()
     # The surface, between the nodes too, edge heights continued beyond it: what a ray from above meets.
     heights = heights + np.random.default_rng(6).uniform(-0.1, 0.1, heights.shape).astype(np.float32)
-    model = crossing_model(robot, heights)
-    data = mujoco.MjData(model)
-    data.qpos[2] = 50.0
-    mujoco.mj_forward(model, data)
-    for x, y in [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5), (5.025, 3.025), (6.01, 4.04)]:
-        down, geom = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
-        distance = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), down, None, 1, -1, geom)
-        assert geom[0] == ground
-        np.testing.assert_allclose(5.0 - distance, oracle.surface_height(heights, SPACING, x, y), atol=1e-5)
+    points = [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5), (5.025, 3.025), (6.01, 4.04)]
+    far = [0, 0, 50, 1, *np.zeros(3 + robot.num_joints)]
+    met, geoms = rays_from_above(crossing_model(robot, heights), points, far)
+    assert (geoms == ground).all()
+    np.testing.assert_allclose(met, [oracle.surface_height(heights, SPACING, *point) for point in points], atol=1e-5)
 
 
 def test_plain_mujoco_takes_a_robot_that_is_its_file(tmp_path):
@@ -210,20 +206,6 @@ def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
         assert result.outcome.shape == (26,) and result.penalties.shape == (26, len(PENALTIES))
         np.testing.assert_array_equal(result.duration_s[25:], expected.duration_s)
         np.testing.assert_array_equal(result.penalties[25:], expected.penalties)
-
-
-class Remembers:
-    """Stands; notes how many robots it is asked for."""
-
-    def __init__(self):
-        self.asked, self.resets = [], 0
-
-    def reset(self):
-        self.resets += 1
-
-    def __call__(self, row):
-        self.asked.append(len(row))
-        return stand(row)
 
 
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):

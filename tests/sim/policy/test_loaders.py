@@ -1,7 +1,4 @@
-"""Controllers from files: what is accepted, that nothing in them runs; and the runner that calls them."""
-
-import os
-import pickle
+"""Controllers from files: what is accepted (that nothing in them runs: tests/kills); and the runner that calls them."""
 
 import numpy as np
 import pytest
@@ -42,22 +39,9 @@ def test_torchscript_loads(tmp_path, anymal, device):
         load_policy(path, anymal, "cpu")
 
 
-def test_code_in_a_file_does_not_run(tmp_path, anymal):
-    proof = tmp_path / "it_ran"
-    bomb = type("Bomb", (), {"__reduce__": lambda self: (os.mkdir, (str(proof),))})()  # unpickled, it makes a folder
-    for content in (bomb, {"actor_state_dict": rsl_rl_actor().state_dict(), "infos": bomb}):
-        torch.save(content, tmp_path / "a.pt")
-        with pytest.raises(ValueError, match=r"a\.pt"):
-            load_policy(tmp_path / "a.pt", anymal, "cpu")
-    assert not proof.exists()
-    pickle.loads(pickle.dumps(bomb))
-    assert proof.exists(), "the bomb is a dud: this test proves nothing"
-
-
 STATE = rsl_rl_actor().state_dict()
 CHECKPOINTS = {
     "another robot's rows": rsl_rl_actor(48).state_dict(),
-    "another robot's joints": rsl_rl_actor(235, 10).state_dict(),
     "NaN": STATE | {"mlp.0.bias": STATE["mlp.0.bias"] * float("nan")},
     "no bias": {name: value for name, value in STATE.items() if name != "mlp.2.bias"},
     "no tensor": STATE | {"mlp.2.weight": "lost"},

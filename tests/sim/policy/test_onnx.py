@@ -46,7 +46,7 @@ def one_node(kind, inputs, outputs, **attributes):
 
 
 def save(path, model):
-    path.write_bytes(model.SerializeToString())
+    path.write_bytes(model if isinstance(model, bytes) else model.SerializeToString())
     return path
 
 
@@ -74,7 +74,6 @@ def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_pat
 
 MODELS = {
     "another robot's rows": linear(48),
-    "another robot's joints": linear(235, 10),
     "another robot's rows, of unknown width": linear(48, columns="columns"),
     "a batch of four": linear(batch=4),
     "NaN": linear(bias=np.full(ACTIONS, np.nan, np.float32)),
@@ -83,9 +82,9 @@ MODELS = {
         [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
     ),
     "two inputs": one_node("Sum", ["a", "b"], ["c"]),
-    "two outputs": one_node("Split", ["a"], ["b", "c"], axis=0),
     "a foreign operator": one_node("Surprise", ["obs"], ["actions"], domain="their.own"),
     "no graph": graph_model([], [], []),
+    "half a file": linear().SerializeToString()[:-9],
 }
 
 
@@ -94,14 +93,6 @@ def test_a_model_that_does_not_fit_is_refused(tmp_path, anymal, model, capfd):
     with pytest.raises(ValueError, match=r"theirs\.onnx"):
         load_policy(save(tmp_path / "theirs.onnx", model), anymal, "cpu")
     assert capfd.readouterr() == ("", ""), "onnxruntime says it a second time"
-
-
-def test_a_truncated_file_is_refused(tmp_path, anymal):
-    whole = linear().SerializeToString()
-    for length in (0, len(whole) // 3, len(whole) - 9):
-        (tmp_path / "half.onnx").write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=r"half\.onnx"):
-            load_policy(tmp_path / "half.onnx", anymal, "cpu")
 
 
 @pytest.mark.parametrize("deep", [False, True])

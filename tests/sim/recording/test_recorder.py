@@ -157,26 +157,18 @@ CHANGES = {
     "a joint too few": {"joint_names": np.array(["a"] * 11)},
     "another number of frames": {"touching": np.zeros((2, 4, 50, 13), bool)},
     "an origin that is no JSON": {"origin": np.array("{")},
-    "objects": {"robot": np.array({"a": 1}, dtype=object)},
 }
 
 
-def test_what_is_no_recording_or_damaged_is_refused(recording, tmp_path):
+def test_what_is_no_recording_is_refused(recording, tmp_path):
     path = tmp_path / "a.npz"
     write_recording(path, recording)
-    whole = path.read_bytes()
     with np.load(path) as content:
         arrays = dict(content)
     for name, changes in CHANGES.items():
         np.savez(path, **{key: value for key, value in (arrays | changes).items() if value is not None})
         with pytest.raises(ValueError, match=r"a\.npz"):
             pytest.fail(f"{name}: {read_recording(path)}")
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 4
-    for content in (whole[:-100], b"hello", b"", bytes(flipped)):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"a\.npz"):
-            read_recording(path)
     with pytest.raises(FileNotFoundError):
         read_recording(tmp_path / "elsewhere.npz")
 

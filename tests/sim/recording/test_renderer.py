@@ -2,16 +2,15 @@
 
 import dataclasses
 
-import mujoco
 import numpy as np
 import pytest
 
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import Camera, Ghost, Renderer, open_context
 from sim.recording.scene import ground_paint, scene_model
-from sim.robots.find import get_robot
 from sim.terrain import NUM_COLS, NUM_ROWS
-from tests.sim.dogs import KINDS, write_dog
+from tests.sim.plain_mujoco import rays_from_above, to_c
+from tests.sim.scenes import standing as standing_robots
 
 SIZE = (640, 320)
 
@@ -34,10 +33,7 @@ def ground():
 
 
 def standing(robot, x, y, z):
-    pose = np.zeros(7 + robot.num_joints)
-    pose[:4] = x, y, z + robot.default_base_height, 1.0
-    pose[7:] = robot.default_joint_pos
-    return pose
+    return to_c(standing_robots(robot, 1, x, y, z + robot.default_base_height)[0])
 
 
 def test_paint_tells_heights_and_metres_apart(ground):
@@ -56,17 +52,11 @@ def test_paint_tells_heights_and_metres_apart(ground):
 def test_the_ground_of_a_scene_is_the_simulations(anymal):
     rough = np.random.default_rng(1).uniform(-0.4, 0.4, (NUM_ROWS, NUM_COLS))
     model = scene_model(anymal, rough, width=64, height=64)
-    data = mujoco.MjData(model)
-    data.qpos[:] = standing(anymal, 2, 4, 0.5)
-    mujoco.mj_forward(model, data)
+    points = np.random.default_rng(2).uniform([-1.9, -1.9], [12.9, 9.9], (200, 2))
+    points = points[np.hypot(*(points - [2, 4]).T) > 1.5]  # there stands the robot
     hidden = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # of the groups, the ground's alone
-    for x, y in np.random.default_rng(2).uniform([-1.9, -1.9], [12.9, 9.9], (200, 2)):
-        if np.hypot(x - 2, y - 4) < 1.5:
-            continue  # there stands the robot
-        distance = mujoco.mj_ray(
-            model, data, np.array([x, y, 5.0]), np.array([0, 0, -1.0]), hidden, 1, -1, np.zeros(1, np.int32)
-        )
-        assert 5.0 - distance == pytest.approx(float(surface_heights(rough, x, y)), abs=1e-5)
+    heights, _ = rays_from_above(model, points, standing(anymal, 2, 4, 0.5), hidden)
+    np.testing.assert_allclose(heights, surface_heights(rough, *points.T), atol=1e-5)
 
 
 def pixel_of(camera, x, y, height=0.0):
@@ -122,29 +112,9 @@ def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
         assert pixels(picture, strong, weak) > pixels(alone, strong, weak) + 40
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_robot_of_ones_own_is_shown_on_the_ground(tmp_path, kind):
-    """Its feet stand where its own model has them."""
-    dog = get_robot(str(write_dog(tmp_path, **KINDS[kind])))
-    model = scene_model(dog, np.full((NUM_ROWS, NUM_COLS), 0.3), width=64, height=64)
-    data = mujoco.MjData(model)
-    assert len(data.qpos) == 7 + dog.num_joints
-    data.qpos[:] = standing(dog, 5.0, 4.0, 0.3)
-    mujoco.mj_forward(model, data)
-    feet = np.array([data.geom(name).xpos for name in dog.foot_geoms])
-    np.testing.assert_allclose(feet[:, 2], 0.3 + 0.025, atol=0.02)  # spheres of 25 mm
-
-
-def test_what_cannot_be_shown_is_named(anymal, tmp_path, monkeypatch):
-    (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
-    (tmp_path / "body.xml").write_text(
-        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    bare = dataclasses.replace(anymal, base_geoms=(), limb_geoms=(), foot_geoms=())
-    for file, words in (("broken.xml", r"broken\.xml"), ("none.xml", r"none\.xml"), ("body.xml", "LF_HAA")):
-        with pytest.raises(ValueError, match=words):
-            robot = dataclasses.replace(bare, model_file=tmp_path / file)
-            scene_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), width=8, height=8)
-    monkeypatch.setenv("MUJOCO_GL", "no_such_way")
-    with pytest.raises(ValueError, match="no_such_way"):
-        open_context(8, 8)
+def test_a_file_without_the_robots_joints_is_named(anymal, tmp_path):
+    file = tmp_path / "body.xml"
+    file.write_text("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    robot = dataclasses.replace(anymal, model_file=file, base_geoms=(), limb_geoms=(), foot_geoms=())
+    with pytest.raises(ValueError, match="LF_HAA"):
+        scene_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), width=8, height=8)

@@ -10,12 +10,7 @@ from tests.sim.scenes import NODE_X, Stepper, free_body, lying, positions, put, 
 GRAVITY = 9.81
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("bodies")
-
-
-def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, folder):
+def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, tmp_path):
     # A riser of 0.2 m in the cell from x = 8 to x = 8.05, hit from all sides, at and round its upper edge and its face.
     radius, speed, height = 0.03, 3.0, 0.2
     grid = np.broadcast_to(np.where(NODE_X > 8.02, height, 0.0), (161, 321))
@@ -23,7 +18,7 @@ def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, folder):
     target = np.array([[8.05, 0.2], [8.045, 0.19], [8.03, 0.12], [8.01, 0.05], [8.07, 0.2]])
     aim, angle = np.repeat(target, len(approach), axis=0), np.tile(approach, len(target))
     direction = np.column_stack([np.cos(angle), np.zeros(len(angle)), np.sin(angle)])
-    sim = simulate(free_body(folder / "foot", f'type="sphere" size="{radius}"', mass=0.588), [grid] * len(aim), device)
+    sim = simulate(free_body(tmp_path, f'type="sphere" size="{radius}"', mass=0.588), [grid] * len(aim), device)
     q, qd = lying(len(aim), 0, 4, 0), np.zeros((len(aim), 6))
     rng = np.random.default_rng(0)
     start = rng.uniform(0.1, 0.115, len(aim))[:, None]  # a step is 0.015 m: every phase of touching is met
@@ -45,13 +40,13 @@ def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, folder):
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.25, 0.5], ids=["along x", "diagonally", "along y"])
-def test_friction_holds_at_08_and_slides_at_12_of_its_angle(device, folder, heading):
+def test_friction_holds_at_08_and_slides_at_12_of_its_angle(device, tmp_path, heading):
     # Whatever the direction: a friction pyramid would give way at 0.75 of the angle across its axes.
     friction = 0.5
     angles = np.arctan(friction) * np.array([0.8, 0.9, 1.2, 1.3])
     rise = np.array([np.cos(np.pi * heading), np.sin(np.pi * heading)])  # the ground rises this way
     grids = [slope(*np.arctan(np.tan(a) * rise)) for a in angles]
-    block = free_body(folder / "block", 'type="box" size="0.05 0.05 0.03"', mass=2.0, friction=friction)
+    block = free_body(tmp_path, 'type="box" size="0.05 0.05 0.03"', mass=2.0, friction=friction)
     sim = simulate(block, grids, device)
     q = np.concatenate([lying(1, 8, 4, 0, (rise[1], -rise[0], 0), a) for a in angles])
     up = np.array([oracle.rotation_matrix(row[3:7])[:, 2] for row in q])

@@ -6,25 +6,16 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from sim.bank import TerrainBank
+from sim.bank import heights_of
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot
 from sim.robots.probes import extents
-from sim.simulation import Simulation
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, SPACING, crossing_terrain
 from tests.kernels import oracle
-from tests.sim.scenes import Stepper, positions, put, velocities
+from tests.sim.scenes import FLAT, Stepper, positions, put, simulate, standing, velocities
 
 DROPS = 40
-
-
-def mixed_ground(device):
-    """Hard-random gene terrains and every hand-crafted kind at its hardest."""
-    bank = TerrainBank(4, device=device)
-    bank.set_genes(SUPER_GAUSSIAN.hard_random(4, 21))
-    grids = np.array(bank.heights.numpy())
-    return np.concatenate([grids, [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]])
 
 
 def above_ground(robot, grids, rng):
@@ -54,12 +45,12 @@ def gaps(sim, grids):
 
 
 def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
-    grids = mixed_ground(device)
-    terrain_of_env = np.arange(DROPS) % len(grids)
-    bank = TerrainBank(len(grids), device=device)
-    bank.set_heights(grids)
-    sim = Simulation(robot, bank, terrain_of_env)
-    put(sim, above_ground(robot, grids[terrain_of_env], np.random.default_rng(23)))
+    # Hard-random gene terrains and every hand-crafted kind at its hardest.
+    hand_crafted = [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]
+    grids = np.concatenate([heights_of(SUPER_GAUSSIAN.hard_random(4, 21)), hand_crafted])
+    grids = grids[np.arange(DROPS) % len(grids)]
+    sim = simulate(robot, grids, device)
+    put(sim, above_ground(robot, grids, np.random.default_rng(23)))
 
     def watch():
         assert not (sim.overflow.numpy() & CAPACITY_OVERFLOWS).any()
@@ -74,17 +65,15 @@ def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
     assert settled.mean() > {"anymal": 0.85, "cassie": 0.25}[robot.name]
     assert (np.abs(positions(sim)[:, :2] - [8, 4]) < [8, 4]).all(axis=1).mean() > 0.85
     # No probe is deeper than 2 cm, and something touches.
-    gap = gaps(sim, grids[terrain_of_env])
+    gap = gaps(sim, grids)
     assert gap.min() > -0.02
     assert gap[settled].max() < 0.02
 
 
 def test_too_few_constraint_rows_are_noticed(anymal, device):
     # The overflow bits are what episodes are judged by: with room for 12 rows a lying robot must set one.
-    sim = Simulation(dataclasses.replace(anymal, njmax=12), TerrainBank(1, device=device), np.zeros(4, int))
-    q = np.zeros((4, 19))
-    q[:, :3], q[:, 6], q[:, 7:] = (8, 4, 0.3), 1, anymal.default_joint_pos
-    put(sim, q)
+    sim = simulate(dataclasses.replace(anymal, njmax=12), [FLAT] * 4, device)
+    put(sim, standing(anymal, 4, z=0.3))
     with wp.ScopedDevice(device):
         sim.physics_step()
     assert (sim.overflow.numpy() & CAPACITY_OVERFLOWS).all()

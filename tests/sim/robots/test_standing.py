@@ -8,14 +8,9 @@ import pytest
 
 from tests.kernels import oracle
 from tests.sim import plain_mujoco
-from tests.sim.scenes import PHYSICS_DT, Stepper, lying, positions, put, slope
+from tests.sim.scenes import PHYSICS_DT, Stepper, lying, positions, put, slope, standing
 
 GRAVITY = 9.81
-
-
-def standing(robot, num=8, x=8.0, y=4.0):
-    """The default pose over flat ground, shape (num, 7 + num_joints)."""
-    return np.column_stack([lying(num, x, y, robot.default_base_height), np.tile(robot.default_joint_pos, (num, 1))])
 
 
 def tilt_between(*rows):
