@@ -10,6 +10,7 @@ from sim.robots.find import get_robot
 from sim.robots.model import build_robot, geom_names
 from sim.robots.skeleton import Skeleton
 from tests.kernels import oracle
+from tests.kernels.states import random_states
 from tests.sim.dogs import KINDS, with_mesh, write_dog
 
 
@@ -18,22 +19,13 @@ def skeleton(robot):
     return Skeleton(robot)
 
 
-def random_coordinates(robot, count):
-    rng = np.random.default_rng(3)
-    quaternion = rng.normal(size=(count, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    return np.concatenate(
-        [rng.uniform(-3, 3, (count, 3)), quaternion, rng.uniform(-1, 1, (count, robot.num_joints))], axis=1
-    )
-
-
 def matrix_of(quaternion_wxyz):
     return oracle.rotation_matrix(np.roll(quaternion_wxyz, -1))
 
 
 def test_bodies_and_shapes_stand_where_mujoco_has_them(robot, skeleton):
     model = mujoco.MjModel.from_xml_path(str(robot.model_file))
-    data, qpos = mujoco.MjData(model), random_coordinates(robot, 4)
+    data, qpos = mujoco.MjData(model), np.float64(random_states(4, robot.num_joints)[0])
     positions, quaternions = skeleton.body_poses(qpos)
     for frame, row in enumerate(qpos):
         data.qpos[:] = row
@@ -67,7 +59,7 @@ def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot,
 def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
     """Limbs and feet, by their names in the simulation's own model, in poses of every joint."""
     dog = get_robot(str(with_mesh(tmp_path, kind)))
-    skeleton, rows, builder = Skeleton(dog), random_coordinates(dog, 3), build_robot(dog)
+    skeleton, rows, builder = Skeleton(dog), np.float64(random_states(3, dog.num_joints)[0]), build_robot(dog)
     positions, quaternions = skeleton.body_poses(rows)
     names = geom_names(builder)
     with wp.ScopedDevice("cpu"):
