@@ -91,6 +91,8 @@ def search(
         scheduler.compute_on(compute.device)
         done = len(metrics)
         say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
+        if note := robot.scaled_by_another(policy):
+            print(note)
         if done < cfg.iterations:
             try:
                 with open_evaluator(evaluator) as pipeline:

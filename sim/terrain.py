@@ -84,6 +84,20 @@ def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
     return heights
 
 
+def _difficulty(kind: str, kinds: tuple[str, ...], level: int) -> float:
+    if kind not in kinds:
+        raise ValueError(f"terrain type must be one of {', '.join(kinds)}, got {kind!r}")
+    if not 0 <= level < NUM_LEVELS:
+        raise ValueError(f"level must be in 0..{NUM_LEVELS - 1}, got {level}: difficulty is level / {NUM_LEVELS}")
+    return level / NUM_LEVELS
+
+
+def _check_positive(**counts: int) -> None:
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
+
+
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
 
@@ -95,7 +109,7 @@ def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     Returns:
         Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
-    d = level / NUM_LEVELS
+    d = _difficulty(kind, CROSSING_TYPES, level)
     rng = np.random.default_rng(seed)
     feature = {
         "slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d),
@@ -122,6 +136,7 @@ def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarr
         Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
         a type is an index into :data:`CROSSING_TYPES`.
     """
+    _check_positive(count=count)
     types = np.arange(count) % len(CROSSING_TYPES)
     levels = np.empty(count, int)
     heights = np.empty((count, NUM_ROWS, NUM_COLS), np.float32)
@@ -146,7 +161,7 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     Returns:
         Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
-    d = level / NUM_LEVELS
+    d = _difficulty(kind, TILE_TYPES, level)
     rng = np.random.default_rng(seed)
     tile = {
         "slope": lambda: _slope(_INSET_TILE_CM, -0.4 * d if inverted else 0.4 * d),
@@ -172,6 +187,9 @@ def training_tiles(num_levels: int, num_columns: int, seed: Seed) -> tuple[np.nd
         Heights [m] float32 of shape (num_levels * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
         index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
     """
+    _check_positive(num_levels=num_levels, num_columns=num_columns)
+    if num_levels > NUM_LEVELS:
+        raise ValueError(f"num_levels must be at most {NUM_LEVELS}, got {num_levels}: levels are 0..{NUM_LEVELS - 1}")
     ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
     heights = np.empty((num_levels * num_columns, NUM_ROWS, NUM_COLS), np.float32)

@@ -1,7 +1,10 @@
 """Controllers as black boxes: a batch of observation rows to a batch of actions."""
 
+import functools
 import inspect
+import multiprocessing
 import os
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +13,12 @@ from typing import Any, Protocol
 import torch
 import warp as wp
 
-from sim.files.atomic import check_zip
+from sim.files.atomic import check_zip, read_json
+from sim.files.records import robot_digest
 from sim.policy.mlp import MlpPolicy
 from sim.policy.runner import action_problem
 from sim.policy.spec import ControllerSpec, find_named, in_one_line
+from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 
 _FORMATS = (
@@ -70,7 +75,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
     checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
-    file made to harm can crash.
+    file made to harm can crash. A warning says if the training record beside a file names another robot.
 
     Args:
         spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
@@ -88,7 +93,31 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     named = ControllerSpec.parse(spec)
     policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
     _try_policy(policy, robot, where, str(spec))
+    if named.file is not None:
+        _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
+
+
+def _warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
+    record = policy.with_suffix(".train.json")
+    try:
+        settings = read_json(record).get("settings")
+    except (OSError, ValueError):  # no record, or a damaged one
+        return
+    trained = settings.get("robot_sha256") if isinstance(settings, dict) else None
+    if trained is None or trained == robot_digest(robot):
+        return
+    now = robot_digest(get_robot(robot.spec))  # a command may have changed its time step or capacities by itself
+    if trained != now and multiprocessing.parent_process() is None:  # a worker's parent warns
+        _print_once(
+            f"warning: {policy} was trained with a robot of other settings, model or meshes (SHA-256 {trained[:12]} in "
+            f"{record.name}) than {robot.spec} has now ({now[:12]})"
+        )
+
+
+@functools.cache
+def _print_once(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:

@@ -12,6 +12,7 @@ from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.records import check_identity
 from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
+from sim.policy.spec import controller_hash
 from sim.robots.training import LearningCfg, TrainingCfg, TuningCfg
 
 ROBOTS_DIR = Path(__file__).parent
@@ -177,6 +178,16 @@ class RobotCfg:
         if missing:
             raise ValueError(f"{self.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
         return tuple(float(scales[name]) for name in self.penalties)
+
+    def scaled_by_another(self, policy: str) -> str | None:
+        """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
+
+        Scales of the robot's own controller make searches against others comparable: this is no mistake.
+        """
+        measured = read_json(self.scales_file) if self.scales_file.exists() else {}
+        if measured.get("policy_sha256") in (None, controller_hash(policy)):
+            return None
+        return f"Penalties are scaled by those of {measured.get('policy')}, with which {self.scales_file} was measured."
 
 
 def _is_positive(value: object) -> bool:

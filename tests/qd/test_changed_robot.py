@@ -8,9 +8,10 @@ import pytest
 from qd.archive import write_archive
 from qd.show.elites import open_run
 from sim.files.records import identity, robot_digest, robot_identity
+from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot, robot_of
 from sim.robots.shipped import ROBOTS
-from tests.builders import small_archive
+from tests.builders import rsl_rl_actor, save_checkpoint, small_archive
 from tests.sim.dogs import write_dog
 
 
@@ -45,6 +46,19 @@ def test_what_was_made_with_the_robot_before_it_changed_is_refused(dog):
     for read in readers(dog):
         with pytest.raises(ValueError, match=was[:12]):
             read()
+
+
+def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):
+    robot = get_robot(str(dog))
+    policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
+    policy.with_suffix(".train.json").write_text(json.dumps({"settings": {"robot_sha256": robot_digest(robot)}}))
+    load_policy(policy, dataclasses.replace(robot, physics_dt=0.001, decimation=20), "cpu")  # finer, not another
+    assert "warning" not in capsys.readouterr().err
+    dog.write_text(dog.read_text().replace("contact_force_limit=150.0", "contact_force_limit=15.0"))
+    changed = get_robot(str(dog))
+    load_policy(policy, changed, "cpu")
+    load_policy(policy, changed, "cpu")
+    assert capsys.readouterr().err.count("warning") == 1
 
 
 @pytest.mark.parametrize("name", ROBOTS)

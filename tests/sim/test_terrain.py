@@ -160,3 +160,21 @@ def test_obstacles_tile_has_the_levels_heights_and_keeps_off_the_edge():
     tiles = np.stack([square(training_tile("obstacles", 9, seed)) for seed in range(50)])
     np.testing.assert_allclose(np.unique(tiles), [-0.23, -0.115, 0.0, 0.115, 0.23], atol=1e-6)  # 0.05 + 0.2 * 0.9
     assert not tiles[:, [0, -1]].any() and not tiles[:, :, [0, -1]].any()
+
+
+# Contracts
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda: terrain.hand_crafted_crossings(0, 0), "count"),
+        (lambda: terrain.training_tiles(1, 0, 0), "num_columns"),
+        (lambda: terrain.training_tiles(11, 1, 0), "num_levels"),
+        (lambda: crossing_terrain("slope", 10, 0), "level"),
+        (lambda: training_tile("noise", 1, 0), "type"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(call, field):
+    with pytest.raises(ValueError, match=field):
+        call()
