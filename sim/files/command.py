@@ -4,8 +4,11 @@ A command is a frozen dataclass: its docstring is its help, its fields are its f
 module loads quickly; what takes seconds to import (torch, warp, newton, pyribs) is imported inside ``execute``.
 """
 
+import contextlib
 import inspect
+import io
 import os
+import re
 import shlex
 import signal
 import sys
@@ -14,7 +17,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 from shutil import get_terminal_size
 from types import FrameType
@@ -116,17 +119,12 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     Returns:
         Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
         can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM.
-        FAULTLINE_DEBUG=1 shows the traceback instead of the line. A SystemExit, of status 2, after wrong flags.
+        FAULTLINE_DEBUG=1 shows the traceback instead of the line.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         defaults = {"default": cls.defaults(argv)} if hasattr(cls, "defaults") else {}
-        if {"-h", "--help"} & {*argv}:
-            print(_wrapped(inspect.getdoc(cls) or ""), end="\n\n")
-        config, registry = (tyro.conf.DisallowNone,), _plain_help()
-        command = tyro.cli(
-            cls, prog=f"faultline {name}", args=list(argv), description="", registry=registry, config=config, **defaults
-        )
+        command = _parse(cls, argv, name, defaults)
         check(command)
         status = command.execute()
         return status if isinstance(status, int) else 0
@@ -152,6 +150,31 @@ def say(*parts: str | tuple[str, str], error: bool = False) -> None:
 
     console = Console(stderr=error, highlight=False)
     console.print(Text.assemble(*parts), soft_wrap=not console.is_terminal)
+
+
+def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
+    """The command with its flags; what tyro says of wrong ones in a box is an error of one line."""
+    if {"-h", "--help"} & {*argv}:
+        print(_wrapped(inspect.getdoc(cls) or ""), end="\n\n")
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                cls, prog=f"faultline {name}", args=list(argv), description="", registry=_plain_help(),
+                config=(tyro.conf.DisallowNone,), **defaults,
+            )  # fmt: skip
+    except SystemExit as stop:
+        if not stop.code:  # it was asked for help
+            raise
+        lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in said.getvalue().splitlines()]
+        _title, *words = [line for line in lines if line.strip("-")]
+        text = " ".join(takewhile(lambda line: not line.startswith("For full helptext"), words))
+        what, _, help_line = text.partition(" Argument helptext: ")
+        if form := re.match(r"(--\S+) (\{.*?\}|\S+)", help_line):
+            flag = form[1]
+            given = "".join(f", got {value}" for value in [_values(argv, flag)] if value)
+            what = f"{flag} must be {form[2].strip('{}').replace('|', ' or ')}{given}"
+        raise UserError(f"{what.rstrip('.')}; `faultline {name} --help` tells all flags") from None
 
 
 def _wrapped(text: str) -> str:
@@ -184,6 +207,12 @@ def _plain_help() -> ConstructorRegistry:
         return replace(spec, fields=tuple(fields))
 
     return registry
+
+
+def _values(argv: Sequence[str], flag: str) -> str:
+    """What a flag is given: the words up to the next one."""
+    after = argv[argv.index(flag) + 1 :] if flag in argv else [peek(argv, flag) or ""]
+    return shlex.join(takewhile(lambda word: not word.startswith("--"), after))
 
 
 def peek(argv: Sequence[str], flag: str) -> str | None:

@@ -4,9 +4,10 @@ A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Fl
 """
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 from msgspec import Meta
@@ -19,6 +20,15 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
 Settings = TypeVar("Settings")
+_EXPECTED = re.compile(r"Expected (?P<what>.*?)(?P<got>, got .*?)?( - at `\$\.?(?P<field>.*)`)?")
+_PLAIN_WORDS = {
+    r"`(int|float)` >= (\S+?)(\.0)?$": r"at least \2",
+    r"`(int|float)` > (\S+?)(\.0)?$": r"above \2",
+    r"`(int|float)` <= (\S+?)(\.0)?$": r"at most \2",
+    r"\bint\b": "a whole number", r"\bfloat\b": "a finite number", r"\bstr\b": "a text", r"\bbool\b": "True or False",
+    r"\barray\b": "a tuple", r"\bnull\b": "None", r" \| ": " or ", "`": "",
+}  # fmt: skip
+"""What msgspec calls a type or a range, and what a user does."""
 
 
 def problems(settings: Any, prefix: str = "") -> list[str]:
@@ -50,7 +60,9 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
-        raise ValueError(f"{name}: {error}") from None
+        match = _EXPECTED.fullmatch(str(error))
+        words = f"{match['field'] or 'it'} must be {_in_words(match['what'])}{match['got'] or ''}" if match else error
+        raise ValueError(f"{name}: {words}") from None
     unknown = list(_unknown(data, msgspec.to_builtins(settings, enc_hook=str)))
     if unknown:
         raise ValueError(f"{name} has no setting {', '.join(unknown)}")
@@ -76,10 +88,23 @@ def _mismatch(annotation: Any, value: Any) -> str | None:
     try:
         converted = msgspec.convert(plain, annotation)
     except msgspec.ValidationError as error:
-        return str(error).removeprefix("Expected ").partition(", got")[0].partition(" - at")[0]
+        match = _EXPECTED.fullmatch(str(error))
+        return _in_words(match["what"]) if match else f"one of {', '.join(map(str, _choices(annotation)))}"
     except TypeError:
         return None
     return "a tuple" if isinstance(value, list) and isinstance(converted, tuple) else None
+
+
+def _in_words(expected: str) -> str:
+    for pattern, words in _PLAIN_WORDS.items():
+        expected = re.sub(pattern, words, expected)
+    return expected
+
+
+def _choices(annotation: Any) -> tuple[Any, ...]:
+    """Values of the literals in an annotation."""
+    parts = get_args(annotation)
+    return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
 
 
 def _brief(value: Any) -> str:
