@@ -4,7 +4,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
 from typing import Any
 
-import mujoco
 import newton
 import numpy as np
 import warp as wp
@@ -16,7 +15,6 @@ from sim.robots.robot import RobotCfg
 _URDF_FRICTION = 1.0
 _URDF_TIME_CONSTANT_S = 0.01
 _vec3: Any = wp.vec3
-_mj: Any = mujoco  # its types are not written down
 _RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
 
 
@@ -71,7 +69,7 @@ def read_robot(robot: RobotCfg, wrong: Collection[str] = ()) -> tuple[newton.Mod
     if structure:
         return builder, problems + structure
     joints = joint_names(builder)
-    problems += _mass_problems(builder)
+    problems += _number_problems(builder, joints)
     problems += _drive_problems(builder, files.root, joints)
     if "joint_names" not in wrong:
         problems += _joint_name_problems(builder, robot) or _joint_value_problems(builder, robot, files, wrong)
@@ -92,7 +90,6 @@ def _add_model(builder: newton.ModelBuilder, robot: RobotCfg, files: ModelFiles)
         builder.add_urdf(text, floating=True, enable_self_collisions=False)
         _name_by_link(builder)
     else:
-        _mj.MjSpec.from_file(str(robot.model_file)).compile()  # which says what is wrong with numbers in it
         builder.add_mjcf(
             str(robot.model_file), enable_self_collisions=False, parse_mujoco_options=False, parse_visuals=False
         )
@@ -249,7 +246,19 @@ def _set_contact(builder: newton.ModelBuilder, robot: RobotCfg, *, is_urdf: bool
             solref[shape], modes[shape] = wp.vec2(time_constant_s, 1.0), _RAW_SOLREF
 
 
-def _mass_problems(builder: newton.ModelBuilder) -> list[str]:
+_JOINT_COLUMNS = {
+    "joint_limit_lower": ("range", -np.inf),
+    "joint_limit_upper": ("range", -np.inf),
+    "joint_target_ke": ("kp", 0.0),
+    "joint_target_kd": ("kv", 0.0),
+    "joint_armature": ("armature", 0.0),
+    "joint_effort_limit": ("largest torque", 0.0),
+}
+"""What each column of a builder holds, and at least."""
+
+
+def _number_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list[str]:
+    """What is wrong with masses, frames and joints of a robot of single joints, one line each."""
     bodies, problems = [leaf_name(label) for label in builder.body_label], []
     light = [name for name, mass in zip(bodies, builder.body_mass, strict=True) if not 0.0 < mass < np.inf]
     if light:
@@ -258,12 +267,29 @@ def _mass_problems(builder: newton.ModelBuilder) -> list[str]:
               if name not in light and not _is_inertia(inertia)]  # fmt: skip
     if hollow:
         problems.append(f"every body must have an inertia above 0 about every axis, unlike {', '.join(hollow)}")
-    return problems
+    lost = [name for name, com in zip(bodies, builder.body_com, strict=True) if not np.isfinite(np.array(com)).all()]
+    poses = zip(joints, builder.joint_X_p[1:], strict=True)
+    lost += [name for name, pose in poses if not np.isfinite(np.array(pose)).all()]
+    if lost:
+        problems.append(f"position and rotation must be numbers, unlike those of {', '.join(lost)}")
+    return problems + _joint_problems(builder, joints)
 
 
 def _is_inertia(inertia: Any) -> bool:
     matrix = np.array(inertia, dtype=np.float64).reshape(3, 3)
     return bool(np.isfinite(matrix).all()) and float(np.linalg.eigvalsh(matrix).min()) > 0.0
+
+
+def _joint_problems(builder: newton.ModelBuilder, joints: Sequence[str]) -> list[str]:
+    problems = []
+    for column, (what, least) in _JOINT_COLUMNS.items():
+        values = zip(joints, getattr(builder, column)[6:], strict=True)
+        wrong = [f"{name} ({value:g})" for name, value in values if not value >= least]
+        if wrong:
+            problems.append(f"{what} must be a number{', 0 or more' * (least == 0.0)}, got {', '.join(wrong)}")
+    skew = [name for name, axis in zip(joints, builder.joint_axis[6:], strict=True)
+            if not abs(np.linalg.norm(np.array(axis, dtype=np.float64)) - 1.0) < 1e-3]  # fmt: skip
+    return [*problems, f"axis must be a direction, unlike that of {', '.join(skew)}"] if skew else problems
 
 
 def effort_limits(builder: newton.ModelBuilder) -> list[float]:

@@ -7,6 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PACKAGE = "package://"
+_NUMBERS = """
+pos quat euler axisangle fromto size mass diaginertia fullinertia axis range armature damping stiffness frictionloss
+friction solref solimp margin kp kv gear forcerange ctrlrange actuatorfrcrange density scale
+xyz rpy ixx iyy izz ixy ixz iyz lower upper effort velocity radius length multiplier offset
+"""  # attributes of MJCF, and of URDF
 _MOVING = ("revolute", "prismatic", "continuous")
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf")  # .msh: MuJoCo's own
 
@@ -20,7 +25,7 @@ class ModelFiles:
     files: tuple[Path, ...]
     """The model file, included files and meshes."""
     problems: tuple[str, ...] = ()
-    """Parts that joints of a URDF need and lack."""
+    """What an importer would stumble over: texts in place of numbers; in a URDF joints without parts that they need."""
 
     @property
     def is_urdf(self) -> bool:
@@ -40,10 +45,10 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
     _refuse_xacro(root, model_file)
-    problems: list[str] = []
+    problems = list(_number_problems(root))
     files = [model_file]
     if root.tag == "robot":
-        problems += _unlimited_joints(root)
+        problems += _urdf_problems(root)
         for mesh in root.iter("mesh"):
             if mesh.get("filename"):
                 files.append(_mesh_path(mesh, model_file))
@@ -70,15 +75,48 @@ def _refuse_xacro(root: ET.Element, file: Path) -> None:
             )
 
 
-def _unlimited_joints(root: ET.Element) -> Iterator[str]:
-    """Joints of a URDF without a range, which an importer would leave free."""
+def _number_problems(root: ET.Element) -> Iterator[str]:
+    """Attributes that hold something else than the numbers they are for."""
+    numbers = _NUMBERS.split()
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if not (name in numbers or (name == "value" and element.tag == "mass")):
+                continue
+            if not all(map(_is_number, value.split())):
+                comma = ": write a decimal point" if "," in value else ""
+                yield f'<{element.tag} {name}="{value}"> must be numbers{comma}'
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _urdf_problems(root: ET.Element) -> Iterator[str]:
+    """Links and joints that lack what a URDF's need."""
+    links = [link.get("name") for link in root.findall("link")]
+    for link in root.findall("link"):
+        if not link.get("name"):
+            yield "a link without a name"
     for joint in root.findall("joint"):
+        name, kind = f"joint {joint.get('name', 'without a name')}", joint.get("type", "")
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            link = None if element is None else element.get("link")
+            if link is None:
+                yield f'{name} has no <{end} link="...">'
+            elif link not in links:
+                yield f"{name}: no link named {link}, the file has {', '.join(map(str, links))}"
+        if kind not in (*_MOVING, "fixed", "floating", "planar"):
+            yield f"{name} must be of type {', '.join(_MOVING)} or fixed, got '{kind}'"
         limit = joint.find("limit")
         lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
-        if joint.get("type") in _MOVING[:2] and lacking:
+        if kind in _MOVING[:2] and lacking:
             missing = "<limit>" if limit is None else " and ".join(lacking)
-            example = '<limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
-            yield f"joint {joint.get('name')} has no {missing}: give it {example}"
+            yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
 
 
 def joints_without_effort(root: ET.Element) -> list[str]:
@@ -87,7 +125,7 @@ def joints_without_effort(root: ET.Element) -> list[str]:
     for joint in root.findall("joint"):
         limit = joint.find("limit")
         effort = "0" if limit is None else limit.get("effort", "0")
-        if joint.get("type") in _MOVING and not float(effort) > 0.0:
+        if joint.get("type") in _MOVING and _is_number(effort) and not float(effort) > 0.0:
             joints.append(joint.get("name", ""))
     return joints
 

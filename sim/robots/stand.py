@@ -25,6 +25,7 @@ _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
 _FALL = 0.1  # a start so much above the right one is a mistake [m]
 _REST_S = 0.5  # the end of the time that a robot stands, at which it should rest
 _RESTLESS = 0.1  # feet whose force changes by more than this share of the weight a step, on average, bounce
+_TURN = 2.0 * np.pi
 _FREE = 1e3  # a joint with a wider range has none [rad]
 _NO_EFFORT_LIMIT = 1e5  # more is no limit [N m]
 _SIZES = (0.05, 5.0)  # farthest point of a robot from its base [m]
@@ -187,6 +188,15 @@ def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
             f"the radius of gyration of {', '.join(far)} is more than the robot's {reach:.3g} m: "
             "are inertias in kg m^2?"
         )
+    turned = [f"{name} ({angle:g})" for name, angle in zip(robot.joint_names, robot.default_joint_pos, strict=True)
+              if abs(angle) > _TURN]  # fmt: skip
+    if turned:
+        warnings.append(f"default_joint_pos is beyond a full turn for {', '.join(turned)}: is it in radians?")
+    spans = zip(robot.joint_names, builder.joint_limit_lower[6:], builder.joint_limit_upper[6:], strict=True)
+    wide = [f"{name} ({low:g} to {high:g})" for name, low, high in spans if 2.0 * _TURN < high - low < _FREE
+            and max(abs(low), abs(high)) > 2.0 * _TURN]  # fmt: skip
+    if wide:
+        warnings.append(f"joints turn by more than two full turns: {', '.join(wide)}: are limits in radians?")
     return warnings
 
 

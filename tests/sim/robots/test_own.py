@@ -98,12 +98,16 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", "</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>', "FL_hip"),
     ("xml", FIRST_DRIVE, '<general joint="FL_hip" biastype="affine" gainprm="60" biasprm="0 -60"/>', "pulls by itself"),
     ("xml", "0.03 0.2 0.2", "0 0 0", "inertia"),
+    ("xml", 'pos="0.2 0.12 0"', 'pos="0.2 nan 0"', "position"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
     ("urdf", LIMIT, "", "FL_hip has no <limit>"),
-    ("urdf", FIRST_MASS, '<mass value="0,8"/>', "'0,8'"),
+    ("urdf", FIRST_MASS, '<mass value="0,8"/>', '<mass value="0,8">'),
     ("urdf", FIRST_MASS, '<mass value="${m}"/>', "xacro"),
+    ("urdf", '<parent link="trunk"/>', "", "<parent link"),
     ("urdf", '<child link="FL_thigh"/>', '<child link="leg"/>', "leg"),
+    ("urdf", '"revolute"', '"hinge"', "hinge"),
+    ("urdf", '"trunk">', '"">', "link without a name"),
 ]
 
 
@@ -124,9 +128,11 @@ def test_every_mistake_of_settings_and_model_is_named_at_once(tmp_path):
         ('base_geoms=("trunk",)', "base_geoms=()"),
     ):
         replace_once(file, old, new)
+    replace_once(file.with_suffix(".xml"), 'mass="8"', 'mass="0"')
+    replace_once(file.with_suffix(".xml"), HIP, f'{HIP} armature="-1"')
     with pytest.raises(ValueError, match=r"dog\.py") as raised:
         get_robot(str(file))
-    for part in ("contact_force_limit", "default_joint_pos", "FL_shin", "base_geoms"):
+    for part in ("contact_force_limit", "default_joint_pos", "FL_shin", "base_geoms", "trunk", "armature"):
         assert part in str(raised.value)
 
 
