@@ -44,18 +44,8 @@ def calibrate(
 ) -> dict[str, Any]:
     """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
 
-    Args:
-        robot: The robot.
-        policy: Its controller; the robot's own if None.
-        compute: Where terrains are crossed.
-        terrains: Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal,
-            up to five times as many. With fewer failing episodes even then, all episodes give the scales.
-        replicas: Episodes a terrain.
-        space: What the terrains are drawn from.
-        seed: Draws terrains and starts.
-        out: File to write; the robot's own if None.
-        cache: Folder where crossings are kept.
-        open_evaluator: Opens what crosses terrains.
+    Hard-random ``terrains`` of a space are crossed to begin with. As many again are drawn until 200 episodes have
+    missed the goal, up to five times as many. With fewer failing episodes even then, all episodes give the scales.
 
     Returns:
         The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written.

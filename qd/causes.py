@@ -107,13 +107,7 @@ def commonest_words(cause: str) -> str:
 
 
 def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
-    """What parts of a terrain do, each beside all others.
-
-    Args:
-        genes: Of one terrain, shape (num_genes,).
-        parts: Their numbers.
-        space: What the genes mean.
-    """
+    """What some parts of a terrain, of genes of shape (num_genes,), do, each beside all others."""
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
     heights, ground = terrains_of(np.concatenate(rows), space)
     nothing = np.zeros((len(parts), *PATCHES), bool)

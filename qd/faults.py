@@ -29,10 +29,7 @@ _INVALID = OUTCOMES.index("invalid")
 def fresh_numbers(archive: Archive, fresh: FreshValues, *, sampled: bool = False) -> dict[str, Any]:
     """What fresh episodes say of an archive, as metrics and reports have it.
 
-    Args:
-        archive: The elites.
-        fresh: Of each of them.
-        sampled: Whether they are some elites only: what sums over all of them is left out then.
+    Of a sample of the elites what sums over all of them is left out.
     """
     std = fresh.std()
     numbers = {
@@ -58,10 +55,7 @@ def fault_numbers(
 ) -> dict[str, Any]:
     """The numbers of faults, as ``archive.json`` has them; None of what is not known.
 
-    Args:
-        archive: The N elites.
-        families: Family of each, shape (N,).
-        seen: Whether a certifier has trained on kin of an elite, shape (N, C); None if that is not on record.
+    ``families`` has shape (N,); ``seen``, of shape (N, C), says whether a certifier has trained on kin of an elite.
     """
     faults, failing, confirmed = archive.faults, archive.failing, archive.confirmed
     names = () if faults is None else faults.certifiers

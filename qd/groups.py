@@ -58,7 +58,7 @@ def verdict_of(archive: Archive, number: int) -> str:
 class Elites:
     """N elites by what fresh episodes say of each where it has valid ones, else as they were found.
 
-    Penalties are scaled. Lower numbers have a higher fitness.
+    Lower numbers have a higher fitness.
     """
 
     numbers: NDArray[np.int64]
@@ -67,8 +67,6 @@ class Elites:
     """Whether the values are of fresh episodes, shape (N,)."""
     fitness: NDArray[np.float64]
     """Shape (N,)."""
-    ratios: NDArray[np.float64]
-    """Shape (N, P)."""
     counted: NDArray[np.int64]
     """Valid episodes, shape (N,)."""
     goal_rate: NDArray[np.float64]
@@ -125,8 +123,9 @@ class Elites:
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
 
-_FROM_FRESH = ("fitness", "ratios", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate",
-               "end_position")  # fmt: skip
+_FROM_FRESH = (
+    "fitness", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate", "end_position",
+)  # fmt: skip
 
 
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
@@ -245,12 +244,8 @@ def rank(
 ) -> Ranking:
     """The ranking of an archive that has elites.
 
-    Args:
-        archive: The elites.
-        space: What their genes mean.
-        minima: Their minimal terrains, which say best what the cause is.
-        judged: Whether elites whose fresh episodes are invalid are left out.
-        numbers: Elites to rank alone, one a row; all if None.
+    Minimal terrains say best what the cause is. ``judged`` leaves out elites whose fresh episodes are invalid;
+    ``numbers`` are elites to rank alone, one a row.
     """
     elites = elites_of(archive, judged=judged)
     elites = elites if numbers is None else elites.rows(np.searchsorted(elites.numbers, numbers))

@@ -61,16 +61,9 @@ _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM = 5, 6, 7
 
 
 def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
-    """Seeds of episodes on elites, which follow from what names an elite: its cell and the iteration that found it.
+    """Seeds of episodes on N elites, which follow from what names an elite: its cell and the iteration that found it.
 
-    Args:
-        archive: The N elites.
-        seed: The search's.
-        times: Seeds an elite.
-        stream: Sets apart what must not share its episodes.
-
-    Returns:
-        Those of an elite in succession, shape (N * times,).
+    A ``stream`` sets apart what must not share its episodes. Those of an elite in succession, shape (N * times,).
     """
     names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
     rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
@@ -85,14 +78,9 @@ def fresh_values(
     num_replicas: int,
     seed: int,
 ) -> FreshValues:
-    """Evaluates every elite again with 40 fresh episodes.
+    """Evaluates every elite again with 40 fresh episodes, drawn apart from the search's own.
 
-    Args:
-        archive: The elites.
-        evaluate: Crosses terrains.
-        fitness: Weights of the fitness, with the archive's penalties.
-        num_replicas: Episodes a terrain that ``evaluate`` gives; terrains are crossed as often as makes 40.
-        seed: The search's seed; the episodes are drawn apart from the search's own.
+    ``evaluate`` gives a terrain ``num_replicas`` episodes; terrains are crossed as often as makes 40.
     """
     if not len(archive):
         empty = {name: getattr(archive, name) for name in Evaluation.__dataclass_fields__}
@@ -147,11 +135,7 @@ class Search:
 def find_search(run: Path, *, robot: str | None = None, policy: str | None = None, space: str | None = None) -> Search:
     """The search of a run, with its robot, controller and terrain space as they are now.
 
-    Args:
-        run: Its directory.
-        robot: The robot, if its settings file must be named.
-        policy: The controller, if it has moved or is code.
-        space: The terrain space, if it is code.
+    What has moved or is code must be named: a robot's settings file, a controller, a terrain space.
     """
     cfg = RunDirectory(run).read_cfg()
     if space is not None:
@@ -189,14 +173,7 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
 
 
 def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
-    """The archive after its controller has crossed some elites with contact resolved.
-
-    Args:
-        archive: With fresh values.
-        rows: Numbers of the elites.
-        search: The search that found them.
-        crossings: What crosses terrains.
-    """
+    """The archive, which has fresh values, after its controller has crossed some elites with contact resolved."""
     faults = archive.faults or FaultCounts.none_of(len(archive))
     counts = _cross(archive, rows, search, crossings, search.policy, "resolved", _CONFIRM_STREAM, "contact resolved")
     return replace(archive, faults=replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts)))
@@ -210,13 +187,6 @@ def certify(
     A terrain that a controller crosses less than half of the time at the search's settings is not crossed with contact
     resolved, since it cannot get a certificate. Counts of a certifier that is not asked stay, those of another
     controller of the same name go.
-
-    Args:
-        archive: With fresh values.
-        rows: Numbers of the elites.
-        certifiers: Controllers by name.
-        search: The search that found the elites.
-        crossings: What crosses terrains.
     """
     faults = archive.faults or FaultCounts.none_of(len(archive))
     searched = dict(zip(faults.certifiers, faults.certifier_outcomes.swapaxes(0, 1), strict=True))
@@ -263,15 +233,9 @@ def _put(counts: NDArray[np.int64], rows: NDArray[np.int64], values: NDArray[np.
 
 
 def seen_by(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
-    """Whether each certifier of an archive has trained on kin of each elite, shape (N, C).
+    """Whether each certifier of a judged archive has trained on kin of each elite, shape (N, C).
 
-    Args:
-        archive: With fault counts.
-        families: Family of each elite, shape (N,).
-        certifiers: Controllers by name.
-
-    Returns:
-        None if the training record of one of them is not at hand.
+    None if the training record of one of them is not at hand.
     """
     assert archive.faults is not None
     marks, columns = np.array(marks_of(archive.genes)), []
@@ -296,20 +260,10 @@ def judge(
     space: str | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Archive:
-    """Judges the elites of a search, and writes the run's archive, numbers and figures after each stage.
+    """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
-    Args:
-        run: Its directory.
-        compute: Where terrains are crossed.
-        stages: What to do, in this order.
-        certifiers: Other controllers by name; those of :func:`certifiers_of` if None.
-        robot: The robot, if its settings file must be named.
-        policy: The controller that was searched, if it has moved or is code.
-        space: The terrain space, if it is code.
-        open_evaluator: Opens what crosses terrains.
-
-    Returns:
-        The judged archive.
+    ``certifiers`` are other controllers by name, those of :func:`certifiers_of` if None; robot, policy and space are
+    as :func:`find_search` takes them.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     check_policy(search.policy, search.robot, compute.device)

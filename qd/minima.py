@@ -29,12 +29,7 @@ class MinimalTerrains:
     """By number of the elite, each of shape (num_genes,)."""
 
     def chosen(self, text: str, run: object) -> list[int]:
-        """Numbers of elites that have a minimal terrain, as a command line names them: some, or ``all``.
-
-        Args:
-            text: Numbers apart by spaces or commas, or ``all``.
-            run: Whose they are, for the message.
-        """
+        """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
         known = list(map(str, self.genes))
         words = known if text.strip() == "all" else split_words([text])
         if not words or not set(words) <= set(known):
@@ -56,11 +51,9 @@ class MinimalTerrains:
 
 
 def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
-    """The minimal terrains of a run; None where nobody looked for them, or of none of the archive's elites.
+    """The minimal terrains of a run's folder; None where nobody looked for them.
 
-    Args:
-        folder: Of the run.
-        archive: Its archive; what is of other elites is left out.
+    What is of other elites than the archive's is left out; None if all are.
     """
     file = folder / NUMBERS_FILE
     if not file.exists():

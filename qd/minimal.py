@@ -105,8 +105,7 @@ class Minimal:
     def cause(self, rank: Mapping[int, float]) -> int | None:
         """The part without which most robots arrive; None if the terrain fails without any part.
 
-        Args:
-            rank: Of parts without which equally many do, the one of the largest number here is meant.
+        Of parts without which equally many do, it is that of the largest ``rank``.
         """
         rates = {part: float(goal_rates(counts)) for part, counts in self.without.items()}
         return max(rates, key=lambda part: (np.nan_to_num(rates[part], nan=-1.0), rank[part]), default=None)
@@ -195,16 +194,7 @@ def genes_of(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> N
 def case_of(
     archive: Archive, number: int, space: TerrainSpace, half_width: float, how: How | None, *, on_gpu: bool
 ) -> Case:
-    """An elite that is to be taken apart.
-
-    Args:
-        archive: With fresh values.
-        number: Of the elite, which fails.
-        space: Of the genes.
-        half_width: Half the width of the robot's stance [m].
-        how: As of :class:`Case`; what suits the device if None.
-        on_gpu: Whether robots cross on a GPU.
-    """
+    """A failing elite, which has fresh values, that is to be taken apart; ``how`` is what suits the device if None."""
     genes = archive.genes[number]
     if not (words := space.parts(genes)):
         raise ValueError(f"space must have parts(genes) and without(genes, parts), got {space.name} without parts")
@@ -224,17 +214,10 @@ def case_of(
 def take_apart(
     archive: Archive, cases: Mapping[int, Case], space: TerrainSpace, search: Search, crossings: Crossings
 ) -> dict[int, Minimal]:
-    """Finds the minimal terrains of some elites, all of them together, by number of the elite.
+    """Finds the minimal terrains of some elites, all of them together, by number of the elite; counts of cases grow.
 
     All subsets of an elite are crossed from the same starts; the fresh episodes have others. Starts follow from the
     search's seed and from what names the elite.
-
-    Args:
-        archive: The elites.
-        cases: By number of the elite; their counts grow.
-        space: Of the genes.
-        search: Its controller crosses them.
-        crossings: What crosses terrains.
     """
     seeds = {}
     for fresh, stream in ((False, _STREAM), (True, _FRESH_STREAM)):

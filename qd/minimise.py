@@ -48,18 +48,9 @@ def minimise(
 ) -> MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
-    Args:
-        run: Its directory, judged at least by fresh episodes.
-        compute: Where terrains are crossed.
-        elite: Numbers of failing elites apart by spaces or commas, or ``all``; by default 200 on a GPU, 3 on the CPU,
-            faults first, then certified, confirmed and other failing ones.
-        how: How they are taken apart; what suits the device if None.
-        judged: Whether the minimal terrains are crossed with contact resolved and by certifiers too.
-        certifiers: Other controllers by name; those of :func:`qd.judge.certifiers_of` if None.
-        robot: The robot, if its settings file must be named.
-        policy: The controller that was searched, if it has moved or is code.
-        space: The terrain space, if it is code.
-        open_evaluator: Opens what crosses terrains.
+    Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
+    certified, confirmed and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
+    terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.judge.judge` takes it.
 
     Returns:
         What the run has now; None without a failing elite.

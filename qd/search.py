@@ -53,19 +53,13 @@ def search(
     policy: str | None = None,
     open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Archive:
-    """Searches, or goes on with the search in a directory, until it has done its iterations.
+    """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
-    Args:
-        cfg: The search.
-        path: Its run directory. Nothing is written before the simulation stands.
-        compute: Where terrains are crossed.
-        robot: The robot, if it is not shipped.
-        policy: Where the controller lies, if not where ``cfg`` says.
-        open_evaluator: Opens what crosses terrains.
+    Nothing is written before the simulation stands; whatever stops a search, all iterations that ended are saved. A
+    robot that is not shipped is given, and a controller that lies elsewhere than ``cfg`` says.
 
     Returns:
-        The archive; with what judging says of its elites if nothing was left to do. Whatever stops a search, all
-        iterations that ended are saved.
+        The archive; with what judging says of its elites if nothing was left to do.
     """
     robot = robot or get_robot(cfg.robot)
     policy = policy or spec_of(cfg.policy, robot)
@@ -213,12 +207,7 @@ def say_what_stops_the_robot(
 ) -> None:
     """Prints the last lines of a search or a judging: what stops the robot, the worst terrain, and what comes next.
 
-    Args:
-        run: Directory of the search.
-        archive: What it found.
-        robot: The robot, if the command line names it; so are the next two.
-        policy: The controller.
-        space: The terrain space.
+    Robot, controller and space are as the command line names them, if it does.
     """
     if not len(archive):
         return

@@ -28,8 +28,7 @@ class Replay(ControllerFlags, DeviceFlag, EliteFlags):
     """
 
     terrain: Path | None = None
-    """Instead of elites a height map of your own, an .npz or a .png; or a .recording.npz that stands beside a film, of
-    which nothing is crossed again."""
+    """Instead of elites a height map of your own, an .npz or a .png."""
     size: tuple[float, float] | None = None
     """Size of the map along x and y [m], such as 16 8; its file's if left out."""
     scale: float | None = None
@@ -54,7 +53,7 @@ class Replay(ControllerFlags, DeviceFlag, EliteFlags):
 
     def _source(self) -> Any:
         from qd.show.elites import open_run
-        from qd.show.replay import RECORDING, source_of_map, source_of_recording, source_of_run
+        from qd.show.replay import source_of_map, source_of_run
         from sim.robots.find import get_robot
 
         crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
@@ -63,8 +62,6 @@ class Replay(ControllerFlags, DeviceFlag, EliteFlags):
             return source_of_run(opened_run, self.elite, self.minimal, **crossing)
         if self.run is not None:
             raise ValueError("give one of --run and --terrain")
-        if self.terrain.name.endswith(RECORDING):
-            return source_of_recording(self.terrain, self.robot, self.policy)
         robot, how = get_robot(self.robot or "anymal"), {"size_m": self.size, "scale_m": self.scale}
         return source_of_map(self.terrain, robot, offset_m=self.offset, **how, **crossing)
 
@@ -76,7 +73,7 @@ class Film(Replay):
     The terrains and the episodes are those that `faultline replay` shows. The film begins 3 s before the robot falls,
     collides or gets stuck, shows the last second before that four times slower, and ends 1 s after it. Feet that touch
     are yellow, base and legs that touch magenta. Arrows are contact forces of the feet, red beyond the robot's limit.
-    The map shows all paths. The recording is stored beside the film, so that it can be filmed again elsewhere.
+    The map shows all paths.
     """
 
     episode: NonNegativeInt | None = None
@@ -227,10 +224,10 @@ class View(RobotFlag, EliteFlags):
 
     It opens on the worst terrain of the commonest cause, one second before the robot fails, and plays; the controller
     that crosses the terrain is shown beside it as a ghost. Under the scene are play, the time with marks where things
-    happen, episode, speed and follow. On the left are the elites, by what stops the robot, as a list and on parallel
-    axes; a click shows one. On the right stand how often the robot arrives, who crosses beside it, its penalties, and a
-    button that films what is shown. Crossings that are not recorded yet run on the CPU, which takes seconds, and are
-    stored under --cache.
+    happen, episode, speed and follow. On the left are the elites, by what stops the robot, as a list and on a map
+    of where episodes end; a click shows one. On the right stand how often the robot arrives, who crosses beside it, its
+    penalties, and a button that films what is shown. Crossings that are not recorded yet run on the CPU, which takes
+    seconds, and are stored under --cache.
 
     Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
     opens just that.

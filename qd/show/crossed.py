@@ -1,6 +1,5 @@
-"""Recorded crossings in numbers and figures: how they ended, what they cost, and where."""
+"""Recorded crossings in numbers and figures: how they ended, and where."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,7 +11,6 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.show.figures import label_of, look_of
 from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
@@ -76,8 +74,6 @@ class Crossed:
 
     recording: Recording
     """Of one terrain."""
-    scales: dict[str, float]
-    """What each penalty of the archive is divided by, in its order."""
     chosen: NDArray[np.int64]
     """Valid episodes, shape (E,)."""
     outcome: NDArray[np.uint8]
@@ -96,7 +92,7 @@ class Crossed:
         return self.recording.base_position[0, episode, : self.recording.num_frames[0, episode]].astype(np.float64)
 
 
-def crossed_of(recording: Recording, penalties: Sequence[str] = (), scales: Sequence[float] = ()) -> Crossed:
+def crossed_of(recording: Recording) -> Crossed:
     """A recording of one terrain in numbers."""
     chosen = np.flatnonzero(recording.outcome[0] != Outcome.INVALID)
     outcome = recording.outcome[0, chosen]
@@ -104,7 +100,6 @@ def crossed_of(recording: Recording, penalties: Sequence[str] = (), scales: Sequ
     hits["fallen"] = recording.fallen[0, chosen]
     return Crossed(
         recording=recording,
-        scales=dict(zip(penalties, scales, strict=True)),
         chosen=chosen,
         outcome=outcome,
         rates={label: Rate(int(hit.sum()), len(chosen)) for label, hit in hits.items()},
@@ -115,14 +110,10 @@ _STUCK = 0.3  # a robot that gets stuck is stuck once it is so near to where it 
 
 
 def moment_of_failure(recording: Recording, episode: int) -> float:
-    """When an episode went wrong [s]: at its base collision, or at its fall where the robot fell before that.
+    """When an episode of one terrain went wrong [s]: at its base collision, or at a fall before that.
 
     A robot that ran out of time without a fall got stuck when it first came within 0.3 m of where it ended. Of every
     other episode it is the end. A fall is the one from which the robot did not rise.
-
-    Args:
-        recording: Of one terrain.
-        episode: Index of the episode.
     """
     last = max(int(recording.num_frames[0, episode]) - 1, 0)
     outcome, frame = recording.outcome[0, episode], last
@@ -139,16 +130,25 @@ def moment_of_failure(recording: Recording, episode: int) -> float:
     return frame * recording.dt
 
 
-def typical_episode(recording: Recording, scales: dict[str, float]) -> int:
-    """The episode to show: of those that end as most do, the one with the middle sum of scaled penalties."""
+def typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
+    """The episode to show: of those that end as most do, or so, the one with the middle sum of scaled penalties."""
     outcome = recording.outcome[0]
-    candidates = np.flatnonzero(outcome == np.bincount(outcome).argmax())
+    candidates = np.flatnonzero(outcome == (np.bincount(outcome).argmax() if ending is None else ending))
     last = np.maximum(recording.num_frames[0, candidates] - 1, 0)
     sums = recording.penalties[0, candidates, last].astype(np.float64)
     names = recording.penalty_names
     costs = sum(sums[:, names.index(name)] / scale for name, scale in scales.items() if name in names)
     order = np.argsort(np.broadcast_to(costs, len(candidates)), kind="stable")
     return int(candidates[order[(len(candidates) - 1) // 2]])
+
+
+def episode_beside(recording: Recording, episode: int, scales: dict[str, float]) -> int:
+    """The episode of another controller to show beside one: that from the same start, else a typical one that arrives.
+
+    If it arrives in none, it is that from the same start.
+    """
+    arrived = recording.outcome[0] == Outcome.GOAL
+    return episode if arrived[episode] or not arrived.any() else typical_episode(recording, scales, Outcome.GOAL)
 
 
 _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}  # of robots, as their makers write them
@@ -165,29 +165,11 @@ def title_of(recording: Recording, controller: str = "") -> str:
     return f"{who}, {recording.labels[0]}: {way}, {ended.sum()} of {valid.sum()}"
 
 
-def penalties_by_place(crossed: Crossed, edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scaled penalties per episode by where along x they were incurred, shape (places, P); they add up to the mean.
-
-    The places lie between ``edges`` [m], shape (places + 1,); what lies outside counts in the first or last.
-    """
-    recording, scales = crossed.recording, crossed.scales
-    columns = [recording.penalty_names.index(name) for name in scales]
-    amounts = np.zeros((len(edges) - 1, len(columns)))
-    for k, episode in enumerate(crossed.chosen):
-        sums = recording.penalties[0, episode, : recording.num_frames[0, episode]][:, columns].astype(np.float64)
-        places = np.clip(np.digitize(crossed.path(k)[1:, 0], edges) - 1, 0, len(amounts) - 1)
-        np.add.at(amounts, places, np.diff(sums, axis=0))
-    return amounts / (np.array([*scales.values()]) * max(1, len(crossed.chosen)))
-
-
-_PLACE = 0.5  # length of the places that penalties are summed over [m]
-
-
 def draw_crossing(crossed: Crossed, title: str) -> Figure:
-    """One terrain: its height map with the paths, its profile, and the penalties by place."""
-    figure = new_figure(9.5, 8.4)
+    """One terrain: its height map with the paths, and its profile."""
+    figure = new_figure(9.5, 6.4)
     figure.suptitle(title)
-    top, profile, places = panels = figure.subplots(3, 1, sharex=True, height_ratios=(3.2, 0.9, 1.1))
+    top, profile = panels = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 0.9))
     image = draw_heights(top, crossed.recording.heights[0], None, crossed.recording.ground)
     figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
     handles = [*_draw_paths(top, crossed), *(Line2D([], [], **look) for look in (START, GOAL))]
@@ -197,9 +179,6 @@ def draw_crossing(crossed: Crossed, title: str) -> Figure:
     if ground is not None and ground.time_constant_s.any():
         handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
     _draw_profile(profile, crossed.recording.heights[0])
-    _draw_places(places, crossed)
-    for look, name in ((look_of(name), label_of(name)) for name in crossed.scales):
-        handles.append(Patch(facecolor=look.color, hatch=look.hatch, edgecolor="white", label=name))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
     xs = [0.0, LENGTH, *crossed.ends[:, 0]]  # robots may leave the terrain
     top.set_xlim(min(xs), max(xs))
@@ -228,19 +207,6 @@ def _draw_profile(axes: Axes, heights: NDArray[np.float32]) -> None:
     x = np.linspace(0.0, LENGTH, len(row))
     axes.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
     axes.plot(x, row, color="0.2", linewidth=1.0)
+    axes.set_xlabel("x [m]")
     axes.set_ylabel("height at\ny = 4 m [m]", fontsize=9)
     axes.grid(alpha=0.3)
-
-
-def _draw_places(axes: Axes, crossed: Crossed) -> None:
-    """Scaled penalties of an episode by where they were incurred."""
-    edges = np.arange(0.0, LENGTH + _PLACE / 2, _PLACE)
-    amounts = penalties_by_place(crossed, edges)
-    bottom = np.zeros(len(amounts))
-    for penalty, amount in zip(crossed.scales, amounts.T, strict=True):
-        axes.bar(edges[:-1], amount, width=_PLACE, align="edge", bottom=bottom, **look_of(penalty).bar)
-        bottom += amount
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel(f"penalties per\n{_PLACE} m (scaled)", fontsize=9)
-    axes.grid(alpha=0.3)
-    axes.set_axisbelow(True)

@@ -126,12 +126,7 @@ class OpenedRun:
         return minima
 
     def terrains(self, elite: str = "0", minimal: str | None = None) -> list[Terrain]:
-        """The terrains that a command line names.
-
-        Args:
-            elite: Numbers of elites apart by spaces or commas, or ``all``.
-            minimal: The same of minimal terrains, which are then meant instead.
-        """
+        """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``."""
         if minimal is None:
             numbers = chosen_elites(elite, len(self.archive), self.path)
             return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}{self._why(n)}") for n in numbers]
@@ -159,12 +154,9 @@ class OpenedRun:
 
 
 def open_run(named: str | None, run: Path | None = None, *, space: str | None = None) -> OpenedRun:
-    """The archive of a run; without one the robot's newest under runs/, else its published one.
+    """The archive of a run directory or file; without one the robot's newest under runs/, else its published one.
 
-    Args:
-        named: The robot, as the command line names it; left out, that of the run.
-        run: Run directory or archive file.
-        space: Terrain space that the command line names.
+    Robot and terrain space are as the command line names them; without a robot it is that of the run.
     """
     if run is None:
         run = find_run(get_robot(named or "anymal"))

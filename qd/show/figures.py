@@ -37,21 +37,14 @@ class PenaltyLook(NamedTuple):
     """Of its raw sum."""
     color: str = "#999999"
     """One of Okabe and Ito's."""
-    hatch: str = ""
-    """Tells it apart in grey."""
-
-    @property
-    def bar(self) -> dict[str, Any]:
-        """Style of its bars."""
-        return {"color": self.color, "hatch": self.hatch, "edgecolor": "white", "linewidth": 0.0}
 
 
 _PENALTY_LOOKS = {
-    "yaw_rate": PenaltyLook("yaw-rate error", "(rad/s)^2 s", "#cc79a7", "//"),
+    "yaw_rate": PenaltyLook("yaw-rate error", "(rad/s)^2 s", "#cc79a7"),
     "vel_x": PenaltyLook("forward-\nvelocity error", "(m/s)^2 s", "#0072b2"),
-    "vel_y": PenaltyLook("sideways-\nvelocity error", "(m/s)^2 s", "#56b4e9", "\\\\"),
+    "vel_y": PenaltyLook("sideways-\nvelocity error", "(m/s)^2 s", "#56b4e9"),
     "contact_force": PenaltyLook("high contact\nforce", "N s", "#000000"),
-    "stumble": PenaltyLook("stumble", "s", "#e69f00", ".."),
+    "stumble": PenaltyLook("stumble", "s", "#e69f00"),
     "collision": PenaltyLook("collisions of\nbase and legs", "s", "#d55e00"),
 }
 
@@ -178,14 +171,6 @@ def _range(fitness: np.ndarray) -> tuple[float, float]:
     return (float(np.quantile(fitness, 0.02)), float(np.quantile(fitness, 0.98))) if len(fitness) else (0.0, 1.0)
 
 
-def spread(archive: Archive) -> np.ndarray:
-    """How many elites were found in each interval of each ratio, shape (P, intervals, 2): without, with collision."""
-    tuples = archive.cells.tuples[archive.cell % len(archive.cells.tuples)]
-    counts = np.zeros((len(archive.penalties), archive.intervals, 2), dtype=np.int64)
-    np.add.at(counts, (np.arange(len(archive.penalties)), tuples, archive.collided[:, None].astype(int)), 1)
-    return counts
-
-
 _CORRECTED = (
     "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
     "corrected_elites", "mean_fitness_corrected",
@@ -216,7 +201,6 @@ def summary(
         **fault_numbers(archive),
         "with_collision": with_collision,
         "without_collision": len(archive) - with_collision,
-        "spread": dict(zip(archive.penalties, spread(archive).sum(axis=2).tolist(), strict=True)),
         "wall_s": sum(row["wall_s"] for row in metrics),
         "gpus": gpus,
         "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),

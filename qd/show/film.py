@@ -18,13 +18,12 @@ from kernels.episode import Outcome
 from qd.judge import panel_of
 from qd.run.progress import share_bar
 from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode, way_to_end
-from qd.show.replay import RECORDING, Source, save
+from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
 from sim.crossing import CrossingCfg
 from sim.maps.picture import LENGTH, height_colors
 from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import label_suffix, spec_of
-from sim.recording.file import write_recording
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Ghost, Renderer, open_context
 from sim.recording.scene import OTHER_CONTROLLER
@@ -229,20 +228,10 @@ def film(
 ) -> None:
     """Films an episode of a recording of one terrain.
 
-    Args:
-        recording: The crossings.
-        robot: The robot.
-        scales: What each penalty is divided by, to find the typical episode.
-        out: The file.
-        cfg: What to show.
-        by: Name of the controller, where it is not the robot's own.
-        beside: Name and recording of another controller from the same starts, to be shown beside it.
-        progress: Called with the share that is done.
+    ``scales`` of penalties find the typical episode. ``by`` names the controller, where it is not the robot's own;
+    ``beside`` is another with its recording from the same starts. ``progress`` is called with the share that is done.
     """
-    replicas = recording.replicas.tolist()
-    if cfg.episode is not None and cfg.episode not in replicas:
-        raise ValueError(f"episode {cfg.episode} was not recorded, expected one of {', '.join(map(str, replicas))}")
-    episode = typical_episode(recording, scales) if cfg.episode is None else replicas.index(cfg.episode)
+    episode = typical_episode(recording, scales) if cfg.episode is None else cfg.episode
     shot = Shot(recording=recording, episode=episode, title=title_of(recording, by), beside=beside)
     fps, size = (GIF_FPS, GIF_SIZE) if cfg.gif else (FPS, SIZE)
     times = shot.times(fps, whole=cfg.whole)
@@ -281,17 +270,15 @@ def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
 def film_source(
     source: Source, cfg: FilmCfg, *, beside: str | None = None, device: str = "cpu", out: Path | None = None
 ) -> list[Path]:
-    """Films of terrains, each with its recording beside it; all is crossed and stored before the first is made.
+    """Films of terrains; all is crossed and stored before the first is made.
 
     ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file.
     """
     robot, run = source.robot, source.opened_run
     files = source.files(".gif" if cfg.gif else ".mp4", out)
-    replicas = {crossing.replicas for crossing in source.wanted}
-    if cfg.episode is not None and replicas and cfg.episode >= min(replicas):
-        raise ValueError(f"episode must be one of 0..{min(replicas) - 1}, got {cfg.episode}")
-    if beside is not None and source.recorded:
-        raise ValueError(f"beside {beside} needs crossings from the same starts: film the elite or the map instead")
+    replicas = source.wanted[0].replicas
+    if cfg.episode is not None and cfg.episode >= replicas:
+        raise ValueError(f"episode must be one of 0..{replicas - 1}, got {cfg.episode}")
     open_context(64, 64).free()
     others: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
@@ -300,8 +287,6 @@ def film_source(
     recordings = source.record(device)
     if beside is not None:
         others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]
-    for recording, file in zip([] if source.recorded else recordings, files, strict=False):
-        write_recording(file.with_name(file.stem + RECORDING), recording)
     for recording, other, file in zip(recordings, others, files, strict=True):
         with share_bar(f"filming {recording.labels[0]}") as progress:
             film(recording, robot, source.scales, file, cfg, by=source.by, beside=other, progress=progress)

@@ -1,4 +1,4 @@
-"""Terrains again: elites of a run, a map of one's own, or what was recorded; their numbers and their figures."""
+"""Terrains again: elites of a run, or a map of one's own; their numbers and their figures."""
 
 import hashlib
 from collections.abc import Sequence
@@ -22,15 +22,11 @@ from sim.files.figures import as_png
 from sim.files.intervals import rate_words, wilson_interval
 from sim.maps.heightmap import as_terrain, fitted, read_heightmap
 from sim.policy.spec import ControllerSpec, crosser_name
-from sim.recording.file import read_recording
 from sim.recording.recorder import Recording
-from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 
 OWN_FOLDER = RUNS / "terrains"
 """Where what is made of a user's own terrains goes."""
-RECORDING = ".recording.npz"
-"""Ending of the recording that stands beside a film."""
 _LONGEST_NAME = 120  # characters of a map's path; with robot, controller and ending a file may have 255
 
 
@@ -47,10 +43,8 @@ class Source:
     """What files about each terrain are called, without their ending."""
     about: Sequence[dict[str, Any]]
     """What is known of each terrain, for the file of its numbers."""
-    wanted: Sequence[Wanted] = ()
+    wanted: Sequence[Wanted]
     """The crossings of each terrain."""
-    recorded: Sequence[Recording] = ()
-    """The recording of each terrain, where nothing is to be crossed."""
     inputs: tuple[Path, ...] = ()
     """Files of the user, which are never overwritten."""
     by: str = ""
@@ -68,7 +62,7 @@ class Source:
     def record(self, device: str, policy: str | None = None) -> list[Recording]:
         """The recording of each terrain, by another controller if one is named; what is not stored is crossed."""
         wanted = [replace(crossing, policy=policy or crossing.policy) for crossing in self.wanted]
-        return list(self.recorded) or Recordings(self.robot, device=device).all_of(wanted)
+        return Recordings(self.robot, device=device).all_of(wanted)
 
     def files(self, ending: str, out: Path | None) -> list[Path]:
         """The file of each terrain: in its folder, in a folder ``out``, or ``out``; refused before long work."""
@@ -142,24 +136,6 @@ def source_of_map(
     )
 
 
-def source_of_recording(file: Path, robot: str | None = None, policy: str | None = None) -> Source:
-    """What was recorded of one terrain or several: nothing is crossed. Penalties are scaled by those of ``policy``."""
-    recording = read_recording(file)
-    recorded = robot_of({**recording.origin, "robot": recording.robot}, robot, file)
-    if recording.joint_names != recorded.joint_names:
-        raise ValueError(f"{file} is of other joints than {recorded.name} has: give the --robot that was recorded")
-    count, stem = recording.num_terrains, file.name.removesuffix(RECORDING).removesuffix(".npz")
-    return Source(
-        robot=recorded,
-        fitness=fitness_of(recorded, policy),
-        folder=file.parent,
-        stems=[stem] if count == 1 else [f"{stem}-{k}" for k in range(count)],
-        about=[{"recording": str(file), "terrain": label} for label in recording.labels],
-        recorded=[recording.of_terrain(k) for k in range(count)],
-        inputs=(file,),
-    )
-
-
 def fitness_of(robot: RobotCfg, policy: str | None) -> FitnessCfg:
     """The robot's penalties with their scales; 1 each, and so raw sums, where they were never measured."""
     try:
@@ -175,7 +151,7 @@ def replay(source: Source, *, device: str = "cpu", out: Path | None = None) -> l
     figures, reports = source.files(".png", out), []
     for k, (recording, figure) in enumerate(zip(source.record(device), figures, strict=True)):
         refuse_all_invalid(recording.result())
-        crossed = crossed_of(recording, source.fitness.penalties, source.fitness.scales)
+        crossed = crossed_of(recording)
         policy = ControllerSpec.parse(str(recording.origin["policy"])).label
         reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(crossed)})
         print(describe(source, k, recording))

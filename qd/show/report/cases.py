@@ -53,13 +53,7 @@ def cross_cases(
 ) -> dict[int, Case]:  # fmt: skip
     """Crosses elites and takes their pictures, by number; one whose episodes are all invalid is left out.
 
-    Args:
-        material: The run.
-        heads: Numbers of those that other controllers cross too, if these have a certificate.
-        others: Numbers of those that are shown in short.
-        recordings: What crosses them.
-        episodes: Of each.
-        pictured: Whether pictures can be taken.
+    ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short.
     """
     opened_run, archive, cases = material.opened_run, material.archive, dict[int, Case]()
     files = opened_run.certifiers()
@@ -90,9 +84,9 @@ def _case(
     sources = close_pictures(material.opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if other is not None:
-        rate = crossed_of(other[1], archive.penalties, archive.scales).rates[ARRIVED]
+        rate = crossed_of(other[1]).rates[ARRIVED]
         beside = Beside(name=other[0], source=sources[1], time_s=moments[1].time_s, rate=rate)
-    crossed, row = crossed_of(recording, archive.penalties, archive.scales), ranking.elites.place_of(number)
+    crossed, row = crossed_of(recording), ranking.elites.place_of(number)
     title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
     return Case(
         number=number,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.show.crossed import moment_of_failure, typical_episode
+from qd.show.crossed import episode_beside, moment_of_failure, typical_episode
 from qd.show.figures import relief
 from qd.show.film import clear_elevation
 from qd.show.report.page import picture_source
@@ -81,8 +81,7 @@ def failure_of(recording: Recording, scales: dict[str, float]) -> Moment | None:
 
 def same_moment(moment: Moment, other: Recording, scales: dict[str, float]) -> Moment:
     """Another controller on the same terrain at that time, from the same start if it reaches the goal from there."""
-    reaches = other.outcome[0, moment.episode] == Outcome.GOAL
-    episode = moment.episode if reaches else typical_episode(other, scales)
+    episode = episode_beside(other, moment.episode, scales)
     return Moment(other, episode, min(moment.frame, int(other.num_frames[0, episode]) - 1))
 
 

@@ -34,19 +34,11 @@ def write_report(
     device: str | None = None,
     cross: Cross | None = None,
 ) -> Path:
-    """Writes the page about a search, or about the rounds of a hardening; returns its file.
+    """Writes the page about a search, or about the rounds of a hardening; returns its file, *.html.
 
-    Args:
-        run: Directory of either, or an archive file; the newest search of the robot, else its published archive.
-        robot: Name or settings file of the robot.
-        policy: The controller to cross with; the search's if None.
-        space: A user's own terrain space that the run names.
-        out: File to write, *.html.
-        num_elites: How many of the worst terrains to show close up, with another controller beside.
-        tables: Tables of an evaluation to show, ``tables.json``; none if left out.
-        episodes: Crossings of each.
-        device: Warp device name.
-        cross: Crosses terrains; by default the simulation.
+    The run is a directory of either, or an archive file; the newest search of the robot, else its published archive.
+    ``num_elites`` of the worst terrains are shown close up, with another controller beside; ``tables`` of an evaluation
+    are shown if their file is given.
     """
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)

@@ -34,8 +34,6 @@ class Address:
     follow: bool = False
     camera: tuple[Point, Point] | None = None
     """Where the camera stands and what it looks at [m]."""
-    others: tuple[tuple[str, str], ...] = ()
-    """Further parameters with their values, such as viser's."""
 
     def query(self) -> str:
         """The address behind its question mark."""
@@ -51,18 +49,12 @@ class Address:
             **{name: ",".join(f"{value:.2f}" for value in point) for name, point in camera.items()},
         }
         ours = [(name, str(value)) for name, value in values.items() if value is not None]
-        return urlencode([*self.others, *ours], safe=",", quote_via=quote)
+        return urlencode(ours, safe=",", quote_via=quote)
 
 
 def read_address(query: str) -> tuple[Address, list[str]]:
-    """What the address of a page says, and which parts of it mean nothing, in words.
-
-    Args:
-        query: The address behind its question mark, with or without that.
-    """
-    pairs = parse_qsl(query.removeprefix("?"), keep_blank_values=True)
-    values, refused = dict(pairs), []
-    ours = {"elite", "controller", "ghost", "terrain", "episode", "t", "follow", _POSITION, _LOOK_AT}
+    """What the address of a page says behind its question mark, and which parts of it mean nothing, in words."""
+    values, refused = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True)), []
 
     def read(name: str, kind: type[int] | type[float]) -> Any:
         if name not in values:
@@ -83,7 +75,6 @@ def read_address(query: str) -> tuple[Address, list[str]]:
         time_s=read("t", float),
         follow=values.get("follow") == "1",
         camera=None if position is None or look_at is None else (position, look_at),
-        others=tuple(pair for pair in pairs if pair[0] not in ours),
     ), refused
 
 
@@ -100,8 +91,7 @@ def show_query(client: viser.ClientHandle, query: str, *, is_new: bool = False) 
     run_script(client, f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
 
 
-def copy_text(client: viser.ClientHandle, text: str | None) -> None:
-    """Have a browser copy a text, or with None its address; if it may not, it shows that to be copied by hand."""
-    source = "location.href" if text is None else json.dumps(text)
-    run_script(client, f"const text = {source}, ask = () => window.prompt('Copy this', text);"
+def copy_text(client: viser.ClientHandle, text: str) -> None:
+    """Have a browser copy a text; if it may not, it shows that to be copied by hand."""
+    run_script(client, f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
          "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip

@@ -1,15 +1,15 @@
 """*Film this*: the film of an episode, made in a process of its own and offered for download."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import viser
 
 from qd.run.directory import folder_for
-from qd.show.film import FilmCfg
+from qd.show.film import FilmCfg, film
 from qd.show.view.common import Common
 from qd.show.view.recorder import Report
-from qd.show.view.wanted_film import WantedFilm
 from sim.recording.recorder import Recording
 
 
@@ -19,7 +19,7 @@ class Filming:
     def __init__(self, client: viser.ClientHandle, common: Common, say: Callable[[str], None]) -> None:
         """Make none yet; ``say`` shows how far it is, in words."""
         self._client, self._common, self._say = client, common, say
-        self._wanted: WantedFilm | None = None
+        self._wanted: partial[None] | None = None
 
     def begin(self, recording: Recording, replica: int, stem: str, **how: Any) -> None:
         """Film an episode, counted from 0, unless a film is made already; more fields of a film."""
@@ -28,11 +28,8 @@ class Filming:
         opened_run = self._common.show.opened_run
         by = f"-{how['by']}" if how["by"] else ""
         name = f"{stem}{by}-episode-{replica + 1}.mp4"
-        file, cfg = (
-            folder_for(opened_run.path, opened_run.robot.name) / name,
-            FilmCfg(episode=int(recording.replicas[replica])),
-        )
-        self._wanted = WantedFilm(recording=recording, cfg=cfg, file=file, **how)
+        file, cfg = folder_for(opened_run.path, opened_run.robot.name) / name, FilmCfg(episode=replica)
+        self._wanted = partial(film, recording, opened_run.robot, out=file, cfg=cfg, **how)
         self._say("Filming: the film process starts …")
         self._common.films().record(self._wanted, tab=self._client.client_id)
 

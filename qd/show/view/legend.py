@@ -27,7 +27,7 @@ def legend_html() -> str:
                 "commanded velocity, 1 m is 1 m/s": _hex(COMMAND_COLOR),
             }
         ),
-        "Ghost": _swatches({"a second controller, at the same time from the same start": _hex(GHOST_COLOR)}),
+        "Ghost": _swatches({"a second controller at the same time": _hex(GHOST_COLOR)}),
     }
     style = "font-size:0.85em;padding:0.15em 0.6em"
     return "".join(f'<div style="{style}"><b>{name}</b>: {words}</div>' for name, words in rows.items())

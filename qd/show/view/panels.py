@@ -155,7 +155,7 @@ class CrossingPanel:
         self._curves_place = gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True)
         self._curves: Any = None
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, first_view_of)}, post)
-        _add_buttons(gui, "Share", {"copy link": (tab.copy_link,), "copy command": (tab.copy_command,)}, post)
+        _add_buttons(gui, "Share", {"copy command": (tab.copy_command,)}, post)
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.filming.cancel,)}, post)
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):

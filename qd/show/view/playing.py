@@ -47,8 +47,8 @@ class Crossing:
     """Arrow of the velocity command, begin and end [m], shape (F, 2, 3)."""
     penalties: NDArray[np.float64]
     """Scaled sums so far, in the archive's order, shape (F, P)."""
-    touching: NDArray[np.bool_] | None
-    """Whether each recorded geom touches something, shape (F, num_geoms); None if that was not recorded."""
+    touching: NDArray[np.bool_]
+    """Whether each recorded geom touches something, shape (F, num_geoms)."""
     marks: tuple[Mark, ...]
     """As :func:`marks_of` has them."""
     moment_s: float
@@ -94,7 +94,7 @@ def crossing_of(
         forces=np.stack([feet, feet + arrows], axis=2),
         command=_command_arrows(qpos, command),
         penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
-        touching=None if recording.touching is None else recording.touching[0, replica, :frames],
+        touching=recording.touching[0, replica, :frames],
         marks=marks_of(recording, replica),
         moment_s=moment_of_failure(recording, replica),
     )
@@ -136,7 +136,7 @@ def _grows(recording: Recording, replica: int, penalty: str) -> NDArray[np.bool_
 
 
 def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
-    if "collision" in recording.penalty_names or recording.touching is None:
+    if "collision" in recording.penalty_names:
         return _grows(recording, replica, "collision")
     bodies = [k for k, name in enumerate(recording.geom_names) if name not in recording.foot_names]
     touching = recording.touching[0, replica, : int(recording.num_frames[0, replica]), bodies]  # geoms come first

@@ -20,7 +20,7 @@ class Report:
     """How a task goes on."""
 
     wanted: Any
-    """The task: :class:`qd.show.recordings.Wanted`, or :class:`qd.show.view.wanted_film.WantedFilm`."""
+    """The task: :class:`qd.show.recordings.Wanted`, or a film."""
     text: str = ""
     """In words, where its share does not say it."""
     share: float = 0.0

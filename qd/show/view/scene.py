@@ -198,9 +198,8 @@ class Scene:
             self.robot.visible = True
             for handle, position, quaternion in zip(self.bodies, positions, quaternions, strict=True):
                 _place(handle, position, quaternion)
-            touching = crossing.touching
             for part, alone, touched in zip(self._shapes.parts, self.parts, self.touched, strict=True):
-                touched.visible = touching is not None and bool(touching[frame, list(part.touches)].any())
+                touched.visible = bool(crossing.touching[frame, list(part.touches)].any())
                 alone.visible = not touched.visible
             _set_arrow(self._command, crossing.command[frame], shown=True)
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):

@@ -83,7 +83,7 @@ def find_show(
     policies: Sequence[str] = (),
     space: str | None = None,
 ) -> Show:
-    """What a user asks to see.
+    """What a user asks to see, as the command line names it.
 
     Args:
         run: Run directory or archive file; the newest of the robot, else its published one.

@@ -2,13 +2,12 @@
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.synchronize import Event
 from typing import Any
 
 import sim.simulation  # noqa: F401  Newton takes seconds to load: now, and not when somebody waits
-from qd.show.film import film
 from qd.show.recordings import Simulation, Wanted
-from qd.show.view.wanted_film import WantedFilm
 from sim.robots.robot import RobotCfg
 
 
@@ -22,10 +21,10 @@ class Simulator:
     def __init__(self, drop: Event) -> None:
         self._drop = drop
         self._simulation: Simulation | None = None
-        self._tasks = deque[tuple[Wanted | WantedFilm, RobotCfg]]()
+        self._tasks = deque[tuple[Wanted | partial[None], RobotCfg]]()
 
-    def put(self, wanted: Wanted | WantedFilm, robot: RobotCfg) -> None:
-        """Queue a task."""
+    def put(self, wanted: Wanted | partial[None], robot: RobotCfg) -> None:
+        """Queue a crossing, or a film as :func:`qd.show.film.film` makes it."""
         self._tasks.append((wanted, robot))
 
     def take(self, progress: Callable[[float], None]) -> Any:
@@ -38,10 +37,9 @@ class Simulator:
                 raise _DroppedError
 
         try:
-            if isinstance(wanted, WantedFilm):
-                by: Any = {"by": wanted.by, "beside": wanted.beside, "progress": report}
-                film(wanted.recording, robot, wanted.scales, wanted.file, wanted.cfg, **by)
-                return wanted.file
+            if isinstance(wanted, partial):
+                wanted(progress=report)
+                return wanted.keywords["out"]
             self._simulation = self._simulation or Simulation(robot, "cpu")
             return self._simulation([wanted], report)[0]
         except _DroppedError:

@@ -9,7 +9,7 @@ from typing import Any
 
 import viser
 
-from qd.show.crossed import crossed_of, typical_episode
+from qd.show.crossed import crossed_of, episode_beside, typical_episode
 from qd.show.view.address import Address, copy_text, read_address, show_query
 from qd.show.view.bar import Bar
 from qd.show.view.common import Common
@@ -89,7 +89,6 @@ class Tab:
     def go_to(self, query: str) -> None:
         """Show what an address asks for; one that names no time opens just before the robot fails, and plays."""
         show, (address, refused) = self.common.show, read_address(query)
-        self._others = address.others
         for words in refused:
             self.refuse(words)
         first = self.selection.picked if show.elite is None else show.elite
@@ -155,7 +154,6 @@ class Tab:
             time_s=self.clock.time_s if self.robot.crossing is not None else self._begin_s,
             follow=self.scene.follow,
             camera=(position, look_at),
-            others=self._others,
         )
         query = address.query()
         if query != self.query:
@@ -163,12 +161,6 @@ class Tab:
             is_new = before.elite not in (None, address.elite)
             self.query = query
             show_query(self.client, query, is_new=is_new)
-
-    def copy_link(self) -> None:
-        """Have the browser copy the link to what the tab shows."""
-        self.show_address()
-        copy_text(self.client, None)
-        self.client.add_notification("Link copied", "It opens what this tab shows.", auto_close_seconds=3.0)
 
     def copy_command(self) -> None:
         """Have the browser copy the command that replays what the tab shows."""
@@ -347,8 +339,7 @@ class Tab:
         columns = [] if self.minimal else [*self.common.show.listing.columns(self.selection.picked)]
         for crosser in crossers:
             if crosser.recording is not None:
-                crossed = crossed_of(crosser.recording, self._archive.penalties, self._archive.scales)
-                columns.append(column_of(str(crosser.name), crossed))
+                columns.append(column_of(str(crosser.name), crossed_of(crosser.recording)))
         self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
@@ -363,14 +354,17 @@ class Tab:
         self._show_rates()
 
     def _show_ghost(self, words: str = "") -> None:
-        """Show the ghost's crossing of the episode beside the robot's; time lasts as long as the longer one."""
-        self.ghost.show_episode(self.replica or 0)
+        """Show the ghost beside the robot, in the same episode or in one that arrives; the longer one says how long."""
+        replica, recording = self.replica or 0, self.ghost.recording
+        beside = replica if recording is None else episode_beside(recording, replica, self._scales)
+        self.ghost.show_episode(beside)
         crossing, ghost = self.robot.crossing, self.ghost.crossing
         self.scene.hide_ghost()
         if crossing is not None:
             words = self._note if self.ghost.name is None else f"Ghost, {self.ghost.name}: {words or 'is recorded'}"
             if ghost is not None:
-                words = f"Ghost, {self.ghost.name}: {ghost.ending} after {ghost.duration_s:.1f} s"
+                name = f"{self.ghost.name}{f' in episode {beside + 1}' * (beside != replica)}"
+                words = f"Ghost, {name}: {ghost.ending} after {ghost.duration_s:.1f} s"
             self.clock.duration_s = max(crossing.duration_s, 0.0 if ghost is None else ghost.duration_s)
             self.clock.seek(self.clock.time_s)
             self.panel.stretch_curves(self.clock.duration_s)

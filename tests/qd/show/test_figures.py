@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.faults import fresh_numbers
-from qd.show.figures import draw_archive, draw_curves, relief, spread, summary, write_figures
+from qd.show.figures import draw_archive, draw_curves, relief, summary, write_figures
 from tests.builders import fresh_values, small_archive
 
 ROW = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5, "reachable_coverage": 0.1}
@@ -64,28 +64,12 @@ def test_summary_by_hand():
         "elites_reproduced": None, "reachable_cells": 10, "reachable_coverage": 0.3, "qd_score": 63.0,
         "mean_fitness": 1.0, "corrected_elites": None, "mean_std": None, "failing": None, "faults": None,
         "with_collision": 3, "without_collision": 0, "wall_s": 10.0, "gpus": 1, "invalid_episodes": 4,
-        # cells 0 to 2 of two ratios are [0, .1) x [.9, 1], [.1, .2) x [.8, .9) and [.2, .3) x [.7, .8)
-        "spread": {"yaw_rate": [1, 1, 1, 0, 0, 0, 0, 0, 0, 0], "vel_x": [0, 0, 0, 0, 0, 0, 0, 1, 1, 1]},
     }  # fmt: skip
     numbers = summary(archive, rows(4), gpus=1, origin={"seed": 9})
     assert {name: numbers[name] for name in expected} == expected
     fresh = dataclasses.replace(fresh_values(archive), collision_rate=np.zeros(3))
     numbers = summary(dataclasses.replace(archive, fresh=fresh), rows(4), gpus=1, origin={})
     assert fresh_numbers(archive, fresh).items() <= numbers.items() and numbers["with_collision"] == 3  # as found
-
-
-def test_spread_by_hand():
-    # cells 0 to 2 of two ratios are [0, .1) x [.9, 1], [.1, .2) x [.8, .9) and [.2, .3) x [.7, .8)
-    archive = dataclasses.replace(
-        small_archive(4), cell=np.array([0, 0, 1, 2]), collision_rate=np.array([0.0, 0.1, 1.0, 0.0])
-    )
-    counts = spread(archive)
-    assert counts.shape == (2, 10, 2) and counts.sum() == 8
-    assert counts[0, :3].tolist() == [[1, 1], [0, 1], [1, 0]]
-    assert counts[1, 7:].tolist() == [[1, 0], [0, 1], [1, 1]]
-    # a collision bit puts a second copy of the 10 cells behind the first
-    bit = dataclasses.replace(archive, collision_bit=True, cell=np.array([0, 10, 11, 2]))
-    assert np.array_equal(spread(bit), counts)
 
 
 @pytest.mark.parametrize("every", [1, 2])

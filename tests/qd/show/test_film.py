@@ -16,7 +16,6 @@ from qd.show.crossed import moment_of_failure, title_of, typical_episode
 from qd.show.film import Shot, as_gif, as_mp4, follow, pictures_of, pose_at
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
-from sim.recording.file import read_recording
 from sim.recording.renderer import open_context
 from tests.builders import small_archive
 from tests.qd.recordings import recording_of, stand_in_cross
@@ -180,7 +179,7 @@ def film(*argv):
     return run_command(Film, [*argv, "--device", "cpu", "--no-shadows"], name="film")
 
 
-def test_films_of_elites_of_a_map_and_of_recordings(run, capsys):
+def test_films_of_elites_and_of_a_map(run, capsys):
     try:
         open_context(16, 16).free()
     except ValueError as error:
@@ -191,17 +190,12 @@ def test_films_of_elites_of_a_map_and_of_recordings(run, capsys):
     # Episodes of 0.4 s at two pictures a second: one that arrives, and 1 s after it
     films = [run / f"elite-{elite}-{name}.mp4" for elite in (0, 2)]
     assert [imageio_ffmpeg.count_frames_and_secs(str(path))[0] for path in films] == [3, 3]
-    recorded = run / f"elite-2-{name}.recording.npz"
-    recording = read_recording(recorded)
-    assert recording.outcome.shape == (1, 4) and recording.origin["seed"] == 3
     assert "replaced" not in capsys.readouterr().out
-    assert film("--terrain", str(recorded), "--episode", "1", "--out", str(films[0])) == 0
+    assert film("--elite", "2", "--episode", "1", "--out", str(films[0]), *crossing) == 0
     assert "replaced" in capsys.readouterr().out
     assert imageio_ffmpeg.count_frames_and_secs(str(films[0]))[0] == 6  # episode 1 fails: 0.4 s in 1.6 s, and 1 s
     np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
     assert film("--terrain", "hill.npz", "--beside", "shipped", "--gif", *crossing) == 0
-    recording = read_recording(f"runs/terrains/hill.npz-anymal-{name}.recording.npz")
-    assert recording.labels == ("hill.npz",) and (recording.heights == 0).all()
     with Image.open(f"runs/terrains/hill.npz-anymal-{name}.gif") as gif:
         assert gif.size == (480, 270) and gif.n_frames > 1
 
@@ -212,7 +206,6 @@ def test_films_of_elites_of_a_map_and_of_recordings(run, capsys):
         ("--elite 3", "elite 3"),
         ("--episode 20", "episode"),
         ("--run runs/anymal-small-0 --terrain a.npz", "--terrain"),
-        ("--terrain none.recording.npz", "none.recording.npz"),
         ("--beside nobody.pt", "nobody.pt"),
         ("--out film.gif", "out"),
     ],
@@ -220,7 +213,7 @@ def test_films_of_elites_of_a_map_and_of_recordings(run, capsys):
 def test_mistakes_are_refused_before_anything_is_crossed(run, capsys, flags, named):
     assert film(*flags.split()) == 2
     assert named in capsys.readouterr().err
-    assert not list(run.glob("*.mp4")) and not list(run.glob("*.recording.npz"))
+    assert not list(run.glob("*.mp4"))
 
 
 def test_without_opengl_nothing_is_crossed(run, capsys, monkeypatch):

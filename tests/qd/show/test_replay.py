@@ -13,7 +13,7 @@ from qd.archive import write_archive
 from qd.descriptors import Cells
 from qd.run.directory import RunDirectory
 from qd.show.commands import Export, Replay
-from qd.show.crossed import crossed_of, draw_crossing, penalties_by_place
+from qd.show.crossed import crossed_of, draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
@@ -22,9 +22,8 @@ from qd.show.view.show import find_show
 from sim.files.command import run_command
 from sim.files.records import identity, robot_identity
 from sim.policy.spec import controller_hash
-from sim.recording.file import write_recording
 from tests.builders import fresh_values, small_archive
-from tests.qd.recordings import FRAMES, NAMES, recording_of
+from tests.qd.recordings import FRAMES, recording_of
 from tests.qd.searches import CFG
 from tests.qd.show.report.pages import make_run, minimal_of
 
@@ -107,9 +106,6 @@ def test_an_elite_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_ru
     np.testing.assert_array_equal(asked[2].terrain, opened_run.archive.genes[0])
     with pytest.raises(ValueError, match="out"):
         replay(source_of_run(opened_run), out=Path("a.jpg"))
-    write_recording(Path("a.recording.npz"), recording)
-    assert run_command(Replay, ["--terrain", "a.recording.npz", "--device", "cpu"], name="replay") == 0
-    assert json.loads(Path("a.json").read_text())["rates"] == report["rates"] and len(asked) == 3
 
 
 def test_rates_of_ones_own_terrain_with_their_intervals():
@@ -139,7 +135,7 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     made = dataclasses.replace(
         made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
     )
-    numbers = numbers_of(crossed_of(made, NAMES, (1.0,) * 6))
+    numbers = numbers_of(crossed_of(made))
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
     assert numbers["duration_s"] == 10.0  # of 4 and 16
@@ -156,14 +152,9 @@ def test_crossings_in_numbers_by_hand():
     np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])
 
 
-def test_penalties_by_place_add_up_and_the_drawing_has_all_paths():
-    recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0], penalties=np.full((2, 6), 10.0))
-    crossed = crossed_of(recording, NAMES, (1.0,) * 6)
-    amounts = penalties_by_place(crossed, np.array([0.0, 3.0, 16.0]))
-    # the first robot makes a step of 0.5 m twenty times, of which one ends below x = 3; the second stays at 2
-    np.testing.assert_allclose(amounts[:, 0], [(0.5 + 10.0) / 2, 9.5 / 2], rtol=1e-5)
-    np.testing.assert_allclose(amounts.sum(axis=0), 10.0, rtol=1e-5)
-    figure = draw_crossing(crossed, "a hill")
+def test_the_drawing_has_all_paths():
+    recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0])
+    figure = draw_crossing(crossed_of(recording), "a hill")
     axes = figure.axes[0]
     assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 2
     assert axes.images[0].get_array().shape == (161, 321)

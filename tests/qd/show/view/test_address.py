@@ -9,7 +9,7 @@ from qd.show.view.address import Address, read_address
         Address(),
         Address(elite=12, controller="C-G", episode=3, time_s=8.4, follow=True),
         Address(elite=0, controller="as searched & more=50%", time_s=0.0),
-        Address(camera=((1.0, -2.5, 3.25), (4.0, 5.0, 0.0)), others=(("darkMode", ""), ("websocket", "ws://x:1/?a=b"))),
+        Address(camera=((1.0, -2.5, 3.25), (4.0, 5.0, 0.0))),
     ],
 )
 def test_what_an_address_says_comes_back(address):
