@@ -12,8 +12,9 @@ import viser
 from qd.show.recordings import Recordings
 from qd.show.view.bar import Bar
 from qd.show.view.common import Common
+from qd.show.view.meshes import robot_parts
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import SKY, first_view_of, shapes_of
+from qd.show.view.scene import SKY, first_view_of
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
@@ -48,7 +49,7 @@ class App:
         self._record_first(recorder)
         skeleton = Skeleton(show.robot)
         self._common = Common(
-            show=show, skeleton=skeleton, shapes=shapes_of(skeleton, show.robot), recordings=recordings,
+            show=show, skeleton=skeleton, parts=robot_parts(skeleton, show.robot), recordings=recordings,
             recorder=recorder, films=self._films, post=self.post,
         )  # fmt: skip
         self.page = Page(host=host, port=port, label="faultline", verbose=False)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from qd.show.recordings import Recordings
+from qd.show.view.meshes import Part
 from qd.show.view.recorder import Recorder
-from qd.show.view.scene import Shapes
 from qd.show.view.show import Show
 from sim.robots.skeleton import Skeleton
 
@@ -16,7 +16,8 @@ class Common:
 
     show: Show
     skeleton: Skeleton
-    shapes: Shapes
+    parts: list[Part]
+    """Of the robot."""
     recordings: Recordings
     recorder: Recorder
     films: Callable[[], Recorder]

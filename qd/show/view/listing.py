@@ -25,17 +25,6 @@ FITNESS_WORDS = (
     "without a base collision where others have one; whether the robot fails is said by the goal rate"
 )
 """What fitness is, and what it is not."""
-KINDS = {
-    "all": VERDICTS,
-    "faults": ("fault",),
-    "certified": ("certified", "fault"),
-    "confirmed": ("confirmed", "fault"),
-    "failing": VERDICTS[1:],
-    "not failing": ("",),
-}
-"""Kinds of elites to choose from, and their verdicts."""
-MINIMAL = "with a minimal terrain"
-"""One more kind, if there are some."""
 
 Column = tuple[str, int, Mapping[str, int]]
 """A head, a number of episodes, and how many of them each of the :data:`RATES` counts."""
@@ -49,8 +38,6 @@ class Choice:
     """What stops the robot; empty for all."""
     order: str = next(iter(ORDERS))
     """One of the :data:`qd.groups.ORDERS`."""
-    kind: str = "all"
-    """One of the :data:`KINDS`, or :data:`MINIMAL`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,21 +69,8 @@ class Listing:
 
     def listed(self, choice: Choice) -> NDArray[np.int64]:
         """Numbers of the elites that are chosen, in the chosen order."""
-        chosen = self._of_kind(choice.kind)
-        if choice.cause:
-            chosen &= np.isin(np.arange(len(chosen)), self._rows_by_cause[choice.cause])
         order = self._orders[choice.order]
-        return order[chosen[order]]
-
-    def _of_kind(self, kind: str) -> NDArray[np.bool_]:
-        if kind == MINIMAL:
-            return np.isin(self.elites.numbers, [] if self.minima is None else [*self.minima.genes])
-        return np.isin(self.elites.verdict, [VERDICTS.index(verdict) for verdict in KINDS[kind]])
-
-    def kinds(self) -> dict[str, str]:
-        """Kinds of elites by their words with the number of elites."""
-        kinds = [*KINDS] if self.minima is None else [*KINDS, MINIMAL]
-        return {f"{kind} ({int(self._of_kind(kind).sum()):,})": kind for kind in kinds}
+        return order[np.isin(order, self._rows_by_cause[choice.cause])] if choice.cause else order
 
     def causes(self) -> dict[str, str]:
         """What stops the robot by its words with the number of elites; empty for all."""

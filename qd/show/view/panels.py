@@ -109,7 +109,6 @@ class ArchivePanel:
             orders = {words: name for name, words in ORDERS.items()}
             _add_choice(gui, "Cause", listing.causes(), partial(self._choose, "cause"))
             _add_choice(gui, "Sort", orders, partial(self._choose, "order"), f"Fitness is {FITNESS_WORDS}.")
-            _add_choice(gui, "Only", listing.kinds(), partial(self._choose, "kind"))
             self.list, self._map = gui.add_html(""), gui.add_html("")
 
     def _choose(self, name: str, value: str) -> None:
@@ -160,13 +159,6 @@ class CrossingPanel:
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
-        with gui.add_folder("Show", expand_by_default=False):
-            for label, (switch, value) in {
-                "Foot forces": (tab.set_forces, True),
-                "All paths": (tab.scene.switch_paths, True),
-            }.items():
-                box = gui.add_checkbox(label, value)
-                _on_visit(box, lambda value, switch=switch: post(switch, value))
         with gui.add_folder("Legend", expand_by_default=False):
             gui.add_html(legend_html())
         with gui.add_folder("Keys", expand_by_default=False):
@@ -217,7 +209,8 @@ def _add_choice(
 ) -> Any:
     """A choice among values by their words."""
     chooser = gui.add_dropdown(label, tuple(options), hint=hint)
-    _on_visit(chooser, lambda words: act(options[words]))
+    # Only what a visitor sets, and not what this program sets.
+    chooser.on_update(lambda event: act(options[event.target.value]) if event.client is not None else None)
     return chooser
 
 
@@ -225,8 +218,3 @@ def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: 
     """Buttons side by side, each with what the loop is to call."""
     buttons = gui.add_button_group(label, tuple(tasks))
     buttons.on_click(lambda event: post(*tasks[event.target.value]))
-
-
-def _on_visit(handle: Any, act: Callable[[Any], None]) -> None:
-    """Acts on the value that a visitor sets a control to, and not on what this program sets."""
-    handle.on_update(lambda event: act(event.target.value) if event.client is not None else None)

@@ -4,7 +4,7 @@ The process takes seconds to load the simulation. So it is begun before the page
 """
 
 import threading
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
@@ -39,8 +39,6 @@ def build_simulator(drop: Event, num_terrains: int) -> Any:
 class Recorder:
     """Does the tasks that each tab asked for last, the oldest first; earlier ones that are not begun are dropped.
 
-    While nobody waits it records ahead what a tab may ask for next, and drops that when somebody asks for another one.
-
     Args:
         build: Makes what works in the process; a module-level function, since the process imports it by name.
     """
@@ -53,9 +51,7 @@ class Recorder:
         self._build = build
         self._drop = get_context("spawn").Event()
         self._wishes: dict[Hashable, Any] = {}  # by tab, the oldest first
-        self._ahead: list[Any] = []  # the likeliest first
         self._now: Any = None  # the task that is worked on
-        self._awaited = False  # whether a tab waits for it
         self._stopped = False
         self._changed = threading.Condition()
         self._worker, self._is_ready = self._begin(), False
@@ -66,18 +62,8 @@ class Recorder:
         """Do a task for a tab when its turn comes; with None, nothing more for it."""
         with self._changed:
             self._wishes.pop(tab, None)
-            if wanted is not None and wanted == self._now:
-                self._awaited = True
-            elif wanted is not None:
+            if wanted is not None and wanted != self._now:
                 self._wishes[tab] = wanted
-                if self._now is not None and not self._awaited:
-                    self._drop.set()
-            self._changed.notify()
-
-    def record_ahead(self, wanted: Sequence[Any]) -> None:
-        """Record these, in their order, while nobody waits for others; they replace the former ones."""
-        with self._changed:
-            self._ahead = list(wanted)
             self._changed.notify()
 
     def cancel(self, wanted: Any) -> None:
@@ -101,12 +87,10 @@ class Recorder:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or bool(self._wishes or self._ahead))
+                self._changed.wait_for(lambda: self._stopped or bool(self._wishes))
                 if self._stopped:
                     return
-                self._awaited = bool(self._wishes)
-                self._now = self._wishes.pop(next(iter(self._wishes))) if self._awaited else self._ahead.pop(0)
-                wanted = self._now
+                wanted = self._now = self._wishes.pop(next(iter(self._wishes)))
             try:
                 result = self._result_of(wanted)
             except (EvaluatorError, OSError) as error:
@@ -116,19 +100,19 @@ class Recorder:
                     self._worker.stop()
                     self._worker, self._is_ready, result = self._begin(), False, error
             with self._changed:
-                awaited, self._now = self._awaited, None
+                self._now = None
                 self._drop.clear()
                 if result is not None:  # others may have asked for the same meanwhile
                     self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
-            if not isinstance(result, Exception):
-                self.report(Report(wanted=wanted, share=1.0, result=result)) if result is not None else None
-            elif awaited:
+            if isinstance(result, Exception):
                 self.report(Report(wanted=wanted, text=str(result), failed=True))
+            elif result is not None:
+                self.report(Report(wanted=wanted, share=1.0, result=result))
 
     def _result_of(self, wanted: Any) -> Any:
         """What came of a task: its result, an error, or None of one that is dropped."""
         if not self._is_ready:
-            self._tell(wanted, _PREPARING, 0.0)
+            self.report(Report(wanted=wanted, text=_PREPARING))
             self._worker.receive()  # that it is ready
             self._is_ready = True
         self._worker.send(wanted, self.robot)
@@ -136,8 +120,4 @@ class Recorder:
             message, value = self._worker.receive()
             if message == "result":
                 return value
-            self._tell(wanted, "", float(value))
-
-    def _tell(self, wanted: Any, text: str, share: float) -> None:
-        if self._awaited:
-            self.report(Report(wanted=wanted, text=text, share=share))
+            self.report(Report(wanted=wanted, share=float(value)))

@@ -1,7 +1,6 @@
 """The 3-D part of a tab: terrain, start and goal, robot, what touches, arrows and paths."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,12 @@ from qd.show.view.meshes import (
     arrow_pose,
     in_bytes,
     in_linear_light,
-    robot_parts,
     terrain_mesh,
 )
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
-from sim.robots.robot import RobotCfg
-from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
 
 TOUCH_COLOR, FOOT_TOUCH_COLOR = in_bytes(TOUCH), in_bytes(FOOT_TOUCH)
@@ -67,32 +63,17 @@ def first_view_of(width: int, height: int) -> View:
     return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Shapes:
-    """What all tabs show of the robot, in the frames of its bodies."""
-
-    parts: list[Part]
-    num_bodies: int
-    feet: tuple[str, ...]
-    """Their names."""
-
-
-def shapes_of(skeleton: Skeleton, robot: RobotCfg) -> Shapes:
-    """The shapes of a robot."""
-    return Shapes(parts=robot_parts(skeleton, robot), num_bodies=skeleton.num_bodies, feet=robot.foot_geoms)
-
-
 class Scene:
     """What stands in the 3-D view of a tab: at first the robot, unseen."""
 
-    def __init__(self, client: viser.ClientHandle, shapes: Shapes) -> None:
-        self._client, self._shapes, self._cfg = client, shapes, CrossingCfg()
+    def __init__(self, client: viser.ClientHandle, parts: Sequence[Part], num_bodies: int, num_feet: int) -> None:
+        self._client, self._parts, self._num_bodies, self._cfg = client, parts, num_bodies, CrossingCfg()
         scene = client.scene
         self.robot, self.bodies = self._add_bodies("/robot")
         self.parts: list[Any] = []
         self.touched: list[Any] = []
         """What the parts are while they touch; a part and this one are never seen together."""
-        for k, part in enumerate(shapes.parts):
+        for k, part in enumerate(parts):
             name = f"/robot/{part.body}/{k}"
             self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
             color = FOOT_TOUCH_COLOR if part.is_foot else TOUCH_COLOR
@@ -102,21 +83,18 @@ class Scene:
         self._ghost_parts: list[Any] = []  # from when there is a ghost
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
-        self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(len(shapes.feet))]
+        self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(num_feet)]
         self._command = self._add_mesh("/command", arrow, COMMAND_COLOR)
         self.paths: list[Any] = []
-        self._paths_wanted = True
         self._followed: Points | None = None
         self.follow = False
         """Whether the camera goes along with the robot."""
-        self.show_forces = True
-        """Whether forces on the feet are shown."""
 
     def _add_bodies(self, name: str) -> tuple[Any, list[Any]]:
         """A frame that is not visible yet, and a frame in it for each body of the robot."""
         add = self._client.scene.add_frame
         whole = add(name, show_axes=False, visible=False)
-        return whole, [add(f"{name}/{k}", show_axes=False) for k in range(self._shapes.num_bodies)]
+        return whole, [add(f"{name}/{k}", show_axes=False) for k in range(self._num_bodies)]
 
     def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
         """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), and friction and softness."""
@@ -175,14 +153,9 @@ class Scene:
             self.paths = [add("/paths", np.concatenate(ends), visible=False, **look)]
         self._show_paths()
 
-    def switch_paths(self, shown: bool) -> None:
-        """Show or hide the paths of all episodes."""
-        self._paths_wanted = shown
-        self._show_paths()
-
     def _show_paths(self) -> None:
         for handle in self.paths:
-            handle.visible = self._paths_wanted and not self.follow  # near the robot, paths would hide it
+            handle.visible = not self.follow  # near the robot, paths would hide it
 
     def set_follow(self, follow: bool) -> None:
         """Go near the robot and along with it from now on, or stay."""
@@ -198,12 +171,12 @@ class Scene:
             self.robot.visible = True
             for handle, position, quaternion in zip(self.bodies, positions, quaternions, strict=True):
                 _place(handle, position, quaternion)
-            for part, alone, touched in zip(self._shapes.parts, self.parts, self.touched, strict=True):
+            for part, alone, touched in zip(self._parts, self.parts, self.touched, strict=True):
                 touched.visible = bool(crossing.touching[frame, list(part.touches)].any())
                 alone.visible = not touched.visible
-            _set_arrow(self._command, crossing.command[frame], shown=True)
+            _set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
-                _set_arrow(handle, arrow, shown=self.show_forces)
+                _set_arrow(handle, arrow)
         self._go_along(positions[0])
 
     def show_ghost(self, crossing: Crossing, frame: int, name: str = "") -> None:
@@ -211,7 +184,7 @@ class Scene:
         positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
             if not self._ghost_parts:
-                for k, part in enumerate(self._shapes.parts):
+                for k, part in enumerate(self._parts):
                     name_of_part, look = f"/ghost/{part.body}/{k}", {"opacity": _GHOST_OPACITY, "visible": True}
                     self._ghost_parts.append(self._add_mesh(name_of_part, part.mesh, GHOST_COLOR, **look))
             self.ghost.visible = True
@@ -255,14 +228,13 @@ def _place(handle: Any, position: Points, quaternion: Points) -> None:
     handle.position, handle.wxyz = tuple(position), tuple(quaternion)
 
 
-def _set_arrow(handle: Any, arrow: Points, *, shown: bool) -> None:
+def _set_arrow(handle: Any, arrow: Points) -> None:
     """Show an arrow from one point to another, shape (2, 3), unless it has no length."""
-    shown = shown and bool(np.any(arrow[0] != arrow[1]))
-    if shown:
+    handle.visible = bool(np.any(arrow[0] != arrow[1]))
+    if handle.visible:
         handle.wxyz, length = arrow_pose(arrow[0], arrow[1])
         handle.position = tuple(arrow[0])
         handle.scale = (1.0, 1.0, length)
-    handle.visible = shown
 
 
 def _heights_at(heights: Points, places: NDArray[np.floating]) -> Points:

@@ -31,8 +31,6 @@ _ADDRESS_S = 1.0
 """Real time from one update of the address to the next; browsers take no more than some three a second."""
 _SETTLES_S = 3.0
 """How long a browser that has just come may still say where its camera stood before it was moved."""
-_AHEAD_S = 5.0
-"""How long the browser has the machine for itself before neighbours of an elite are recorded."""
 _BEFORE_S = 1.0
 """How long before the robot fails an episode begins to be shown."""
 
@@ -58,9 +56,8 @@ class Tab:
         self.replica: int | None = None  # the typical one of the recording that comes
         self._begin_s: float | None = None  # where the next crossing begins; just before the robot fails if None
         self.query, self._bar_at, self._near_until, self._address_at = "", 0.0, 0.0, time.perf_counter()
-        self._ahead_at = math.inf
         self.robot, self.ghost = Crosser(common, client.client_id), Crosser(common, (client.client_id, "ghost"))
-        self.scene = Scene(client, common.shapes)
+        self.scene = Scene(client, common.parts, common.skeleton.num_bodies, len(show.robot.foot_geoms))
         title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
         self.list = ArchivePanel(client, self.selection, title, self)
         self.filming = Filming(client, common, lambda words: self.panel.show_film(words))
@@ -136,9 +133,6 @@ class Tab:
                 self._show_moment()
         if now - self._address_at > _ADDRESS_S:
             self.show_address()
-        if now > self._ahead_at:
-            self._ahead_at = math.inf
-            self._record_ahead()
 
     def show_address(self) -> None:
         """Have the browser's address say what the tab shows."""
@@ -282,11 +276,6 @@ class Tab:
         self.scene.set_follow(follow)
         self.bar.show({"follow": follow})
 
-    def set_forces(self, shown: bool) -> None:
-        """Show or hide the forces of the feet."""
-        self.scene.show_forces = shown
-        self._show_frame()
-
     def show_report(self, report: Report) -> None:
         """Say how far a recording or film is, and show it, if it is one of this tab."""
         self.filming.take_report(report)
@@ -308,13 +297,6 @@ class Tab:
         self.robot.leave()
         self.ghost.leave()
         self.filming.cancel()
-
-    def _record_ahead(self) -> None:
-        """Have the crossings of the neighbours in the list recorded while nobody waits."""
-        near = dict.fromkeys(self.selection.step(by) for by in (1, -1))
-        crossings = [self.common.show.wanted(number, self.controller, minimal=self._minimal) for number in near]
-        missing = [wanted for wanted in crossings if wanted is not None and self.common.recordings.may_keep(wanted)]
-        self.common.recorder.record_ahead(missing)
 
     def _show_elite(self) -> None:
         show, elite, listing = self.common.show, self.selection.picked, self.common.show.listing
@@ -397,7 +379,6 @@ class Tab:
         self._show_rates()
         self.scene.set_paths(paths_of(recording))
         self._show_episode()
-        self._ahead_at = time.perf_counter() + _AHEAD_S
 
     def _show_episode(self) -> None:
         assert self.replica is not None

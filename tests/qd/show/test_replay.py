@@ -17,7 +17,6 @@ from qd.show.crossed import crossed_of, draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
-from qd.show.view.listing import MINIMAL, Choice
 from qd.show.view.show import find_show
 from sim.files.command import run_command
 from sim.files.records import identity, robot_identity
@@ -240,5 +239,4 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     about = json.loads((tmp_path / "out" / f"minimal-{number}.json").read_text())
     assert about["elite"] == number and about["minimal"]["cause"]["kind"] == "rise"
     show = find_show(run, minimal=str(number), policies=("base=shipped",))
-    assert show.elite == number and f"{MINIMAL} (2)" in show.listing.kinds()
-    assert set(show.listing.listed(Choice(kind=MINIMAL)).tolist()) == set(genes)
+    assert show.elite == number and show.minimal

@@ -42,9 +42,6 @@ class Asked:
     def record(self, wanted, *, tab=0):
         self.wanted.append(wanted)
 
-    def record_ahead(self, wanted):
-        pass
-
     def cancel(self, wanted):
         self.cancelled.append(wanted)
 
@@ -172,7 +169,7 @@ def test_what_one_tab_does_no_other_tab_sees(shown):
         (first.seek, 2.0),
         (first.set_follow, True),
     )
-    first.selection.choose(kind="not failing")
+    first.selection.choose(order="goal_rate")
     first.list.show()
     assert first.playing and not second.playing and not second.scene.follow
     assert second.list.list.content == before != first.list.list.content and second.selection.picked == 171
@@ -222,7 +219,7 @@ def test_what_touches_is_coloured_while_it_touches(shown):
     shank = names.index("RF_SHANK")
     for frame in (int(np.argmax(touching[:, shank])), int(np.flatnonzero(~touching[:, shank])[0])):
         shown.do((tab.seek, 0.02 * frame))
-        parts = zip(tab.common.shapes.parts, tab.scene.parts, tab.scene.touched, strict=True)
+        parts = zip(tab.common.parts, tab.scene.parts, tab.scene.touched, strict=True)
         columns = {column for part, _, touched in parts if touched.visible for column in part.touches}
         assert columns == set(np.flatnonzero(touching[frame]).tolist())
 
@@ -238,15 +235,13 @@ def test_playing_and_dragging_move_the_robot(shown):
         (tab.play, False),
         (tab.set_speed, 0.25),
         (tab.set_follow, True),
-        (tab.set_forces, False),
-        (tab.scene.switch_paths, False),
     )
     assert not tab.clock.playing and tab.clock.speed == 0.25
-    assert not any(arrow.visible for arrow in tab.scene.forces) and not any(path.visible for path in tab.scene.paths)
+    assert not any(path.visible for path in tab.scene.paths)  # they would hide the robot
     arrows = tab.robot.crossing.forces  # 1 mm is 1 N
     pushing = np.linalg.norm(arrows[:, :, 1] - arrows[:, :, 0], axis=2) >= 0.1
     frame = int(np.flatnonzero(pushing.any(axis=1))[0])
-    shown.do((tab.set_forces, True), (tab.seek, 0.02 * frame))
+    shown.do((tab.seek, 0.02 * frame))
     seen = np.array([arrow.visible for arrow in tab.scene.forces])
     assert seen.any() and seen[pushing[frame]].all()
 

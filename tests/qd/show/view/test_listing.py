@@ -4,7 +4,7 @@ import re
 import numpy as np
 
 from qd.show.crossed import crossed_of
-from qd.show.view.listing import KINDS, Choice, column_of, listing_of, table_html
+from qd.show.view.listing import Choice, column_of, listing_of, table_html
 from qd.show.view.panels import Clock, Selection
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
@@ -20,13 +20,11 @@ def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(listing):
     selection.choose(order="goal_rate")
     selection.picked = 3
     assert selection.matching.tolist() == list(range(20)) and selection.step(1) == 4
-    selection.choose(kind="not failing", order="fitness")
-    assert selection.matching.tolist() == list(range(10, 20)) and selection.step(1) == 10  # on from where it was
-    selection.choose(kind="faults")
-    assert selection.matching.tolist() == [] and selection.step(-1) == selection.picked == 3
+    selection.picked = 15  # which does not fail
     cause, rows = next(iter(ranking.by_cause().items()))
-    selection.choose(kind="all", cause=cause)
+    selection.choose(cause=cause, order="fitness")
     assert selection.matching.tolist() == sorted(rows.tolist())  # by fitness, so as they are numbered
+    assert selection.step(1) == selection.picked == 15 and selection.step(-1) == max(rows)  # from where it was
 
 
 def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(listing):
@@ -40,13 +38,6 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(lis
 def test_faults_come_before_certified_confirmed_and_other_failing_elites():
     listing = listing_of(judged_archive(), SUPER_GAUSSIAN)  # fault, confirmed, certified, failing, not failing
     assert listing.listed(Choice(order="fault")).tolist() == [0, 2, 1, 3, 4]
-    listed = {kind: sorted(listing.listed(Choice(kind=kind)).tolist()) for kind in KINDS}
-    assert listed == {
-        "all": [0, 1, 2, 3, 4], "faults": [0], "certified": [0, 2], "confirmed": [0, 1], "failing": [0, 1, 2, 3],
-        "not failing": [4],
-    }  # fmt: skip
-    assert list(listing.kinds()) == ["all (5)", "faults (1)", "certified (2)", "confirmed (2)", "failing (4)",
-                                     "not failing (1)"]  # fmt: skip
     assert "It is a fault" in listing.details(0)
 
 

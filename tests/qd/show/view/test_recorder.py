@@ -61,24 +61,6 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
     assert all(report.wanted.terrain_seed == 5 for report in iter_now(reports))
 
 
-def test_what_may_be_asked_for_next_is_recorded_ahead_and_makes_room(recorder, reports):
-    recorder.record_ahead([wish(1, "droppable"), wish(2, "droppable")])
-    time.sleep(0.5)  # it may be at the first
-    recorder.record(wish(7, "droppable"))
-    received = last_of(reports)  # of what nobody waits for nothing is told but the end
-    assert received[-1].result == "spot: droppable on 7" and {report.wanted.terrain_seed for report in received} <= {
-        0,
-        1,
-        7,
-    }
-    later = last_of(reports)[-1].result
-    assert later in ("spot: droppable on 1", "spot: droppable on 2")  # the other one is dropped, or done before
-    recorder.record_ahead([wish(13)])  # it breaks, and nobody waits for it
-    recorder.record(None)
-    time.sleep(0.3)
-    assert not any(report.failed for report in iter_now(reports))
-
-
 def iter_now(reports):
     while not reports.empty():
         yield reports.get()
