@@ -14,6 +14,12 @@ _NEED_VISER = ("test_app.py", "test_listing.py", "test_address.py", "test_browse
 collect_ignore = [] if find_spec("viser") else list(_NEED_VISER)
 
 
+@pytest.fixture(scope="session")
+def run(published):
+    """The published archive of ANYmal."""
+    return published / "anymal" / "archive"
+
+
 @pytest.fixture
 def listing():
     """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""

@@ -23,11 +23,6 @@ from tests.qd.show.view.visitor import Visitor, serve
 
 
 @pytest.fixture(scope="module")
-def run(published):
-    return published / "anymal" / "archive"
-
-
-@pytest.fixture(scope="module")
 def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
     return find_show(run, elite="0", policies=policies)
