@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from qd.run.directory import RUNS
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -40,7 +40,6 @@ def calibrate(
     seed: int = 0,
     out: Path | None = None,
     cache: Path | None = RUNS / "crossings",
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
 
@@ -61,7 +60,7 @@ def calibrate(
     genes = space.hard_random(most, seed)
     seeds = np.random.SeedSequence(seed).generate_state(most, np.uint32)
     results: list[RolloutResult] = []
-    with Crossings(robot, compute, cache=cache, open_evaluator=open_evaluator) as crossings:
+    with Crossings(robot, compute, cache=cache) as crossings:
         for first in range(0, most, terrains):
             rows, label = slice(first, first + terrains), f"hard-random terrains from {first + 1:,}"
             results.append(

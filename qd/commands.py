@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from msgspec import Meta
 
+from qd.evaluate.labels import SetsCfg
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek
 from sim.files.settings import NonNegativeInt, PositiveInt
@@ -237,7 +238,7 @@ class Calibrate(ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(ControllerFlags, WorkerFlags):
+class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
@@ -260,23 +261,6 @@ class Evaluate(ControllerFlags, WorkerFlags):
     """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped. The
     others are compared with the first. base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind;
     their mean is shown too."""
-    archive: Path | None = None
-    """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
-    independent: Path | None = None
-    """Run of another search, with another seed, or its archive.npz: elites that share no ancestor with those trained
-    on, drawn from all of its elites. They are the terrains of generated_independent."""
-    space: str | None = None
-    """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS, with ground as in
-    course+friction; super_gaussian if left out. If the archive is of a space of your own, name it here."""
-    sets: tuple[str, ...] = ()
-    """Sets of the tables: hand_crafted, hard_random, with --archive generated and generated_far, and with --independent
-    generated_independent. All of them if left out."""
-    terrains: PositiveInt | None = None
-    """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
-    episodes: PositiveInt | None = None
-    """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
-    seed: NonNegativeInt = 0
-    """Draws other test sets."""
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
@@ -284,7 +268,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
-        from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
+        from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
         from qd.evaluate.labels import COMPARED
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
         from qd.evaluate.tables import is_regression
@@ -322,8 +306,7 @@ class Evaluate(ControllerFlags, WorkerFlags):
             if names or self.independent:
                 raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
             names = (COMPARED,)
-        cfg = SetsCfg(names=names, archive=self.archive, independent=self.independent, space=self.space, **size)
-        report = evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)
+        report = evaluate_tables(robot, controllers, replace(self, sets=names), compute=compute, out=self.out)
         return int(compared and is_regression(report))
 
 

@@ -38,7 +38,7 @@ from qd.run.directory import (
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.records import identity
 from sim.policy.spec import ControllerSpec, certifier_hash, spec_of
@@ -258,7 +258,6 @@ def judge(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
@@ -270,9 +269,7 @@ def judge(
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if "others" in stages:
         check_certifiers(certifiers, search, compute.device)
-    with claimed(run), Crossings(
-        search.robot, compute, cache=run / CROSSINGS_FOLDER, open_evaluator=open_evaluator
-    ) as crossings:  # fmt: skip
+    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crossings:
 
         def cross_fresh(terrains: NDArray, seeds: NDArray) -> RolloutResult:
             return crossings.cross(

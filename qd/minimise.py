@@ -19,7 +19,7 @@ from qd.run.directory import claimed
 from qd.show.figures import save_figure
 from qd.show.minimal_figure import draw_minimal
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.bank import heights_of
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import chosen_elites
@@ -44,7 +44,6 @@ def minimise(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
@@ -62,9 +61,7 @@ def minimise(
         check_certifiers(certifiers, search, compute.device)
     terrain_space, half_width = get_space(search.cfg.space, search.cfg.space_sha256), search.robot.footprint[1]
     kind = compute.device.partition(":")[0]
-    with claimed(run), Crossings(
-        search.robot, compute, cache=run / CROSSINGS_FOLDER, open_evaluator=open_evaluator
-    ) as crossings:  # fmt: skip
+    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crossings:
         archive = search.read_archive()
         numbers = _failing(archive, elite, run, _MOST_ELITES[kind])
         on_gpu = kind == "cuda"

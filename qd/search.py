@@ -21,11 +21,9 @@ from qd.show.figures import summary, write_figures
 from qd.workers.evaluator import (
     Compute,
     EvaluatorCfg,
-    OpenEvaluator,
     Pipeline,
     check_policy,
     episode_seeds,
-    open_evaluator,
     origin_of,
 )
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
@@ -51,7 +49,6 @@ def search(
     *,
     robot: RobotCfg | None = None,
     policy: str | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Archive:
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
@@ -89,7 +86,7 @@ def search(
             print(note)
         if done < cfg.iterations:
             try:
-                with open_evaluator(evaluator) as pipeline:
+                with compute.open(evaluator) as pipeline:
                     run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
                     with SearchBar(cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)

@@ -1,6 +1,5 @@
 """README and docs/ are true: commands are taken, code works, links lead somewhere, numbers are those of their files."""
 
-import functools
 import importlib
 import re
 import runpy
@@ -13,6 +12,7 @@ import torch
 import tyro
 
 import faultline
+from qd.workers.evaluator import Compute
 from sim.bank import heights_of
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
@@ -115,9 +115,7 @@ def test_the_script_of_a_page_searches_judges_crosses_and_trains(tmp_path, monke
     (tmp_path / "search.py").write_text("from qd.run.presets import SchedulerCfg\n" + small)
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.chdir(tmp_path)
-    for name in ("search", "judge", "cross"):
-        crossing = functools.partial(getattr(faultline, name), open_evaluator=open_stand_in)
-        monkeypatch.setattr(faultline, name, crossing)
+    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_stand_in(cfg))
     runpy.run_path("search.py", run_name="__main__")
     assert Path("runs/mine-tuned/policy.pt").exists() and "elites" in capsys.readouterr().out
 

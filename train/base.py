@@ -13,13 +13,8 @@ def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> P
     """Trains a controller by PPO on legged_gym's rough-terrain task; returns its file, ``<run_dir>/policy.pt``.
 
     Where the directory holds a checkpoint of the same settings, the training goes on. torchrun may start several
-    processes of it, each with its GPU and ``cfg.num_envs`` robots.
-
-    Args:
-        robot: Who learns.
-        cfg: What, and from which seed.
-        run_dir: Where checkpoint, controller, record and TensorBoard's file go.
-        run: Where and for how long.
+    processes of it, each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and
+    TensorBoard's file; ``run`` says where and for how long.
     """
     deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
     cfg = cfg.sized(robot, device)

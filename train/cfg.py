@@ -156,18 +156,13 @@ class FinetuneCfg(TrainCfg):
 
 @dataclass(frozen=True, kw_only=True)
 class RoundSearchCfg:
-    """Each search of a hardening; what is left out or 0 is the preset's."""
+    """Each search of a hardening."""
 
     preset: str | None = None
     """Size of an iteration: wide (the default on a GPU), paper, or small (the default on the CPU)."""
     episodes: NonNegativeInt = 0
     """Budget in episodes, rounded up to whole iterations; 0: 400,000 on CUDA (5 minutes on one H200), 2,560 on the CPU.
     With fewer, less is found: compare numbers of faults only between searches of the same budget."""
-    emitters: NonNegativeInt = 0
-    batch_size: NonNegativeInt = 0
-    """Terrains that an emitter asks for in an iteration."""
-    replicas: NonNegativeInt = 0
-    """Episodes a terrain."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,13 +45,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
 
     Where the directory holds a checkpoint of the same settings, the training goes on; one that is over is left as it
-    is.
-
-    Args:
-        robot: Who learns.
-        cfg: What, and on which terrains.
-        run_dir: Where checkpoint, controller, record and TensorBoard's file go.
-        run: Where and for how long.
+    is. ``run_dir`` gets checkpoint, controller, record and TensorBoard's file; ``run`` says where and for how long.
     """
     deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
     if Ranks.of_environment().size > 1:
@@ -96,11 +90,8 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     It is the controller of the search, trained further on the elites that it fails, all of them: a certificate is a
     proof of existence, so it may have trained on the terrain. The training works in ``<run>/specialist``.
 
-    Args:
-        robot: Who learns.
-        run: Directory of a search whose elites have fresh episodes.
-        cfg: As of :meth:`FinetuneCfg.specialist`; controller and archive are those of the search.
-        options: Where and for how long.
+    The elites of ``run`` must have fresh episodes. ``cfg`` is as of :meth:`FinetuneCfg.specialist`; controller and
+    archive are those of the search.
     """
     archive = read_elites(run, robot, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]

@@ -23,7 +23,7 @@ from qd.judge import judge
 from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.run.settings import SearchCfg, differences, preset
 from qd.search import search
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.intervals import value_words
@@ -56,7 +56,6 @@ def harden(
     compute: Compute,
     *,
     certifiers: Mapping[str, str] | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Searches for what breaks a controller, trains it on all that was found, and searches again, for some rounds.
 
@@ -64,13 +63,8 @@ def harden(
     validation terrains speak for it; else the next round goes on with the controller before. Every controller is
     evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
 
-    Args:
-        robot: The robot.
-        cfg: Rounds, budgets and seed.
-        run_dir: Where to work; what is done there already is not done again.
-        compute: Where terrains are crossed and robots are trained.
-        certifiers: Controllers by name that judge the searches; those of :func:`qd.judge.judge` if None.
-        open_evaluator: Opens simulations.
+    What ``run_dir`` has done already is not done again. ``certifiers`` are controllers by name that judge the searches;
+    those of :func:`qd.judge.judge` if None.
 
     Returns:
         The content of ``rounds.json``, which is written after each round: the counts of all searches, which trainings
@@ -79,7 +73,7 @@ def harden(
     cfg, content = _begin(robot, cfg, run_dir, compute)
     hardening = _Hardening(
         robot=robot, cfg=cfg, path=run_dir, compute=compute, space=load_space(cfg.space),
-        certifiers=certifiers, open_evaluator=open_evaluator, content=content,
+        certifiers=certifiers, content=content,
         policies={"base": cfg.policy or str(robot.policy_file)}, start=cfg.policy,
     )  # fmt: skip
     hardening.search_cfg(0, cfg.policy)  # refuses what no search can be
@@ -136,7 +130,6 @@ class _Hardening:
     compute: Compute
     space: TerrainSpace
     certifiers: Mapping[str, str] | None
-    open_evaluator: OpenEvaluator
     content: dict[str, Any]
     """What ``rounds.json`` has."""
     policies: dict[str, str]
@@ -186,7 +179,7 @@ class _Hardening:
         sets = self._sets(searches, "validation")
         results = cross_sets(
             controllers, sets, robot=self.robot, compute=self.compute, episodes=self.cfg.evaluation.episodes,
-            reward=True, cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+            reward=True, cache=self.path / "crossings",
         )  # fmt: skip
         goal: dict[str, dict[str, float]] = {}
         for when in controllers:
@@ -211,11 +204,8 @@ class _Hardening:
         print(f"\n=== {name}: search, in {run}", flush=True)
         policy = self.policies[name]
         cfg = self.search_cfg(number, self.cfg.policy if policy == self.policies["base"] else policy)
-        search(cfg, run, self.compute, robot=self.robot, open_evaluator=self.open_evaluator)
-        settings: dict[str, Any] = {
-            "compute": self.compute, "robot": self.robot.spec, "space": self.space.name,
-            "open_evaluator": self.open_evaluator,
-        }  # fmt: skip
+        search(cfg, run, self.compute, robot=self.robot)
+        settings: dict[str, Any] = {"compute": self.compute, "robot": self.robot.spec, "space": self.space.name}
         if self.cfg.specialists and judge(run, stages=("fresh",), **settings).failing.any():
             specialist = replace(FinetuneCfg.specialist(self.robot), space=self.space.name)
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
@@ -231,13 +221,9 @@ class _Hardening:
         on_cuda, size = self.compute.device.startswith("cuda"), self.cfg.search
         named = size.preset or ("wide" if on_cuda else "small")
         cfg = preset(named, self.robot, policy, space=self.space.name, space_sha256=self.space.sha256)
-        scheduler = replace(
-            cfg.scheduler, emitters=size.emitters or cfg.scheduler.emitters,
-            batch_size=size.batch_size or cfg.scheduler.batch_size,
-        )  # fmt: skip
-        cfg = replace(cfg, seed=self._seed(number), replicas=size.replicas or cfg.replicas, scheduler=scheduler)
         usual = _GPU_EPISODES if on_cuda else cfg.iterations * cfg.episodes_per_iteration
-        return replace(cfg, iterations=-(-(size.episodes or usual) // cfg.episodes_per_iteration))
+        iterations = -(-(size.episodes or usual) // cfg.episodes_per_iteration)
+        return replace(cfg, seed=self._seed(number), iterations=iterations)
 
     def evaluate(self) -> None:
         """Evaluates all controllers so far, and writes ``rounds.json`` where these rounds are not all in it."""
@@ -245,7 +231,7 @@ class _Hardening:
             return
         tables = evaluate(
             self.policies, self._sets(self._searches(), "test"), robot=self.robot, compute=self.compute,
-            episodes=self.cfg.evaluation.episodes, cache=self.path / "crossings", open_evaluator=self.open_evaluator,
+            episodes=self.cfg.evaluation.episodes, cache=self.path / "crossings",
         )  # fmt: skip
         self.content |= {"rounds": self.rows, "choices": self.choices, "tables": dict(tables)}
         write_atomically(self.path / ROUNDS_FILE, to_json(self.content))

@@ -13,7 +13,7 @@ from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.command import publish
 from sim.files.figures import as_png
 from sim.files.intervals import value_words, wilson_interval
@@ -40,7 +40,6 @@ def measure_dose(
     episodes: int | None = None,
     seed: int = 0,
     out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Lets every controller cross every value of every dose; prints, writes and draws what came of it.
 
@@ -60,7 +59,7 @@ def measure_dose(
         sets = {name: dose_set(name, dose, count, seed) for name, dose in doses.items()}
         results = cross_sets(
             controllers, sets, robot=robot, compute=compute, episodes=episodes,
-            how="resolved" if resolved else "searched", cache=crossings_folder(robot), open_evaluator=open_evaluator,
+            how="resolved" if resolved else "searched", cache=crossings_folder(robot),
         )  # fmt: skip
         rows = {
             (name, controller): rows_of(name, dose, controller, results[name][controller])

@@ -2,14 +2,13 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from qd.archive import ARCHIVE_FILE, Archive
-from qd.evaluate.labels import COMPARED, HELD_OUT
+from qd.evaluate.labels import COMPARED, HELD_OUT, SetsCfg
 from qd.evaluate.marks import check_untrained, recorded_marks
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
 from qd.evaluate.sets import (
@@ -26,7 +25,7 @@ from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Tables, check_seeds, make_tables
 from qd.run.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.command import publish
 from sim.files.records import identity, robot_identity
 from sim.policy.spec import controller_hash, crosser_name, name_of, spec_of
@@ -41,27 +40,6 @@ EPISODES = 20
 RATE_TERRAINS = 300
 """Terrains a set of the published rates; tables take the paper's (:func:`qd.evaluate.sets.paper_terrains`)."""
 _SMALL = (24, 4)  # terrains a set and episodes a terrain on a machine without a GPU
-
-
-@dataclass(frozen=True, kw_only=True)
-class SetsCfg:
-    """Which terrains controllers are evaluated on, and how often they cross them."""
-
-    names: tuple[str, ...] = ()
-    """Some of :data:`qd.evaluate.labels.SETS`; all that can be had if empty. ``elites`` alone: those of the archive
-    that no controller was trained on, to compare ``old`` and ``new``."""
-    archive: Path | None = None
-    """Run of a search, or its archive file: its held-out elites are the generated terrains."""
-    independent: Path | None = None
-    """Run of another search, or its archive file, for ``generated_independent``."""
-    space: str | None = None
-    """Terrain space of the hard-random terrains, by name; super_gaussian if None."""
-    terrains: int | None = None
-    """A set; by default as many as suit the device."""
-    episodes: int | None = None
-    """On each terrain; by default as many as suit the device."""
-    seed: int = 0
-    """Draws the sets."""
 
 
 def sizes_for(
@@ -91,7 +69,6 @@ def cross_sets(
     reward: bool = False,
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, dict[str, RolloutResult]]:
     """Lets every controller cross every set, as :meth:`qd.workers.cross.Crossings.cross` does; prints how each fared.
 
@@ -100,7 +77,7 @@ def cross_sets(
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))
-    with Crossings(robot, compute, cache=cache, open_evaluator=open_evaluator) as crossings:
+    with Crossings(robot, compute, cache=cache) as crossings:
         for controller, policy in controllers.items():
             for name, terrains in sets.items():
                 label = f"{controller} on {name}" + (f" ({how})" if how != "searched" else "")
@@ -123,7 +100,6 @@ def evaluate(
     episodes: int = EPISODES,
     seed: int = 0,
     cache: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> Tables:
     """The tables of controllers on sets of terrains.
 
@@ -131,11 +107,10 @@ def evaluate(
         controllers: Policy of each by its name; ``shipped`` is the robot's own.
         sets: Sets by name (:func:`qd.evaluate.sets.make_sets`); 24 hand-crafted and 24 hard-random terrains if None.
         robot: The robot, or its name or settings file.
-        compute: Where terrains are crossed; by default on the CPU.
+        compute: By default the CPU.
         episodes: On each terrain.
         seed: Of bootstraps.
         cache: Folder where crossings are stored and found again.
-        open_evaluator: Opens simulations.
     """
     robot, compute = get_robot(robot), compute or Compute()
     sets = sets or make_sets((), _SMALL[0], seed)
@@ -144,7 +119,6 @@ def evaluate(
     scales = robot.read_penalty_scales(others[0] if others else None)
     results = cross_sets(
         controllers, sets, robot=robot, compute=compute, episodes=episodes, reward=True, cache=cache,
-        open_evaluator=open_evaluator,
     )  # fmt: skip
     crossed = {
         name: {controller: measure(result, scales) for controller, result in row.items()}
@@ -164,7 +138,6 @@ def evaluate_tables(
     *,
     compute: Compute,
     out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """The tables of controllers with where their terrains come from; prints and writes them.
 
@@ -181,10 +154,10 @@ def evaluate_tables(
     check_seeds(controllers)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
-    if cfg.names == (COMPARED,) and archive is not None:
+    if cfg.sets == (COMPARED,) and archive is not None:
         sets = {COMPARED: _untrained_elites(archive, controllers, terrains, cfg)}
     else:
-        sets = make_sets(cfg.names, terrains, cfg.seed, archive=archive, independent=independent, space=space)
+        sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent, space=space)
     for name in set(HELD_OUT).intersection(sets):
         check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for the test")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
@@ -202,7 +175,7 @@ def evaluate_tables(
     def make() -> dict[str, Any]:
         tables = evaluate(
             controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed,
-            cache=crossings_folder(robot), open_evaluator=open_evaluator,
+            cache=crossings_folder(robot),
         )  # fmt: skip
         origin = origin_of(compute.device, cfg.seed, compute.workers)
         return {**origin, **robot_identity(robot), "space": space.name, **about, **tables}
@@ -241,7 +214,6 @@ def evaluate_rates(
     space: str | None = None,
     seed: int = 0,
     out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Rates of one controller on hand-crafted and hard-random terrains and its velocity error on flat ground.
 
@@ -257,7 +229,7 @@ def evaluate_rates(
     def make() -> dict[str, Any]:
         results = cross_sets(
             {controller: policy}, sets, robot=robot, compute=compute, episodes=episodes,
-            penalties_from_s=VELOCITY_FROM_S, cache=crossings_folder(robot), open_evaluator=open_evaluator,
+            penalties_from_s=VELOCITY_FROM_S, cache=crossings_folder(robot),
         )  # fmt: skip
         hand_crafted, hard_random, flat = (results[name][controller] for name in sets)
         types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels

@@ -1,4 +1,9 @@
-"""Words for what an evaluation reports: sets of terrains, measures, and what became of a terrain."""
+"""Words for what an evaluation reports: sets of terrains, measures, and what became of a terrain; settings of sets."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim.files.settings import NonNegativeInt, PositiveInt
 
 HELD_OUT = ("generated", "generated_far")
 """Sets of elites held out of training: all, and the third that lies farthest from those trained on."""
@@ -30,3 +35,26 @@ RATES = ("goal", "success", "fallen", *CERTIFIED)
 """Measures that lie between 0 and 1, and so do their intervals."""
 FATES = {fate: fate.replace("_", " ") for fate in ("mended", "still_failing", "newly_broken", "fine")}
 """What may have become of a terrain from one controller to another: failed by the first, both, the second, neither."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SetsCfg:
+    """Which terrains controllers are evaluated on, and how often they cross them."""
+
+    archive: Path | None = None
+    """Run of a search, or its archive.npz: its held-out elites are the generated terrains."""
+    independent: Path | None = None
+    """Run of another search, with another seed, or its archive.npz: elites that share no ancestor with those trained
+    on, drawn from all of its elites. They are the terrains of generated_independent."""
+    space: str | None = None
+    """Terrain space of the hard-random terrains: super_gaussian, course, or file.py:CLASS, with ground as in
+    course+friction; super_gaussian if left out. If the archive is of a space of your own, name it here."""
+    sets: tuple[str, ...] = ()
+    """Sets of the tables: hand_crafted, hard_random, with --archive generated and generated_far, and with --independent
+    generated_independent. All of them if left out."""
+    terrains: PositiveInt | None = None
+    """Terrains a set; 300 on CUDA (tables of Cassie: 180), 24 on the CPU."""
+    episodes: PositiveInt | None = None
+    """Episodes a terrain; 20 on CUDA, 4 on the CPU."""
+    seed: NonNegativeInt = 0
+    """Draws other test sets."""

@@ -77,12 +77,7 @@ def count_outcomes(result: RolloutResult) -> dict[str, int]:
 
 
 def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
-    """Everything that the tables say of crossings.
-
-    Args:
-        result: Crossings of T terrains, with their reward.
-        scales: Scale of each penalty, in the result's order.
-    """
+    """Everything that the tables say of crossings with their reward; ``scales`` are of the penalties in order."""
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
     counted = counted_episodes(result.invalid)
@@ -128,11 +123,7 @@ def summarise(
 def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
     """Error of v_x from 2 s to the end of each valid episode [m/s], base frame: the root of its mean square over time.
 
-    ``vx_error_mean`` is the mean of the episodes' errors.
-
-    Args:
-        result: Crossings whose penalties were summed from :data:`VELOCITY_FROM_S` on.
-        seed: Of the bootstrap.
+    ``vx_error_mean`` is the mean of the episodes' errors. Penalties must be summed from :data:`VELOCITY_FROM_S` on.
     """
     counted_s = result.duration_s - VELOCITY_FROM_S
     usable = ~result.invalid & (counted_s > 0.0)

@@ -27,7 +27,7 @@ from qd.groups import families_of, rank, verdict_of
 from qd.judge import certifiers_of, find_search
 from qd.minima import read_minimal
 from qd.run.directory import RUNS
-from qd.workers.evaluator import Compute, OpenEvaluator, check_policy, open_evaluator, origin_of
+from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
@@ -90,7 +90,6 @@ def evaluate_pack(
     episodes: int | None = None,
     seed: int = 0,
     out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Tests one controller on a pack: prints what fails beside the rates of the pack's controllers, and writes it.
 
@@ -107,7 +106,7 @@ def evaluate_pack(
     def measure() -> dict[str, Any]:
         result = cross_sets(
             {controller: policy}, {"pack": chosen}, robot=robot, compute=compute, episodes=episodes,
-            cache=crossings_folder(robot), open_evaluator=open_evaluator,
+            cache=crossings_folder(robot),
         )["pack"][controller]  # fmt: skip
         abouts = with_rates(known, {"this": result})
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
@@ -146,7 +145,6 @@ def make_pack(
     episodes: int = EPISODES,
     seed: int = 0,
     out: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, Any]:
     """Chooses terrains of a judged run, lets controllers cross them, and writes the pack.
 
@@ -162,7 +160,6 @@ def make_pack(
         episodes: On each terrain.
         seed: Draws the episodes.
         out: Folder to write to; under runs/ if None.
-        open_evaluator: Opens simulations.
 
     Returns:
         The content of ``pack.json``.
@@ -191,7 +188,7 @@ def make_pack(
     def measure() -> dict[str, Any]:
         crossed = cross_sets(
             controllers, {"pack": pack_set(heights, len(heights), seed)}, robot=body, compute=compute,
-            episodes=episodes, cache=crossings_folder(body), open_evaluator=open_evaluator,
+            episodes=episodes, cache=crossings_folder(body),
         )["pack"]  # fmt: skip
         abouts = with_rates([candidates[place][0] for place in chosen], crossed)
         return {

@@ -276,16 +276,11 @@ def make_sets(
     space: TerrainSpace = SUPER_GAUSSIAN,
     part: Part = "test",
 ) -> dict[str, TerrainSet]:
-    """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`.
+    """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; all that can be had if unnamed.
 
-    Args:
-        names: Some of these sets; all that can be had if empty.
-        count: Terrains a set; of generated ones fewer where the archive holds out fewer.
-        seed: Draws the sets.
-        archive: Elites for ``generated`` and ``generated_far``.
-        independent: Elites for ``generated_independent``.
-        space: Of the hard-random ones.
-        part: What the terrains are for.
+    A set has ``count`` terrains, of generated ones fewer where the archive holds out fewer. ``archive`` has the elites
+    for ``generated`` and ``generated_far``, ``independent`` for ``generated_independent``. ``space`` is that of the
+    hard-random ones.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]

@@ -38,13 +38,6 @@ def _rate_cells(row: Mapping[str, Any]) -> list[str]:
     return [value_words(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in _RATES]
 
 
-def _show_invalid(outcomes: Mapping[str, Mapping[str, int]]) -> None:
-    for label, counts in outcomes.items():
-        if counts["invalid"]:
-            share = counts["invalid"] / sum(counts.values())
-            print(f"{label}: {counts['invalid']} episodes are invalid ({share:.1%}) and left out; they may be failures")
-
-
 def show_rates(report: dict[str, Any]) -> None:
     """Prints the rates of one controller, as ``base.json`` has them."""
     sets, rows = {SETS[name]: report[name] for name in ("hand_crafted", "hard_random")}, []
@@ -55,7 +48,6 @@ def show_rates(report: dict[str, Any]) -> None:
     show_table(report["policy"], (*_heads(_RATES), "terrains"), rows)
     error = value_words(report["flat"]["vx_error_mean"], None)
     print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
-    _show_invalid({label: group["outcomes"] for label, group in sets.items()})
 
 
 def show_tables(report: dict[str, Any]) -> None:
@@ -77,8 +69,6 @@ def show_tables(report: dict[str, Any]) -> None:
     if rows:
         title = "terrains on which under half of the episodes reach the goal; in brackets beyond chance"
         show_table(title, ("", "mended", "newly broken", "still failing", "of", "gain of the goal rate"), rows)
-    outcomes = report["outcomes"].items()
-    _show_invalid({f"{controller} on {name}": counts for name, row in outcomes for controller, counts in row.items()})
 
 
 def show_comparison(report: dict[str, Any]) -> None:

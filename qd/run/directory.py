@@ -40,13 +40,9 @@ Metrics = list[dict[str, Any]]
 def find_run(
     robot: RobotCfg, named: Path | None = None, *, published: Literal["never", "last", "first"] = "last"
 ) -> Path:
-    """The run to work on: the one that is named, else one of a robot.
+    """The run to work on: the one that is named, else the run of a robot under runs/ whose archive changed last.
 
-    Args:
-        robot: The robot.
-        named: Run directory or archive file.
-        published: Whether the robot's published archive is taken where there is no run under runs/, before these, or
-            never. Of the runs it is the one whose archive changed last.
+    ``published`` says when the robot's published archive is taken: where there is no such run, before it, or never.
     """
     if named is not None:
         return named
@@ -78,10 +74,7 @@ def search_seed(run: Path) -> int | None:
 def read_archive_of(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
     """An archive whose terrains a robot can cross; one of the robot's own must be of the robot as it is now.
 
-    Args:
-        robot: The robot.
-        run: Run directory or archive file.
-        space: Terrain space that the command line names, for one of a user's own.
+    ``space`` is the terrain space that the command line names, for one of a user's own.
     """
     archive = read_archive(run)
     check_space(archive, space)
@@ -105,10 +98,6 @@ def folder_for(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
 
     That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
-
-    Args:
-        run: Run directory or archive file.
-        robot: Name of its robot.
     """
     folder = directory_of(run)
     if RESULTS.resolve() not in folder.resolve().parents:
@@ -125,11 +114,7 @@ def free_path(name: str) -> Path:
 
 @contextmanager
 def claimed(path: Path) -> Iterator[None]:
-    """Makes a run directory if need be and keeps other commands out of it.
-
-    Args:
-        path: The directory; if it was made here and is still empty at the end, it is removed again.
-    """
+    """Makes a run directory if need be and keeps other commands out of it; one that stays empty is removed again."""
     if not str(path).isprintable():
         raise ValueError(f"run directory {str(path)!a} must have a name of printable characters: rename it")
     is_new = not os.path.exists(path)
@@ -176,12 +161,9 @@ class RunDirectory:
             raise ValueError(f"{self.path / CONFIG_FILE}: {error}; {_REMEDY}") from None
 
     def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
-        """Writes what the run is asked to do from now on.
+        """Writes what the run is asked to do from now on, after ``done`` iterations.
 
-        Args:
-            cfg: The search.
-            origin: Provenance of this session; of the first one it is the run's.
-            done: Iterations done before.
+        ``origin`` is the provenance of this session; of the first one it is the run's.
         """
         config = self.read_config() if self.exists() else {**origin, "sessions": []}
         session = {name: origin[name] for name in ("command", "commit", "device")} | {"from_iteration": done}
@@ -192,11 +174,7 @@ class RunDirectory:
     def save(self, cfg: SearchCfg, state: dict[str, Any], metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it.
 
-        Args:
-            cfg: The run's settings, so that a checkpoint that strayed here is noticed.
-            state: State of the scheduler after ``tell``.
-            metrics: All rows up to this iteration.
-            archive: What the search has found.
+        ``state`` is that of the scheduler after ``tell``. The settings let a checkpoint that strayed here be noticed.
         """
         save_checkpoint(self.path / CHECKPOINT_FILE, {"settings": as_settings(cfg), "metrics": metrics, **state})
         self.write_derived(metrics, archive)
@@ -208,14 +186,10 @@ class RunDirectory:
         write_archive(self.path / ARCHIVE_FILE, archive)
 
     def load(self, cfg: SearchCfg) -> tuple[dict[str, Any], Metrics] | None:
-        """State of the scheduler and metrics of the search as its checkpoint has it.
+        """State of the scheduler and metrics of the search that is to go on, as its checkpoint has it.
 
-        Args:
-            cfg: The search that is to go on.
-
-        Returns:
-            None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
-            something else in the directory, is a ValueError.
+        None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
+        something else in the directory, is a ValueError.
         """
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):

@@ -39,10 +39,7 @@ def describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers:
 class Bar:
     """How far work is, on stderr: one line of a terminal, with the time left first; elsewhere a line every 30 s.
 
-    Args:
-        text: What is done.
-        total: Position at which all is done.
-        done: Position at which this work begins.
+    The work begins at position ``done`` and ends at ``total``.
     """
 
     def __init__(self, text: str, total: float = 1.0, done: float = 0.0) -> None:

@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
 from qd.run.progress import share_bar
-from qd.workers.evaluator import (
-    Compute,
-    EvaluatorCfg,
-    OpenEvaluator,
-    Pipeline,
-    open_evaluator,
-    parse_workers,
-)
+from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import write_atomically
@@ -57,9 +50,7 @@ _ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_
 class Cache:
     """Arrays in the files of a folder, by key. A damaged file counts as absent, in a printed line.
 
-    Args:
-        folder: Where they are; made when the first is written.
-        most_bytes: Size above which the files that were not used for longest are removed.
+    Above ``most_bytes`` the files that were not used for longest are removed.
     """
 
     def __init__(self, folder: Path, *, most_bytes: int = MOST_BYTES) -> None:
@@ -170,11 +161,7 @@ def _row_keys(terrains: NDArray[Any], seeds: NDArray[Any]) -> list[bytes]:
 class Crossings:
     """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
 
-    Args:
-        robot: The robot.
-        compute: Where terrains are crossed.
-        cache: Folder of the crossings that are done; None to store nothing.
-        open_evaluator: Opens simulations.
+    Crossings that are done are stored in the folder ``cache``, if there is one.
     """
 
     def __init__(
@@ -183,12 +170,10 @@ class Crossings:
         compute: Compute,
         *,
         cache: Path | None = None,
-        open_evaluator: OpenEvaluator = open_evaluator,
     ) -> None:
         self.robot, self.compute = get_robot(robot), compute
         self._cache = None if cache is None else Cache(cache)
         self._stored: dict[str, _Stored] = {}
-        self._open_evaluator = open_evaluator
         self._stack = ExitStack()
         self._opened: tuple[EvaluatorCfg, Pipeline] | None = None
 
@@ -228,7 +213,7 @@ class Crossings:
             seeds: One a terrain, shape (B,), uint32.
             replicas: Episodes a terrain.
             space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
-            how: What crosses them.
+            how: Physics of the crossing.
             reward: Whether the training task's reward is summed too.
             penalties_from_s: Penalties are summed from this time of an episode on [s].
             label: What is crossed, for the progress bar.
@@ -238,9 +223,6 @@ class Crossings:
         Returns:
             One row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C tells
             neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
-
-        Raises:
-            EvaluatorError: If a worker is lost.
         """
         if seeds.shape != (len(terrains),):
             raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")
@@ -317,7 +299,7 @@ class Crossings:
             if replace(opened, num_terrains=cfg.num_terrains) == cfg and room >= cfg.num_terrains:
                 return pipeline
         self.close()
-        pipeline = self._stack.enter_context(self._open_evaluator(cfg))
+        pipeline = self._stack.enter_context(self.compute.open(cfg))
         self._opened = (cfg, pipeline)
         return pipeline
 
@@ -352,14 +334,13 @@ def cross(
     reward: bool = False,
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
-    open_evaluator: OpenEvaluator = open_evaluator,
 ) -> dict[str, RolloutResult]:
     """Lets each controller cross each terrain several times: one result a controller, by its name.
 
     Arguments are those of :class:`Crossings` and :meth:`Crossings.cross`; without ``compute`` the CPU crosses, by a
     process a core.
     """
-    with Crossings(robot, compute or Compute(), cache=cache, open_evaluator=open_evaluator) as crossings:
+    with Crossings(robot, compute or Compute(), cache=cache) as crossings:
         return {
             name: crossings.cross(
                 spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how,
@@ -378,13 +359,9 @@ def _lot_size(cfg: EvaluatorCfg) -> int:
 def _in_order(parts: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> RolloutResult:
     """One result of parts that hold some of the terrains each."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
-    return take_terrains(join_results([result for _, result in parts], join=1), order)
-
-
-def take_terrains(result: RolloutResult, numbers: NDArray[np.intp]) -> RolloutResult:
-    """The rows of some terrains, in the order given; steps and time stay those of all."""
+    result = join_results([result for _, result in parts], join=1)
     arrays = {field.name: getattr(result, field.name) for field in fields(result)}
-    return replace(result, **{name: value[numbers] for name, value in arrays.items() if isinstance(value, np.ndarray)})
+    return replace(result, **{name: value[order] for name, value in arrays.items() if isinstance(value, np.ndarray)})
 
 
 def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutResult:

@@ -148,18 +148,15 @@ class Compute:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         return cls(resolve_device(device, workers), workers, num_envs)
 
+    def open(self, cfg: EvaluatorCfg) -> AbstractContextManager["Pipeline"]:
+        """Opens what crosses terrains."""
+        return open_evaluator(cfg)
+
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
-    """Seeds of the terrains of one evaluation; the same for the same numbers, so that a resumed search repeats nothing.
+    """Seeds of the terrains of one evaluation, shape (count,); the same for the same numbers.
 
-    Args:
-        seed: The run's seed.
-        iteration: Number of the evaluation.
-        count: Number of terrains.
-        stream: Set apart what must not share its episodes with the search.
-
-    Returns:
-        One seed a terrain, shape (count,).
+    So a resumed search repeats nothing. Another ``stream`` shares no episodes with the search.
     """
     sequence = np.random.SeedSequence([seed, iteration], spawn_key=(stream,) if stream else ())
     return sequence.generate_state(count, np.uint32).astype(np.uint32)
@@ -171,12 +168,7 @@ def available_cores() -> int:
 
 
 def resolve_device(name: str | None, workers: str | None = None) -> str:
-    """Warp device name; None means CUDA where there is one, else the CPU.
-
-    Args:
-        name: What the user asked for.
-        workers: Who works there, as :func:`parse_workers` takes it; the devices of a cluster are meant on Ray.
-    """
+    """Warp device name, on Ray of the cluster; None means CUDA where there is one, else the CPU."""
     on_ray, count = parse_workers(workers)
     if on_ray:
         return _ray_workers().cluster_device(name, count)
@@ -228,17 +220,13 @@ def _ray_workers() -> Any:
 
 
 Build = Callable[[EvaluatorCfg, int], Crosser]
-OpenEvaluator = Callable[[EvaluatorCfg], AbstractContextManager["Pipeline"]]
-"""Opens what crosses terrains, as :func:`open_evaluator` does."""
 
 
 @contextmanager
 def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterator["Pipeline"]:
     """Builds the simulation, in as many processes as there is work for or on a Ray cluster, and keeps it until the end.
 
-    Args:
-        cfg: What, with what, where.
-        build: Makes the simulation; a module-level function, since processes import it by name.
+    ``build`` makes it; a module-level function, since processes import it by name.
     """
     if parse_workers(cfg.workers).on_ray:
         with _ray_workers().open_ray_workers(cfg, build) as workers:
@@ -264,11 +252,8 @@ def open_evaluator(cfg: EvaluatorCfg, *, build: Build = build_rollout) -> Iterat
 class Pipeline:
     """Evaluates any number of terrains: lots of them are put in, and come out in the same order.
 
-    Robots go on with the lots behind while the last robots of the first one still walk.
-
-    Args:
-        num_terrains: Terrains that may be under way at once.
-        crosser: The simulation, in this process; subclasses have others.
+    Robots go on with the lots behind while the last robots of the first one still walk. At most ``num_terrains`` are
+    under way at once. ``crosser`` is the simulation in this process; subclasses have others.
     """
 
     def __init__(self, num_terrains: int, crosser: Any = None) -> None:
@@ -294,13 +279,7 @@ class Pipeline:
     def __call__(
         self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
     ) -> RolloutResult:
-        """Crosses each terrain once a replica; nothing else may be under way.
-
-        Args:
-            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
-            seeds: One a terrain, uint32.
-            progress: Called now and then with the share that is done.
-        """
+        """Crosses each terrain once a replica, as :meth:`in_lots` does; all in one result."""
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
         return join_results([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
@@ -311,10 +290,10 @@ class Pipeline:
         """Crosses each terrain once a replica, in lots; nothing else may be under way.
 
         Args:
-            terrains: As of a call, and so are seeds and progress.
-            seeds: One a terrain.
+            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
+            seeds: One a terrain, uint32.
             size: Terrains of a lot.
-            progress: Called with the share that is done.
+            progress: Called now and then with the share that is done.
 
         Yields:
             Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.

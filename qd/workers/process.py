@@ -40,12 +40,9 @@ class Crosser(Protocol):
 
 
 class WorkerProcess:
-    """A process that has a simulation of its own.
+    """A process that has a simulation of its own, with room for ``num_terrains`` at once.
 
-    Args:
-        num_terrains: Terrains it may have under way at once.
-        build: Called in the process with ``cfg`` and ``num_terrains``; a module-level function.
-        cfg: Anything that can be pickled.
+    ``build``, a module-level function, is called in the process with ``cfg`` and ``num_terrains``.
     """
 
     def __init__(self, num_terrains: int, build: Callable[[Any, int], Crosser], cfg: Any) -> None:

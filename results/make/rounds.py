@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
     if script.small:
         cfg = replace(
-            cfg, rounds=1, search=replace(cfg.search, episodes=16, emitters=2, batch_size=4, replicas=1),
+            cfg, rounds=1, search=replace(cfg.search, episodes=16),
             tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
             evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
         )  # fmt: skip

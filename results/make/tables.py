@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.evaluate import SetsCfg, cross_sets, crossings_folder, evaluate_tables
+from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
+from qd.evaluate.labels import SetsCfg
 from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
 from results.make.common import SEEDS, Script, parse, published_controllers
 from sim.files.atomic import write_atomically
@@ -97,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         controllers = {"base": controllers["base"], **train_controllers(script), **hardened}
     terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
     cfg = SetsCfg(
-        names=("hard_random", "generated") if script.small else (),
+        sets=("hard_random", "generated") if script.small else (),
         archive=script.results / "archive",
         independent=None if script.small else script.results / "independent",
         terrains=terrains,
@@ -107,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=script.out)
     archive = script.read_archive()
     independent = None if cfg.independent is None else script.read_archive("independent")
-    sets = make_sets(cfg.names, terrains, cfg.seed, archive=archive, independent=independent)
+    sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent)
     crossed = cross_sets(
         controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, reward=True,
         cache=crossings_folder(script.robot),

@@ -1,7 +1,6 @@
 """Searches over the stand-in evaluator, for tests of several files."""
 
 import dataclasses
-import functools
 import json
 import shutil
 from collections.abc import Iterator
@@ -18,12 +17,12 @@ from qd.run.presets import SchedulerCfg
 from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.show import figures
-from qd.workers.evaluator import Compute, OpenEvaluator
+from qd.workers.evaluator import Compute
 from sim.files.records import robot_identity
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.qd import stand_in
-from tests.qd.stand_in import open_stand_in
+from tests.qd.stand_in import compute_by, open_stand_in
 
 ANYMAL = get_robot("anymal")
 CFG = SearchCfg(
@@ -39,12 +38,11 @@ CFG = SearchCfg(
     fitness=FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES),
     scheduler=SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, sigma0=0.5, restart_rule=3),
 )
-ALONE = Compute(workers="1")
 
 
-def run(path: Path, *, open_evaluator: OpenEvaluator = open_stand_in, **changes) -> Archive:
+def run(path: Path, *, opener=open_stand_in, **changes) -> Archive:
     """A search, begun or gone on with, whose settings differ from CFG's by some."""
-    return search(dataclasses.replace(CFG, **changes), path, ALONE, open_evaluator=open_evaluator)
+    return search(dataclasses.replace(CFG, **changes), path, compute_by(opener))
 
 
 def without_figures(patch: pytest.MonkeyPatch) -> None:
@@ -54,10 +52,10 @@ def without_figures(patch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def crossing_by(open_evaluator: OpenEvaluator) -> Iterator[None]:
+def crossing_by(opener) -> Iterator[None]:
     """``faultline archive`` crosses terrains by this meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(searching, "search", functools.partial(search, open_evaluator=open_evaluator))
+        patch.setattr(Compute, "open", lambda self, cfg: opener(cfg))
         yield
 
 
@@ -67,7 +65,7 @@ def found_and_fresh(folder: Path) -> Path:
         without_figures(patch)
         run(folder / "found", iterations=6)
         shutil.copytree(folder / "found", folder / "fresh")
-        judge(folder / "fresh", compute=ALONE, stages=("fresh",), open_evaluator=open_stand_in)
+        judge(folder / "fresh", compute=compute_by(open_stand_in), stages=("fresh",))
     return folder
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from kernels.episode import Outcome
-from qd.workers.evaluator import EvaluatorCfg, Pipeline
+from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline
 from sim.rollout import RolloutResult
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -68,3 +68,13 @@ class Stub(Pipeline):
 def open_stand_in(cfg: EvaluatorCfg) -> Iterator:
     """Opened like the real evaluator."""
     yield Stub(lambda genes, seeds: evaluate(genes, seeds, cfg.num_replicas))
+
+
+def compute_by(opener, compute: Compute = Compute(workers="1")) -> Compute:  # noqa: B008 - frozen
+    """Where terrains are crossed by what this opens."""
+
+    class Opened(Compute):
+        def open(self, cfg):
+            return opener(cfg)
+
+    return Opened(**vars(compute))

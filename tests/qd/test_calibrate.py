@@ -9,14 +9,13 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.calibrate import calibrate, measured
-from qd.workers.evaluator import Compute
 from sim.files.records import identity
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.robots import Robots
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import compute_by, make_result
 
 ROBOT = get_robot("anymal")
 
@@ -56,8 +55,8 @@ def failing(share):
 
 
 def calibrated(folder, opened, **changes):
-    values = {"compute": Compute(workers="1"), "out": folder / "scales.json", "cache": folder / "crossings", **changes}
-    return calibrate(ROBOT, open_evaluator=opened, **values)
+    values = {"compute": compute_by(opened), "out": folder / "scales.json", "cache": folder / "crossings", **changes}
+    return calibrate(ROBOT, **values)
 
 
 def test_the_file_is_what_the_robot_reads(tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ from qd.commands import Archive
 from qd.minimise import minimise
 from qd.show.commands import Export
 from qd.show.recordings import Recordings, on_heights
-from qd.workers.evaluator import Compute
 from sim.bank import terrains_of
 from sim.files.command import run_command
 from sim.ground import GroundMaps
@@ -76,8 +75,7 @@ def test_a_minimal_terrain_may_be_a_patch(run):
     archive.genes[0, 64:96], archive.genes[0, 96:] = -1.0, 1.0  # slippery and soft everywhere
     fresh = replace(fresh_values(archive), goal_rate=np.zeros(1))
     write_archive(run / "archive.npz", archive.corrected_by(fresh))
-    compute = Compute(workers="1")
-    minima = minimise(run, compute=compute, elite="0", how="greedy", open_evaluator=nobody_crosses_ice)
+    minima = minimise(run, compute=stand_in.compute_by(nobody_crosses_ice), elite="0", how="greedy")
     (entry,) = minima.numbers["elites"]
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])

@@ -13,7 +13,6 @@ from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
 from qd.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
 from qd.show import figures
-from qd.workers.evaluator import Compute
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -21,7 +20,7 @@ from sim.robots.shipped import ROBOTS
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
 from tests.qd.robots import Robots
-from tests.qd.stand_in import make_result
+from tests.qd.stand_in import compute_by, make_result
 
 RESULTS = Path(__file__).parents[2] / "results"
 OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
@@ -114,10 +113,9 @@ def result_of(cfg, genes, seeds):
 def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
     return judge(
         path,
-        compute=Compute(workers="1"),
+        compute=compute_by(robots or Robots(result_of)),
         stages=stages,
         certifiers=certifiers,
-        open_evaluator=robots or Robots(result_of),
         **changes,
     )
 

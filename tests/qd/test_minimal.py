@@ -9,12 +9,12 @@ import pytest
 from qd.judge import Search
 from qd.minimal import Case, Trial, case_of, find_minimal, take_apart
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute
 from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.robots import Robots
 from tests.qd.searches import CFG
+from tests.qd.stand_in import compute_by
 
 PASSES, FAILS, INVALID = np.array([20, 0, 0, 0]), np.array([0, 20, 0, 0]), np.array([0, 9, 0, 11])
 ROBOT = get_robot("anymal")
@@ -160,7 +160,7 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
 
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
-        with Crossings(ROBOT, Compute(workers="1"), open_evaluator=robots) as crossings:
+        with Crossings(ROBOT, compute_by(robots)) as crossings:
             return cases, take_apart(archive, cases, SUPER_GAUSSIAN, search, crossings)
 
     together, alone = Robots(fails), Robots(fails)

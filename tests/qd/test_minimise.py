@@ -9,10 +9,10 @@ import pytest
 
 from qd.archive import read_archive, write_archive
 from qd.minimise import minimise, read_minimal
-from qd.workers.evaluator import Compute
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.qd.robots import Robots
+from tests.qd.stand_in import compute_by
 
 RESULTS = Path(__file__).parents[2] / "results"
 OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
@@ -45,7 +45,7 @@ def elites(path):
 
 def minimised(path, elites, robots=None, **changes):
     elite = " ".join(map(str, elites)) if elites else None
-    return minimise(path, compute=Compute(workers="1"), elite=elite, open_evaluator=robots or Robots(fails), **changes)
+    return minimise(path, compute=compute_by(robots or Robots(fails)), elite=elite, **changes)
 
 
 def test_minimal_terrains_from_end_to_end(path, elites, capsys):

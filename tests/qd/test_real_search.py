@@ -41,7 +41,7 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_num
             on_cpu = {"workers": workers} if device == "cpu" else {"workers": None, "device": device}
             return open_evaluator(dataclasses.replace(cfg, **on_cpu), build=short_rollout)
 
-        return run(path, iterations=iterations, **settings, open_evaluator=opened)
+        return run(path, iterations=iterations, **settings, opener=opened)
 
     whole = searched(tmp_path / "whole", 3)
     searched(tmp_path / "pieces", 1, workers="2")

@@ -96,9 +96,9 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     assert archive.penalty_mean == pytest.approx(4.0 * hardness**3, rel=0.1)
 
 
-def in_groups(path, groups, *, open_evaluator=stand_in.open_stand_in, iterations=5):
+def in_groups(path, groups, *, opener=stand_in.open_stand_in, iterations=5):
     scheduler = dataclasses.replace(CFG.scheduler, emitters=5, batch_size=3, groups=groups)
-    return run(path, scheduler=scheduler, iterations=iterations, reevaluate_every=2, open_evaluator=open_evaluator)
+    return run(path, scheduler=scheduler, iterations=iterations, reevaluate_every=2, opener=opener)
 
 
 class Lost(Pipeline):
@@ -129,7 +129,7 @@ class Lost(Pipeline):
 def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
     """Five emitters make groups of one, two and two, which are put in ahead; elites are sampled at times."""
     pipeline = Lost(99)
-    whole = in_groups(tmp_path / "whole", 3, open_evaluator=pipeline.opened)
+    whole = in_groups(tmp_path / "whole", 3, opener=pipeline.opened)
     assert pipeline.most == 3 and not pipeline.lots
     assert whole.iterations == 5 and len(whole) > 10
     expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
@@ -137,7 +137,7 @@ def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_bee
     for lots in (4, 6, 8):
         path = tmp_path / f"lost-{lots}"
         with pytest.raises(EvaluatorError):
-            in_groups(path, 3, open_evaluator=Lost(lots).opened)
+            in_groups(path, 3, opener=Lost(lots).opened)
         in_groups(path, 3)
         assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, lots
 
@@ -152,12 +152,12 @@ def test_a_finished_search_crosses_nothing_writes_what_is_lost_and_keeps_what_wa
     before = {name: (path / name).read_bytes() for name in ("archive.npz", "metrics.jsonl")}
     for name in ("archive.npz", "archive.json", "metrics.jsonl"):
         (path / name).unlink()
-    run(path, open_evaluator=never)
+    run(path, opener=never)
     assert {name: (path / name).read_bytes() for name in before} == before
     assert json.loads((path / "archive.json").read_text())["iterations"] == 2
     write_archive(path / "archive.npz", archive.corrected_by(fresh_values(archive)))
     judged = (path / "archive.npz").read_bytes()
-    assert run(path, open_evaluator=never).fresh is not None
+    assert run(path, opener=never).fresh is not None
     assert (path / "archive.npz").read_bytes() == judged
     assert run(path, iterations=3).fresh is None  # there are other elites now
 
@@ -193,7 +193,7 @@ def test_an_interrupt_leaves_finished_iterations_and_says_how_to_go_on(tmp_path)
         return stand_in.evaluate(genes, seeds)
 
     with pytest.raises(Interrupted, match=f"--resume {path}"):
-        run(path, iterations=3, open_evaluator=opens(evaluate))
+        run(path, iterations=3, opener=opens(evaluate))
     assert len(rows_of(path)) == 1
 
 
@@ -216,7 +216,7 @@ def invalid_from(iteration, share):
 def test_an_iteration_of_invalid_episodes_alone_stops_the_search_with_those_before_saved(tmp_path):
     path = tmp_path / "run"
     with pytest.raises(AllInvalidError, match=r"48 episodes"):
-        run(path, iterations=4, open_evaluator=invalid_from(3, 1.0))
+        run(path, iterations=4, opener=invalid_from(3, 1.0))
     assert [row["iteration"] for row in rows_of(path)] == [1, 2]
     run(path, iterations=4)  # with what it was mended by
     run(tmp_path / "whole", iterations=4)
@@ -225,6 +225,6 @@ def test_an_iteration_of_invalid_episodes_alone_stops_the_search_with_those_befo
 
 def test_invalid_episodes_are_counted_and_many_of_them_reported(tmp_path, capsys):
     # One of four episodes of each of 12 terrains, in the second iteration of two.
-    run(tmp_path / "run", open_evaluator=invalid_from(2, 0.25))
+    run(tmp_path / "run", opener=invalid_from(2, 0.25))
     assert "12 of 48 episodes" in capsys.readouterr().out
     assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]

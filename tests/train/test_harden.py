@@ -17,7 +17,7 @@ from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.robots.find import get_robot
 from tests.builders import fresh_values
-from tests.qd.stand_in import Stub
+from tests.qd.stand_in import Stub, compute_by
 from tests.train.archives import make_archive
 from tests.train.results import result_of
 from tests.train.starts import PPO, write_actor
@@ -96,7 +96,7 @@ def hardened(place, monkeypatch):
     def run(world, **changes):
         for name in ("search", "judge", "finetune"):
             monkeypatch.setattr(module, name, getattr(world, name))
-        harden(ROBOT, cfg_of(place, **changes), place / "run", CPU, open_evaluator=world.open)
+        harden(ROBOT, cfg_of(place, **changes), place / "run", compute_by(world.open, CPU))
         return read_json(place / "run" / "rounds.json")
 
     return run

@@ -82,8 +82,7 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
 
 def _check_std(actor: State, robot: RobotCfg, path: Path) -> None:
     std = actor.get(STD)
-    fits = std is None or (std.shape == (robot.num_joints,) and bool((std > 0.0).all()) and bool(std.isfinite().all()))
-    if not fits:
+    if std is not None and (std.shape != (robot.num_joints,) or not bool(((std > 0.0) & std.isfinite()).all())):
         raise ValueError(
             f"{path}: {STD}, the standard deviation of the actions, must be {robot.num_joints} numbers above 0, got "
             f"{' '.join(str(std).split())}: leave it out, or give another controller"

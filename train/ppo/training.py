@@ -193,9 +193,7 @@ class Training:
     def run(self, deadline_s: float, export: Path | None) -> Path:
         """Iterates until all is done, time is up or a stop is requested, and saves; returns the controller's file.
 
-        Args:
-            deadline_s: When it is to be done, on the clock of :func:`time.monotonic` [s].
-            export: Another place for the controller and its record.
+        ``deadline_s`` is on the clock of :func:`time.monotonic`; ``export`` is another place for the controller.
         """
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))

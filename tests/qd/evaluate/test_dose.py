@@ -9,10 +9,10 @@ import pytest
 from qd.commands import Dose
 from qd.evaluate import dose as dose_module
 from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
-from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.spaces.dose import parse_doses
 from tests.qd.evaluate.made import Crosser
+from tests.qd.stand_in import compute_by
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 STRONG, WEAK = "tests.sim.policies:stand", "tests.sim.policies:stretch"
@@ -30,7 +30,7 @@ def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     crosser, controllers = Crosser(gets_over), {"base": WEAK, "C-G": STRONG}
     doses = parse_doses(["step_up=0.1,0.2,0.25,0.3 friction=0.2,0.9"], [])
-    given = {"compute": Compute(), "terrains": 3, "episodes": 4, "open_evaluator": crosser.open}
+    given = {"compute": compute_by(crosser.open), "terrains": 3, "episodes": 4}
     report = measure_dose(anymal, controllers, doses, **given)
     assert json.loads(Path("runs/anymal-dose/dose.json").read_text()) == json.loads(json.dumps(report))
     assert Path("runs/anymal-dose/dose.png").stat().st_size > 10_000

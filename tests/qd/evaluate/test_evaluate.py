@@ -10,14 +10,15 @@ import pytest
 from qd.archive import write_archive
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
-from qd.evaluate.evaluate import SetsCfg, evaluate_rates, evaluate_tables
-from qd.evaluate.labels import SETS
+from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
+from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.files.records import robot_digest
 from sim.robots.find import get_robot
 from tests.qd.evaluate.made import PENALTIES, Crosser
+from tests.qd.stand_in import compute_by
 from tests.train.archives import make_archive
 from tests.train.starts import write_trained
 
@@ -41,7 +42,7 @@ def archive(tmp_path, monkeypatch):
 
 def tables_of(anymal, crosser, controllers, **changes):
     cfg = SetsCfg(**{"terrains": 4, "episodes": 2, **changes})
-    return evaluate_tables(anymal, controllers, cfg, compute=CPU, open_evaluator=crosser.open)
+    return evaluate_tables(anymal, controllers, cfg, compute=compute_by(crosser.open))
 
 
 def test_the_tables_from_end_to_end(anymal, archive, tmp_path):
@@ -86,7 +87,7 @@ def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive
 def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     crosser = Crosser()
-    given = {"compute": CPU, "terrains": 3, "episodes": 1, "open_evaluator": crosser.open}
+    given = {"compute": compute_by(crosser.open), "terrains": 3, "episodes": 1}
     report = evaluate_rates(anymal, STAND, **given)
     # Under runs/, never under results/, where the published ones stand; another controller has a file of its own.
     written = json.loads(Path("runs/anymal-tests.sim.policies-stand-rates.json").read_text())

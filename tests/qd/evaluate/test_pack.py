@@ -32,7 +32,7 @@ from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.qd.evaluate.made import Crosser
 from tests.qd.searches import found_and_fresh, without_figures
-from tests.qd.stand_in import Stub, make_result
+from tests.qd.stand_in import Stub, compute_by, make_result
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
 TUNED = {"C-G": str(Path(__file__).parents[3] / "results/anymal/C-G.pt")}
@@ -89,9 +89,9 @@ def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
     crosser, base = Crosser(crosses), {"base": str(anymal.policy_file)}
 
     def make(controllers, **changes):
-        return make_pack(run, controllers, compute=CPU, open_evaluator=crosser.open, out=Path("pack"), **changes)
+        return make_pack(run, controllers, compute=compute_by(crosser.open), out=Path("pack"), **changes)
 
-    given = {"compute": CPU, "open_evaluator": judges}
+    given = {"compute": compute_by(judges)}
     judge(run, stages=("resolved",), **given)
     with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
         make(base)
@@ -183,7 +183,7 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     crosser = Crosser(crosses)
-    given = {"compute": CPU, "episodes": 2, "open_evaluator": crosser.open}
+    given = {"compute": compute_by(crosser.open), "episodes": 2}
     stored = read_pack(Path("pack"))
     report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **given)
     (file,) = Path("runs").glob("anymal-*-pack.json")

@@ -16,7 +16,7 @@ from sim.files.command import Interrupted
 from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
-from tests.qd.stand_in import Stub
+from tests.qd.stand_in import Stub, compute_by
 
 ROBOT = get_robot("anymal")
 POLICY = str(ROBOT.policy_file)
@@ -47,7 +47,7 @@ class StandIn:
 
 
 def cross_all(opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, **kwargs):
-    with Crossings(ROBOT, TWO_WORKERS, cache=cache, open_evaluator=opened) as crossings:
+    with Crossings(ROBOT, compute_by(opened, TWO_WORKERS), cache=cache) as crossings:
         return crossings.cross(policy, genes, seeds, replicas=replicas, **kwargs)
 
 
@@ -106,8 +106,8 @@ def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path,
     cross_all(StandIn(), tmp_path)
     for robot, compute in ((get_robot("cassie"), TWO_WORKERS), (ROBOT, Compute("cuda"))):
         opened = StandIn()
-        cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute, replicas=20, cache=tmp_path,
-              open_evaluator=opened)  # fmt: skip
+        cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute_by(opened, compute), replicas=20,
+              cache=tmp_path)  # fmt: skip
         assert len(opened.crossed) == len(GENES)
     monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
     changed = StandIn()
@@ -155,7 +155,7 @@ def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
 
 def test_a_simulation_stays_open_for_calls_that_agree():
     opened = StandIn()
-    with Crossings(ROBOT, TWO_WORKERS, open_evaluator=opened) as crossings:
+    with Crossings(ROBOT, compute_by(opened, TWO_WORKERS)) as crossings:
         crossings.cross(POLICY, GENES[:2], SEEDS[:2], replicas=20, at_most=9)
         crossings.cross(POLICY, GENES, SEEDS, replicas=20)
         assert [cfg.num_terrains for cfg in opened.cfgs] == [4]  # two lots of a terrain a worker
@@ -167,7 +167,7 @@ def test_lots_fill_the_device():
     opened = StandIn()
     genes, seeds = np.zeros((5000, 64), np.float32), np.zeros(5000, np.uint32)
     for compute in (Compute("cuda"), Compute(workers="3")):
-        with Crossings(ROBOT, compute, open_evaluator=opened) as crossings:
+        with Crossings(ROBOT, compute_by(opened, compute)) as crossings:
             crossings.cross(POLICY, genes, seeds, replicas=20)
     gpu, cpu = opened.cfgs
     assert (gpu.num_terrains, gpu.envs_of_worker) == (2 * (16_384 // 20), 2 * (16_384 // 20) * 20)
