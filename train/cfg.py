@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, check
+from sim.files.settings import NonNegativeInt, PositiveInt, check
 from sim.robots.robot import RobotCfg
 from sim.robots.training import Draw
 from train.ppo.cfg import PpoCfg, ppo_problems
@@ -28,17 +28,13 @@ _SPECIALIST_SEED = 7
 
 @dataclass(frozen=True, kw_only=True)
 class RunCfg:
-    """How a training runs, which does not change what it learns."""
+    """Where a training runs, which does not change what it learns."""
 
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
-    max_seconds: PositiveFloat | None = None
-    """Save and stop in time to be done this many seconds after the start."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
     <name>.pt beside the settings file of another robot makes it that robot's own."""
-    overwrite: bool = False
-    """Replace the file that --export names if it is there and of another training."""
 
 
 RUN = RunCfg()

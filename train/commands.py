@@ -32,7 +32,7 @@ class Train(_OfTraining, TrainCfg):
     """Train a base controller from scratch: PPO on legged_gym's rough-terrain task.
 
     On CUDA ANYmal trains 8192 robots for 2240 iterations, Cassie 2048 for 3400; on the CPU 32 for 20, enough to see
-    that it runs. Ctrl-C or --max-seconds saves and stops; --resume RUN_DIR goes on. On several GPUs: torchrun
+    that it runs. Ctrl-C or SIGTERM saves and stops; --resume RUN_DIR goes on. On several GPUs: torchrun
     --nproc-per-node 4 -m faultline train --run-dir RUN_DIR, each with --num-envs.
     """
 
@@ -55,7 +55,7 @@ class Train(_OfTraining, TrainCfg):
 class Finetune(_OfTraining, FinetuneCfg):
     """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
 
-    On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or --max-seconds saves
+    On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or SIGTERM saves
     and stops; --resume RUN_DIR goes on. With --specialist RUN it trains a certifier for a search.
     """
 

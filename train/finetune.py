@@ -29,7 +29,6 @@ from train.ppo.training import (
     Kind,
     Training,
     check_settings,
-    deadline_of,
     device_of,
     is_finished,
     read_saved,
@@ -45,9 +44,9 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
 
     Where the directory holds a checkpoint of the same settings, the training goes on; one that is over is left as it
-    is. ``run_dir`` gets checkpoint, controller, record and TensorBoard's file; ``run`` says where and for how long.
+    is. ``run_dir`` gets checkpoint, controller, record and TensorBoard's file; ``run`` says where.
     """
-    deadline_s, device = deadline_of(run.max_seconds), device_of(run.device)
+    device = device_of(run.device)
     if Ranks.of_environment().size > 1:
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
@@ -70,14 +69,14 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         if is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done. A larger --iterations goes on.")
             return run_dir / POLICY
-    with run_directory(run_dir, run.export, overwrite=run.overwrite):
+    with run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
         training = FineTuning(
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
-        policy = training.run(deadline_s, run.export)
+        policy = training.run(run.export)
     actor = load_policy(policy, robot, "cpu")
     assert isinstance(actor, MlpPolicy)
     export_onnx(actor, policy.with_suffix(".onnx"))

@@ -95,12 +95,6 @@ def test_other_settings_robots_and_commands_are_refused(finished, copied):
     assert (finished / "checkpoint.pt").read_bytes() == before
 
 
-def test_out_of_time_it_saves_and_stops(copied, capsys):
-    train(ROBOT, replace(CFG, iterations=50), copied, RunCfg(device="cpu", max_seconds=1.0))
-    assert read_checkpoint(copied / "checkpoint.pt")["iter"] == 2 and (copied / "policy.pt").exists()
-    assert "2 of 50 iterations" in capsys.readouterr().out
-
-
 def test_an_interrupt_saves_and_stops(copied, monkeypatch):
     iterate, before = Learner.iterate, signal.getsignal(signal.SIGTERM)
 
@@ -109,7 +103,7 @@ def test_an_interrupt_saves_and_stops(copied, monkeypatch):
         return iterate(learner)
 
     monkeypatch.setattr(Learner, "iterate", interrupted)
-    with pytest.raises(Interrupted):
+    with pytest.raises(Interrupted, match="3 of 50"):
         train(ROBOT, replace(CFG, iterations=50), copied, ON_CPU)
     assert read_checkpoint(copied / "checkpoint.pt")["iter"] == 3 and (copied / "policy.pt").exists()
     assert signal.getsignal(signal.SIGTERM) is before
@@ -131,7 +125,7 @@ def test_places_of_others_are_not_written_to(finished, tmp_path):
         train(ROBOT, CFG, tmp_path, ON_CPU)
     assert [file.name for file in tmp_path.iterdir()] == ["archive.npz"]
     exported = finished.parent / "out" / "robot.pt"
-    with pytest.raises(ValueError, match="overwrite"):
+    with pytest.raises(ValueError, match="export"):
         train(ROBOT, CFG, tmp_path / "new", RunCfg(device="cpu", export=exported))
     assert not (tmp_path / "new").exists()
     train(ROBOT, CFG, finished, RunCfg(device="cpu", export=exported))  # its own

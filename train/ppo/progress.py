@@ -43,9 +43,6 @@ class Progress:
         self._env_steps, self._wall_before_s = before["env_steps"], before["wall_s"]
         self._began = time.monotonic()
         self._window: list[Iteration] = []
-        self._is_warm = False
-        self.slowest_s = 0.0
-        """Time of the slowest iteration but the first, which compiles and captures [s]."""
         self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
         if learner.ranks.is_first:
             _write_event(self._events, Event(file_version="brain.Event:2"))
@@ -55,9 +52,6 @@ class Progress:
         """Count an iteration; finish a row where one is due."""
         self._window.append(step)
         self._env_steps += self._learner.steps_per_iteration
-        if self._is_warm:
-            self.slowest_s = max(self.slowest_s, step.collection_s + step.learning_s)
-        self._is_warm = True
         if self._learner.iteration % self._every == 0:
             self._finish_row()
 
@@ -69,10 +63,10 @@ class Progress:
     def state(self) -> dict[str, Any]:
         """What the next piece needs, plain data."""
         return {
-            "curve": self._curve,
-            "pieces": self._pieces,
             "env_steps": self._env_steps,
-            "wall_s": self._wall_before_s + time.monotonic() - self._began,
+            "wall_s": round(self._wall_before_s + time.monotonic() - self._began, 1),
+            "pieces": self._pieces,
+            "curve": self._curve,
         }
 
     def record(self) -> dict[str, Any]:
@@ -82,10 +76,7 @@ class Progress:
             "robot": self._learner.env.task.robot.name,
             "iterations": self._learner.iteration,
             "num_envs": self._learner.env.num_envs,
-            "env_steps": self._env_steps,
-            "wall_s": round(self.state()["wall_s"], 1),
-            "pieces": self._pieces,
-            "curve": self._curve,
+            **self.state(),
         }
 
     def _finish_row(self) -> None:

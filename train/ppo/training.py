@@ -34,7 +34,6 @@ POLICY = "policy.pt"
 """File of a training's directory with its controller."""
 CONFIG = "config.json"
 SAVE_EVERY_S = 60.0
-_RESERVE_S = 10.0  # of a time limit, for the last save
 _SEED_STEP = 1_000_003  # between the tasks of two processes
 _FREE = ("iterations", "archive", "space")
 """Settings that may differ where a training goes on: of archives and space hashes are compared."""
@@ -71,11 +70,6 @@ def device_of(name: str | None) -> str:
     return device
 
 
-def deadline_of(max_seconds: float | None) -> float:
-    """When a training that begins now is to be done, on the clock of :func:`time.monotonic` [s]."""
-    return float("inf") if max_seconds is None else time.monotonic() + max_seconds
-
-
 def settings_of(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
     """What makes a training what it is, checked, as plain values."""
     cfg.check(robot)
@@ -83,7 +77,7 @@ def settings_of(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
 
 
 @contextmanager
-def run_directory(run_dir: Path, export: Path | None, *, overwrite: bool) -> Iterator[None]:
+def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
     """Makes the directory of a training, checks that it can be written to, and keeps other trainings out of it."""
     if not Ranks.of_environment().is_first:
         yield
@@ -93,8 +87,8 @@ def run_directory(run_dir: Path, export: Path | None, *, overwrite: bool) -> Ite
     if export is not None:
         if export.suffix != ".pt":
             raise ValueError(f"export must be a file named *.pt, got {export}")
-        if export.exists() and not overwrite and not is_same(str(export), str(run_dir / POLICY)):
-            raise ValueError(f"{export} must not be there yet, got another training's: --overwrite replaces it")
+        if export.exists() and not is_same(str(export), str(run_dir / POLICY)):
+            raise ValueError(f"{export} must not be there yet, got another training's: move it, or name another")
         prepare_output(export)
     prepare_output(run_dir / CONFIG)  # last: what is refused leaves no directory
     with locked(run_dir, f"another training works in {run_dir}: let it end, or give another directory"):
@@ -190,37 +184,34 @@ class Training:
             **self.facts(),
         }
 
-    def run(self, deadline_s: float, export: Path | None) -> Path:
-        """Iterates until all is done, time is up or a stop is requested, and saves; returns the controller's file.
+    def run(self, export: Path | None) -> Path:
+        """Iterates until all is done or a stop is requested, and saves; returns the controller's file.
 
-        ``deadline_s`` is on the clock of :func:`time.monotonic`; ``export`` is another place for the controller.
+        ``export`` is another place for the controller.
         """
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))
         with stop_request() as stop:
             try:
-                self._iterate(stop, deadline_s)
+                self._iterate(stop)
             except FloatingPointError as error:
                 raise FloatingPointError(
                     f"{error}, in {self._run_dir}: begin again with a lower --ppo.learning-rate"
                 ) from error
             self._finish(export)
-        done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
         if stop.is_set():
+            done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
             raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
-        if self.learner.iteration < self._cfg.iterations and self.learner.ranks.is_first:
-            print(f"The time is up after {done}; the same command goes on in {self._run_dir}.")
         return self._run_dir / POLICY
 
-    def _iterate(self, stop: Event, deadline_s: float) -> None:
+    def _iterate(self, stop: Event) -> None:
         learner = self.learner
         last_save = time.monotonic()
         if learner.iteration - learner.averaged < self.averaged_from:  # it was shorter: its last actors are others
             learner.count_into_mean(False)
 
         def wants_more() -> bool:
-            in_time = time.monotonic() + self.progress.slowest_s < deadline_s - _RESERVE_S
-            return learner.iteration < self._cfg.iterations and not stop.is_set() and in_time
+            return learner.iteration < self._cfg.iterations and not stop.is_set()
 
         while learner.ranks.all_want(wants_more(), learner.env.device):
             self.before_iteration()
