@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
-from qd.evaluate.figures import draw_dose
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS
 from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.command import publish
-from sim.files.figures import as_png
+from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words, wilson_interval
 from sim.files.records import robot_identity
 from sim.policy.spec import about_controllers
@@ -27,6 +27,10 @@ from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
+_COLUMNS = 4
+# Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
+_COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+_MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
 
 
 def measure_dose(
@@ -44,11 +48,8 @@ def measure_dose(
     """Lets every controller cross every value of every dose; prints, writes and draws what came of it.
 
     Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
-    the file lies under runs/. The figure is beside it.
-
-    Returns:
-        The report, with a row for each value and controller under ``dose`` (:func:`rows_of`) and one for each dose and
-        controller under ``half`` (:func:`half_of`).
+    the file lies under runs/. The figure is beside it. The report has a row for each value and controller under
+    ``dose`` (:func:`rows_of`) and one for each dose and controller under ``half`` (:func:`half_of`).
     """
     count, episodes = sizes_for(compute, terrains, episodes, full=_FULL, small=_SMALL)
     for policy in controllers.values():
@@ -128,9 +129,7 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
 def half_of(dose: Dose, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Where under half of the robots begin to reach the goal, by straight lines between the values.
 
-    Returns:
-        ``element``, ``parameter``, ``unit``, ``controller``, ``value`` and ``interval``. The interval ends where the
-        limits of the goal rates pass a half. None stands for what lies beyond the values.
+    The ``interval`` ends where the limits of the goal rates pass a half. None stands for what lies beyond the values.
     """
     known = [row for row in rows if row["goal_rate"] is not None]
     values = [row["value"] for row in known]
@@ -164,3 +163,38 @@ def show_dose(report: dict[str, Any]) -> None:
         unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
         head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots reach the goal")
         show_table(f"{title}: robots that reach the goal", head, lines)
+
+
+def draw_dose(report: Mapping[str, Any]) -> Figure:
+    """Goal rate over the dose with its interval, small axes an element, a line a controller; harder is to the right."""
+    elements = list(report["titles"])
+    columns = min(_COLUMNS, len(elements))
+    rows = -(-len(elements) // columns)
+    figure = new_figure(max(6.0, 3.3 * columns), 1.0 + 2.5 * rows)
+    contact = "contact resolved" if report["resolved"] else "at the search's settings"
+    figure.suptitle(f"{report['robot']}: robots that reach the goal, {contact}, with 95 % intervals")
+    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(len(elements))]
+    for axes, element in zip(panels, elements, strict=True):
+        of_element = [row for row in report["dose"] if row["element"] == element]
+        for number, controller in enumerate(report["controllers"]):
+            known = [row for row in of_element if row["controller"] == controller and row["goal_rate"] is not None]
+            values = [row["value"] for row in known]
+            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
+            rates = [100.0 * row["goal_rate"] for row in known]
+            axes.plot(values, rates, label=controller, color=colour, marker=marker, markersize=4)
+            low, high = ([100.0 * row["interval"][end] for row in known] for end in (0, 1))
+            axes.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
+        first, last = of_element[0], of_element[-1]
+        title, _, others = report["titles"][element].partition(", ")
+        axes.set_title(f"{title}\n{others}", fontsize=9)
+        axes.set_xlabel(f"{first['parameter']} [{first['unit']}]" if first["unit"] else first["parameter"], fontsize=8)
+        axes.set_ylim(-3, 103)
+        axes.axhline(100.0 * FAILING_GOAL_RATE, color="0.7", linewidth=0.8, zorder=0)
+        axes.tick_params(labelsize=8)
+        if first["value"] > last["value"]:
+            axes.invert_xaxis()
+    for axes in panels[::columns]:
+        axes.set_ylabel("reach the goal [%]", fontsize=8)
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=len(report["controllers"]), frameon=False)
+    return figure
