@@ -67,10 +67,8 @@ def search(
         policy=policy,
         num_terrains=cfg.scheduler.num_terrains,
         num_replicas=cfg.replicas,
-        device=compute.device,
-        workers=compute.workers,
         lots=cfg.scheduler.num_groups,
-        num_envs=compute.num_envs,
+        **vars(compute),
         space=space.name,  # where its code is now
     )
     with claimed(path):

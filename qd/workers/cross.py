@@ -228,8 +228,7 @@ class Crossings:
             raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")
         cfg = EvaluatorCfg(
             robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)), num_replicas=replicas, space=space,
-            device=self.compute.device, workers=self.compute.workers, num_envs=self.compute.num_envs, reward=reward,
-            penalties_from_s=penalties_from_s, resolved=how == "resolved",
+            reward=reward, penalties_from_s=penalties_from_s, resolved=how == "resolved", **vars(self.compute),
         )  # fmt: skip
         if how == "mujoco_c" and (reward or penalties_from_s):
             raise ValueError("MuJoCo C sums no reward, and penalties from the start only")

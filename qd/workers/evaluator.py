@@ -60,8 +60,32 @@ def parse_workers(text: str | None) -> Workers:
     return Workers(on_ray=match["ray"] is not None, count=None if number is None else int(number))
 
 
+@dataclass(frozen=True)
+class Compute:
+    """Where terrains are crossed."""
+
+    device: str = "cpu"
+    """Warp device name."""
+    workers: str | None = None
+    """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
+    num_envs: int | None = None
+    """Robots at once over all workers, which take the episodes one after the other; as many as the device is good for
+    if None. It changes no result."""
+
+    @classmethod
+    def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:
+        """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU."""
+        if num_envs is not None and num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        return cls(resolve_device(device, workers), workers, num_envs)
+
+    def open(self, cfg: "EvaluatorCfg") -> AbstractContextManager["Pipeline"]:
+        """Opens what crosses terrains."""
+        return open_evaluator(cfg)
+
+
 @dataclass(frozen=True, kw_only=True)
-class EvaluatorCfg:
+class EvaluatorCfg(Compute):
     """What an evaluator crosses, with what, and where."""
 
     robot: RobotCfg | str
@@ -72,15 +96,8 @@ class EvaluatorCfg:
     """Terrains under way at once; of more, half as many follow each time that the first half is done."""
     num_replicas: int
     """Episodes a terrain."""
-    device: str = "cpu"
-    """Warp device name."""
-    workers: str | None = None
-    """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
     lots: int = 1
     """Lots of terrains under way at once in a search, equally large."""
-    num_envs: int | None = None
-    """Robots at once over all workers, which take the episodes one after the other; as many as the device is good for
-    if None. It changes no result."""
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
     reward: bool = False
@@ -128,29 +145,6 @@ class WorkerStatus(NamedTuple):
     def __str__(self) -> str:
         again = f", {self.retries} crossed again" if self.retries else ""
         return f"{self.workers} worker{'s' * (self.workers != 1)}{again}"
-
-
-@dataclass(frozen=True)
-class Compute:
-    """Where terrains are crossed."""
-
-    device: str = "cpu"
-    """Warp device name."""
-    workers: str | None = None
-    """Who crosses them, as :func:`parse_workers` takes it."""
-    num_envs: int | None = None
-    """Robots at once over all workers; as many as the device is good for if None. It changes no result."""
-
-    @classmethod
-    def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:
-        """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU."""
-        if num_envs is not None and num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        return cls(resolve_device(device, workers), workers, num_envs)
-
-    def open(self, cfg: EvaluatorCfg) -> AbstractContextManager["Pipeline"]:
-        """Opens what crosses terrains."""
-        return open_evaluator(cfg)
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = 0) -> NDArray[np.uint32]:
