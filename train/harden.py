@@ -240,10 +240,8 @@ class _Hardening:
 def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, float]) -> dict[str, Any]:
     """Whether to keep the controller ``after`` a training, by goal rates of each validation set.
 
-    Two trainings of one recipe differ by several points, and a training may end worse than it began.
-
-    Returns:
-        ``kept``, ``why``, and ``score`` before and after, the mean over the sets.
+    Two trainings of one recipe differ by several points, and a training may end worse than it began. The ``score`` is
+    the mean over the sets.
     """
     scores = {"before": fmean(before.values()), "after": fmean(after.values())}
     why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"

@@ -72,8 +72,7 @@ def cross_sets(
 ) -> dict[str, dict[str, RolloutResult]]:
     """Lets every controller cross every set, as :meth:`qd.workers.cross.Crossings.cross` does; prints how each fared.
 
-    Returns:
-        Set -> controller -> crossings.
+    The result is set -> controller -> crossings.
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))

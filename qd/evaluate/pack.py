@@ -343,11 +343,7 @@ def rates_over_all(abouts: Sequence[About], controller: str, seed: int) -> dict[
 
 
 def failing_by(group: str, abouts: Sequence[About], controller: str) -> dict[str, dict[str, int]]:
-    """How many terrains a controller fails by one of :data:`GROUPS`, the most frequent value first.
-
-    Returns:
-        Value -> ``terrains`` and ``failing``.
-    """
+    """How many ``terrains`` there are and ``failing``, by one of :data:`GROUPS`, the most frequent value first."""
     counts = Counter(str(about[group] or "unclear") for about in abouts)
     fails = _rates(abouts, controller, "goal") < FAILING_GOAL_RATE
     failing = Counter(str(about[group] or "unclear") for about, fail in zip(abouts, fails, strict=True) if fail)

@@ -127,7 +127,7 @@ def test_the_command_hands_its_flags_on(archive, monkeypatch):
     flags = ["--sets", "hard_random, generated", "--archive", "archive.npz", "--seed", "3", "--device", "cpu"]
     assert run_command(Evaluate, flags, name="evaluate") == 0
     robot, controllers, cfg = given["args"]
-    assert (robot.name, list(controllers), cfg.names, cfg.seed) == ("anymal", ["base"], ("hard_random", "generated"), 3)
+    assert (robot.name, list(controllers), cfg.sets, cfg.seed) == ("anymal", ["base"], ("hard_random", "generated"), 3)
     assert run_command(Evaluate, ["--space", "course", "--robot", "cassie", "--device", "cpu"], name="evaluate") == 0
     assert given["args"][0].name == "cassie" and given["space"] == "course"
     for gain, status in ((0.1, 0), (-0.1, 1)):
