@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.evaluate import paper
 from qd.evaluate.labels import FROM_ARCHIVE, HELD_OUT, INDEPENDENT, SETS
 from qd.evaluate.marks import marks_of
 from qd.groups import families_of, rms_distances
@@ -34,7 +33,9 @@ Part = Literal["test", "validation"]
 """What terrains are for: to be reported, or to choose settings by."""
 MIN_ELITES = 5
 """Fewest elites that can be split: a fifth of them is one."""
+_PAPER_TERRAINS = {"anymal": 300, "cassie": 180}  # of each of its test sets
 _OTHER_TERRAINS = 300  # of a robot that the paper does not have
+_TRAINING_ELITES = 750  # the paper's
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
 _KEYS = {"test": 20250604, "validation": 20250606}  # with place of name and seed, the entropy of a set
@@ -118,7 +119,7 @@ class TerrainSet:
 
 def paper_terrains(robot: str) -> int:
     """Terrains a set of the published tables of a robot; 300 of one that the paper does not have."""
-    return paper.TERRAINS.get(robot, _OTHER_TERRAINS)
+    return _PAPER_TERRAINS.get(robot, _OTHER_TERRAINS)
 
 
 def split_elites(archive: Archive) -> EliteSplit:
@@ -135,7 +136,7 @@ def split_elites(archive: Archive) -> EliteSplit:
             f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites, got "
             f"{len(archive)}: let its search go on"
         )
-    num_train, num_test = paper.TRAINING_ELITES, paper_terrains(archive.robot)
+    num_train, num_test = _TRAINING_ELITES, paper_terrains(archive.robot)
     if len(archive) < num_train + num_test:
         num_test = round(_HELD_OUT_SHARE * len(archive))
         num_train = len(archive) - num_test
