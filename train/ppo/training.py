@@ -88,7 +88,7 @@ def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
         if export.suffix != ".pt":
             raise ValueError(f"export must be a file named *.pt, got {export}")
         if export.exists() and not is_same(str(export), str(run_dir / POLICY)):
-            raise ValueError(f"{export} must not be there yet, got another training's: move it, or name another")
+            raise ValueError(f"export {export} must not be there yet, got another training's: move it, or name another")
         prepare_output(export)
     prepare_output(run_dir / CONFIG)  # last: what is refused leaves no directory
     with locked(run_dir, f"another training works in {run_dir}: let it end, or give another directory"):
