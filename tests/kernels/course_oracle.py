@@ -5,8 +5,6 @@ import numpy as np
 NODES = 20  # a metre
 CUT = {"ramp": 16, "cross_slope": 30, "sill": 1, "rail": 0, "pallet": 16, "ditch": 2, "bridge": 16, "stones": 20,
        "rubble": 16}  # fmt: skip
-KINDS = ("flat", "ramp", "cross_slope", "sill", "rail", "kerb", "step", "stairs", "pallet", "ditch", "bridge",
-         "stones", "rubble")  # fmt: skip
 RANGES = {
     "flat": [(0, 0), {"whole": (0, 60)}, (0, 0), (0, 0)],
     "ramp": [(1 / 12, 1 / 3), {"whole": (16, 48)}, (0, 0), (-1, 1)],
@@ -22,6 +20,7 @@ RANGES = {
     "stones": [(0.2, 0.6), {"whole": (20, 48)}, {"whole": (4, 8)}, {"whole": (2, 6)}],
     "rubble": [(0.03, 0.2), {"whole": (16, 48)}, {"whole": (2, 8)}, (-0.5, 0.5)],
 }
+KINDS = tuple(RANGES)
 
 
 def value(gene, span):

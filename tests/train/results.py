@@ -1,12 +1,14 @@
 """Hand-made crossings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from kernels.episode import Invalidity, Outcome
+from kernels.episode import Outcome
 from sim.rollout import RolloutResult
+from tests.qd.stand_in import make_result
 
 GOAL, HIT, LATE, OUT, BAD = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT, Outcome.INVALID
 NAMES = ("yaw_rate", "vel_x")
@@ -25,17 +27,11 @@ def result_of(
     for values in (penalties, rewards):
         if values is not None:
             values[outcome == Outcome.INVALID] = np.nan
-    return RolloutResult(
-        penalties=penalties,
-        penalty_names=names,
+    result = make_result(penalties, invalid=outcome == Outcome.INVALID, names=names)
+    return replace(
+        result,
         outcome=outcome,
-        invalidity=np.where(outcome == Outcome.INVALID, np.uint8(Invalidity.STATE), np.uint8(0)),
-        fallen=np.zeros(outcome.shape, bool) if fallen is None else np.array(fallen, bool),
+        fallen=result.fallen if fallen is None else np.array(fallen, bool),
         duration_s=np.full(outcome.shape, 12.0, np.float32) if duration_s is None else np.array(duration_s),
-        final_position=np.zeros((*outcome.shape, 3), np.float32),
-        physics_steps=1,
-        robot_steps=1,
-        busy_steps=1,
-        wall_s=1.0,
         reward=rewards,
     )
