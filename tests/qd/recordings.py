@@ -8,8 +8,8 @@ from kernels.episode import Outcome
 from sim.files.records import identity
 from sim.recording.recorder import Recording
 from sim.robots.find import get_robot
+from tests.qd.stand_in import PENALTIES
 
-NAMES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 FRAMES = 21
 
 
@@ -34,7 +34,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frame
     quaternion = np.zeros((*shape, 4), np.float32)
     quaternion[..., 0] = 1.0
     return Recording(
-        robot="anymal", joint_names=joints, foot_names=feet, penalty_names=NAMES, dt=0.02, labels=("made up",),
+        robot="anymal", joint_names=joints, foot_names=feet, penalty_names=PENALTIES, dt=0.02, labels=("made up",),
         heights=np.random.default_rng(seed).normal(0.0, 0.2, (1, 161, 321)).astype(np.float32), genes=None,
         seeds=np.array([seed], np.uint32), replicas=np.arange(count, dtype=np.int32),
         outcome=np.array([outcomes], np.uint8), invalidity=np.zeros((1, count), np.uint8),

@@ -47,6 +47,13 @@ def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> Rol
     return make_result(penalties, base_collision=collides)
 
 
+def assert_same(result: RolloutResult, expected: RolloutResult) -> None:
+    assert result.penalty_names == expected.penalty_names
+    for name, values in vars(expected).items():
+        if isinstance(values, np.ndarray):
+            np.testing.assert_array_equal(getattr(result, name), values, err_msg=name, strict=True)
+
+
 class Stub(Pipeline):
     """Crosses lots by a function of terrains and seeds, each when it is waited for."""
 

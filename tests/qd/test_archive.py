@@ -122,11 +122,3 @@ def test_goal_rates_by_hand():
     counts = np.array([[0, 0, 0, 0], [9, 6, 5, 0], [9, 6, 0, 5], [8, 6, 0, 6], [0, 0, 0, 20]])
     # not crossed; 9 of 20; 9 of the 15 valid; 6 of 20 are more than a quarter
     np.testing.assert_array_equal(goal_rates(counts), [np.nan, 0.45, 0.6, np.nan, np.nan])
-
-
-def test_elites_are_the_same_in_any_order():
-    archive = judged_archive()
-    bare = dataclasses.replace(archive, fresh=None, faults=None).rows(np.array([3, 1, 4, 0, 2]))
-    assert bare.has_elites_of(archive)
-    assert not dataclasses.replace(bare, iteration=bare.iteration + 1).has_elites_of(archive)
-    assert not bare.rows(np.arange(4)).has_elites_of(archive)

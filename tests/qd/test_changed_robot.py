@@ -5,36 +5,28 @@ import json
 
 import pytest
 
-from qd.archive import write_archive
-from qd.show.elites import open_run
 from sim.files.records import identity, robot_digest, robot_identity
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot, robot_of
 from sim.robots.shipped import ROBOTS
-from tests.builders import rsl_rl_actor, save_checkpoint, small_archive
+from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.dogs import write_dog
 
 
 @pytest.fixture
 def dog(tmp_path):
-    """The dog's settings, and beside them scales and an archive of it."""
+    """The dog's settings, and beside them its scales."""
     file = write_dog(tmp_path)
     robot = get_robot(str(file))
     robot.scales_file.write_text(json.dumps({**robot_identity(robot), "scales": dict.fromkeys(robot.penalties, 1.0)}))
-    archive = dataclasses.replace(small_archive(), robot=robot.name, **robot_identity(robot))
-    write_archive(tmp_path / "archive.npz", archive)
     return file
 
 
 def readers(file):
     """What reads a record of the robot."""
-    robot, folder = get_robot(str(file)), file.parent
+    robot = get_robot(str(file))
     record = {"robot": "dog"} | json.loads(robot.scales_file.read_text())
-    return (
-        robot.read_penalty_scales,
-        lambda: open_run(str(file), folder / "archive.npz"),
-        lambda: robot_of(record, str(file), folder),
-    )
+    return robot.read_penalty_scales, lambda: robot_of(record, str(file), file.parent)
 
 
 def test_what_was_made_with_the_robot_before_it_changed_is_refused(dog):

@@ -6,27 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kernels.episode import Outcome
 from qd.archive import read_archive, write_archive
 from qd.causes import causes_at, effects_of
 from qd.commands import Archive
 from qd.minimise import minimise
 from qd.show.commands import Export
-from qd.show.recordings import Recordings, on_heights
 from sim.bank import terrains_of
 from sim.files.command import run_command
-from sim.ground import GroundMaps
 from sim.maps.heightmap import read_heightmap
 from sim.robots.robot import RobotCfg
 from sim.spaces.registry import get_space
-from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.builders import fresh_values
 from tests.qd import stand_in
-from tests.qd.recordings import recording_of
 from tests.qd.searches import crossing_by, without_figures
 
 SPACE = get_space("super_gaussian+friction+softness")
-FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
 
 def search(*words: str) -> int:
@@ -85,28 +79,6 @@ def test_a_minimal_terrain_may_be_a_patch(run):
     slippery[0, 1, 3] = 0.15  # the 8 x 4 patches are counted along the way first: 11 = 8 + 3
     np.testing.assert_allclose(exported.ground.friction, slippery, rtol=1e-6)
     assert not exported.heights.any() and not exported.ground.time_constant_s.any()
-
-
-def slippery_and_soft() -> GroundMaps:
-    maps = GroundMaps.plain(1)
-    maps.friction[0, 1, 2], maps.time_constant_s[0, 2, 5] = 0.3, 0.03
-    return maps
-
-
-def test_recordings_are_found_again_by_their_ground(anymal, tmp_path):
-    crossed = []
-
-    def cross(wanted, progress):
-        crossed.extend(wanted)
-        ends = [14.0 if crossing.ground is None else 3.0 for crossing in wanted]
-        return [recording_of([Outcome.GOAL], [x]) for x in ends]
-
-    about = {"label": "", "policy": str(anymal.policy_file), "replicas": 1, "seed": 0}
-    wanted = [on_heights(FLAT, ground=slippery_and_soft(), **about), on_heights(FLAT, **about)]
-    for _ in range(2):  # the second time from their files
-        recordings = Recordings(anymal, folder=tmp_path, cross=cross).all_of(wanted)
-        assert [recording.base_position[0, 0, -1, 0] for recording in recordings] == [3.0, 14.0]
-        assert len(crossed) == 2
 
 
 def test_effects_of_patches_are_parts_like_bumps():

@@ -12,7 +12,6 @@ from qd.groups import (
     elites_of,
     families_of,
     rank,
-    rms_distances,
     summary_of,
 )
 from qd.minimise import MinimalTerrains
@@ -60,19 +59,6 @@ def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid(
     assert corrected.counted.tolist() == [40, 32, 40]
     np.testing.assert_array_equal(corrected.fitness, archive.fitness[[0, 2, 3]] / 2)
     assert [corrected.place_of(number) for number in (0, 2, 3)] == [0, 1, 2]
-
-
-def test_what_fails_and_how_it_ends_by_hand():
-    archive = dataclasses.replace(
-        small_archive(4),
-        fitness=np.array([1.0, 4.0, 2.0, 3.0]),
-        goal_rate=np.array([0.0, 0.4, 0.0, 0.9]),
-        collision_rate=np.array([0.25, 0.6, 0.5, 0.1]),
-    )
-    elites = elites_of(archive)
-    assert elites.failing.tolist() == [True, True, True, False]
-    np.testing.assert_allclose(elites.other_rate, [0.75, 0.0, 0.5, 0.0], atol=1e-12)
-    assert rank(archive, SUPER_GAUSSIAN).worst(4)[3] == 3
 
 
 def test_verdicts_come_before_rates_and_rates_before_fitness():
@@ -187,10 +173,6 @@ def test_without_failing_elites_nothing_leads():
     archive = dataclasses.replace(small_archive(4), goal_rate=np.ones(4))
     ranking = rank(archive, SUPER_GAUSSIAN)
     assert ranking.by_cause() == {} and sorted(ranking.worst(4)) == [0, 1, 2, 3]
-
-
-def test_a_distance_is_the_root_of_the_mean_square():
-    assert rms_distances(np.array([[0.0, 0.0]]), np.array([[3.0, 4.0], [0.0, 0.0]])).tolist() == [[12.5**0.5, 0.0]]
 
 
 def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():

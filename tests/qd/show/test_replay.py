@@ -141,16 +141,6 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     assert (numbers["invalid_episodes"], numbers["invalid_reasons"]) == (1, {"speed": 1})
 
 
-def test_crossings_in_numbers_by_hand():
-    outcomes = [Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.BASE_COLLISION, Outcome.INVALID]
-    crossed = crossed_of(recording_of(outcomes, [14.0, 5.0, 7.0, 3.0], fallen=[False, True, False, True]))
-    assert crossed.chosen.tolist() == [0, 1, 2]
-    assert str(crossed.rates["reached the goal"]) == "1 of 3 (33%, 6 to 79%)"
-    hits = {label: rate.hits for label, rate in crossed.rates.items()}
-    assert hits == {"reached the goal": 1, "base collision": 2, "out of time": 0, "left the terrain": 0, "fallen": 1}
-    np.testing.assert_allclose(crossed.ends[:, 0], [14.0, 5.0, 7.0])
-
-
 def test_the_drawing_has_all_paths():
     recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0])
     figure = draw_crossing(crossed_of(recording), "a hill")

@@ -9,6 +9,7 @@ from qd.workers import evaluator
 from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, parse_workers
 from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
+from tests.qd.stand_in import assert_same
 
 CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")
 GENES = np.random.default_rng(0).uniform(-1, 1, (15, 64)).astype(np.float32)
@@ -31,11 +32,6 @@ class Echo(crossers.Crosser):
 
     def evaluate(self, terrains, seeds, *, progress=None):
         return dataclasses.replace(stand_in.evaluate(np.zeros((2, 64)), seeds), penalties=terrains)
-
-
-def same(a, b) -> bool:
-    arrays = [field.name for field in dataclasses.fields(a) if isinstance(getattr(a, field.name), np.ndarray)]
-    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in arrays)
 
 
 def test_workers_as_the_command_line_names_them():
@@ -76,7 +72,7 @@ def evaluate(request):
 def test_how_terrains_are_spread_changes_nothing(evaluate, count):
     shares = []
     result = evaluate(GENES[:count], SEEDS[:count], shares.append)
-    assert same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
+    assert_same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
@@ -86,7 +82,7 @@ def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(evaluate):
 
     with pytest.raises(KeyboardInterrupt):
         evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
-    assert same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
+    assert_same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
 
 
 @pytest.mark.parametrize("evaluate", ["2"], indirect=True)
@@ -124,7 +120,7 @@ def test_a_worker_that_ended_in_between_is_heard_when_it_gets_the_next_lot():
     with open_evaluator(dataclasses.replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
         for lot in (slice(0, 2), slice(2, 4)):
             evaluate.put(GENES[lot], SEEDS[lot])
-        assert same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
+        assert_same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
         end = time.monotonic() + 20
         with pytest.raises(ValueError, match="terrains of another kind"):
             while time.monotonic() < end:
