@@ -305,7 +305,7 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
         if compared:
             if names or self.independent:
                 raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
-            names = (COMPARED,)
+            names, controllers = (COMPARED,), {name: controllers[name] for name in ("old", "new")}
         report = evaluate_tables(robot, controllers, replace(self, sets=names), compute=compute, out=self.out)
         return int(compared and is_regression(report))
 

@@ -111,6 +111,8 @@ class Elites:
         if self.collision_rate[row] >= self.other_rate[row]:
             most_fall = 2 * self.fallen_rate[row] > self.collision_rate[row]
             return "topples" if most_fall else "hits the ground", "collision_rate"
+        if 2 * self.fallen_rate[row] > 1.0:  # it lies on its legs, and no touch of the base ends the episode
+            return "topples", "fallen_rate"
         place, limits = self.end_position[row], (CrossingCfg.lower, CrossingCfg.upper)
         is_out = (place <= limits[0]).any() or (place >= limits[1]).any()
         return "leaves the terrain" if is_out else "gets stuck", "other_rate"

@@ -130,10 +130,19 @@ def moment_of_failure(recording: Recording, episode: int) -> float:
     return frame * recording.dt
 
 
+def typical_outcome(outcome: NDArray[np.integer]) -> int:
+    """How most valid episodes end, shape (E,); where under half reach the goal, how most of the others end."""
+    counts = np.bincount(outcome, minlength=max(Outcome) + 1)
+    if valid := len(outcome) - counts[Outcome.INVALID]:
+        counts[Outcome.INVALID] = 0
+        counts[Outcome.GOAL] *= 2 * counts[Outcome.GOAL] >= valid
+    return int(counts.argmax())
+
+
 def typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
-    """The episode to show: of those that end as most do, or so, the one with the middle sum of scaled penalties."""
+    """The episode to show: of those with the typical outcome, or a given one, that of middle cost."""
     outcome = recording.outcome[0]
-    candidates = np.flatnonzero(outcome == (np.bincount(outcome).argmax() if ending is None else ending))
+    candidates = np.flatnonzero(outcome == (typical_outcome(outcome) if ending is None else ending))
     last = np.maximum(recording.num_frames[0, candidates] - 1, 0)
     sums = recording.penalties[0, candidates, last].astype(np.float64)
     names = recording.penalty_names
@@ -158,7 +167,7 @@ def title_of(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
-    most = int(np.bincount(outcome[valid], minlength=1).argmax())
+    most = typical_outcome(outcome)
     ended = outcome == most
     way = way_to_end(most, recording.fallen[0, ended].mean() > 0.5) if valid.any() else "no valid episode"
     who = _NAMES.get(recording.robot, recording.robot) + (f" with {controller}" if controller else "")

@@ -115,6 +115,9 @@ def test_an_elite_is_named_by_its_own_cause_and_ending():
         "unclear: topples, 40 of 40",
         "crossed, 30 of 40",
     ]
+    fallen = dataclasses.replace(ranking.elites, fallen_rate=np.array([0.75] + 5 * [0.0]))
+    lying = dataclasses.replace(ranking, elites=fallen)  # on their legs until the time is over
+    assert lying.name(0) == "ridge: topples, 30 of 40"
     outside, _ = ranked((9.0, 10.01))
     assert outside.name(0) == "ridge: leaves the terrain, 30 of 40"
 

@@ -167,7 +167,7 @@ window.faultline = (() => {
   });
   const TASKS = {
     play: () => send("play", !state.playing),
-    mark: () => send("pause_at", (state.marks.find(([time]) => time > state.time + 1e-6) ?? state.marks[0])[0]),
+    mark: () => state.marks?.length && send("pause_at", (state.marks.find(([time]) => time > state.time + 1e-6) ?? state.marks[0])[0]),
   };
   const KEYS = { " ": TASKS.play, m: TASKS.mark, ArrowLeft: () => send("pause_at", state.time - 0.1),
     ArrowRight: () => send("pause_at", state.time + 0.1), n: () => send("step", 1), p: () => send("step", -1),

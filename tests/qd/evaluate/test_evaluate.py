@@ -130,9 +130,12 @@ def test_the_command_hands_its_flags_on(archive, monkeypatch):
     assert (robot.name, list(controllers), cfg.sets, cfg.seed) == ("anymal", ["base"], ("hard_random", "generated"), 3)
     assert run_command(Evaluate, ["--space", "course", "--robot", "cassie", "--device", "cpu"], name="evaluate") == 0
     assert given["args"][0].name == "cassie" and given["space"] == "course"
-    for gain, status in ((0.1, 0), (-0.1, 1)):
+    for gain, status, order in ((0.1, 0, 1), (-0.1, 1, -1)):  # named in either order
         gains = {"gain": {"goal": {"interval": [-0.5, gain]}}}
         tables = {"differences": {"elites": {"old -> new": gains}}}
-        monkeypatch.setattr(evaluation, "evaluate_tables", lambda *_, given=tables, **named: given)
-        flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--device", "cpu"]
-        assert run_command(Evaluate, flags, name="evaluate") == status
+        monkeypatch.setattr(
+            evaluation, "evaluate_tables", lambda *args, tables=tables, **named: given.update(args=args) or tables
+        )
+        named = ["old=shipped", "new=C-G.pt"][::order]
+        flags = ["--policies", *named, "--archive", "archive.npz", "--device", "cpu"]
+        assert run_command(Evaluate, flags, name="evaluate") == status and [*given["args"][1]] == ["old", "new"]
