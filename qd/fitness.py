@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
 from sim.files.settings import check
-from sim.rates import MAX_INVALID_SHARE, counted_episodes
+from sim.rates import MAX_INVALID_SHARE, counted_episodes, typical_outcome
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -160,11 +160,8 @@ def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray
     """
     ends = np.full((len(counted), 2), np.nan, np.float32)
     for row in np.flatnonzero(counted.any(axis=1)).tolist():
-        outcome, arrived = result.outcome[row], result.reached_goal[row]
-        failed = counted[row] & ~arrived
-        alike = counted[row] & arrived
-        if failed.sum() > alike.sum():
-            alike = failed & (outcome == np.bincount(outcome[failed]).argmax())
+        outcome = result.outcome[row]
+        alike = counted[row] & (outcome == typical_outcome(outcome[counted[row]]))
         ends[row] = np.median(result.final_position[row, alike, :2], axis=0)
     return ends
 

@@ -25,6 +25,17 @@ def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.flo
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
+def typical_outcome(outcome: NDArray[np.integer]) -> int:
+    """How most valid episodes end, shape (E,); where under half reach the goal, how most of the others end."""
+    from kernels.episode import Outcome
+
+    counts = np.bincount(outcome, minlength=max(Outcome) + 1)
+    if valid := len(outcome) - counts[Outcome.INVALID]:
+        counts[Outcome.INVALID] = 0
+        counts[Outcome.GOAL] *= 2 * counts[Outcome.GOAL] >= valid
+    return int(counts.argmax())
+
+
 def hits_of(outcome: NDArray[np.uint8], kind: str) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which episodes count as a hit of one of :data:`KINDS`, and which count at all; one that still runs does not.
 

@@ -15,6 +15,7 @@ from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
 from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
+from sim.rates import typical_outcome
 from sim.recording.recorder import Recording
 
 
@@ -128,15 +129,6 @@ def moment_of_failure(recording: Recording, episode: int) -> float:
             place = recording.base_position[0, episode, : last + 1, :2].astype(np.float64)
             frame = int(np.argmax(np.linalg.norm(place - place[-1], axis=1) <= _STUCK))
     return frame * recording.dt
-
-
-def typical_outcome(outcome: NDArray[np.integer]) -> int:
-    """How most valid episodes end, shape (E,); where under half reach the goal, how most of the others end."""
-    counts = np.bincount(outcome, minlength=max(Outcome) + 1)
-    if valid := len(outcome) - counts[Outcome.INVALID]:
-        counts[Outcome.INVALID] = 0
-        counts[Outcome.GOAL] *= 2 * counts[Outcome.GOAL] >= valid
-    return int(counts.argmax())
 
 
 def typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
