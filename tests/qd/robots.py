@@ -2,41 +2,58 @@
 
 from collections.abc import Callable
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
 from qd.workers.evaluator import EvaluatorCfg
+from sim.robots.find import get_robot
 from sim.rollout import RolloutResult
-from tests.qd.stand_in import Stub, make_result
+from tests.qd import stand_in
+
+OTHER = {"C-G": str(get_robot("anymal").panel / "C-G.pt")}
+"""A controller that certifies."""
+
+
+def by_stand_in(cfg, genes, seeds):
+    return stand_in.evaluate(genes, seeds, cfg.num_replicas)
+
+
+def bump_stops(cfg, genes, seeds):
+    """Nobody crosses bump 4 where it is higher than .1 m; C-G crosses everything."""
+    return (np.abs(genes[:, 4 * 8 + 7]) > 0.4) & ("C-G" not in cfg.policy)
 
 
 class Robots:
     """Opened like the real evaluator.
 
-    ``rule(cfg, genes, seeds)`` says of each terrain whether all robots collide, or gives a result. ``crossed`` notes
-    (cfg, seed, genes) of each terrain. After ``stop_after`` terrains it is as if somebody pressed Ctrl-C.
+    ``rule(cfg, genes, seeds)`` says of each terrain whether all robots collide, or gives a result. ``opened`` notes the
+    settings of each simulation, ``crossed`` (cfg, seed) of each terrain. After ``stop_after`` terrains it is as
+    if somebody pressed Ctrl-C.
     """
 
-    def __init__(self, rule: Callable[..., np.ndarray | RolloutResult], stop_after: int | None = None) -> None:
-        self.rule, self.stop_after, self.crossed, self.opened = rule, stop_after, [], 0
+    def __init__(
+        self, rule: Callable[..., np.ndarray | RolloutResult] = by_stand_in, stop_after: int | None = None
+    ) -> None:
+        self.rule, self.stop_after, self.crossed, self.opened = rule, stop_after, [], []
 
     @property
     def seeds(self) -> list[int]:
         """Seeds of what was crossed."""
-        return [seed for _, seed, _ in self.crossed]
+        return [seed for _, seed in self.crossed]
 
     @contextmanager
     def __call__(self, cfg: EvaluatorCfg):
-        self.opened += 1
+        self.opened.append(cfg)
 
         def evaluate(genes, seeds):
             if self.stop_after is not None and len(self.crossed) >= self.stop_after:
                 raise KeyboardInterrupt
-            self.crossed += [(cfg, *row) for row in zip(seeds.tolist(), map(tuple, genes.tolist()), strict=True)]
+            self.crossed += [(cfg, seed) for seed in seeds.tolist()]
             result = self.rule(cfg, genes, seeds)
-            if isinstance(result, RolloutResult):
-                return result
-            collided = np.repeat(result[:, None], cfg.num_replicas, axis=1)
-            return make_result(np.ones((*collided.shape, 6)), base_collision=collided)
+            if not isinstance(result, RolloutResult):
+                collided = np.repeat(result[:, None], cfg.num_replicas, axis=1)
+                result = stand_in.make_result(np.ones((*collided.shape, 6)), base_collision=collided)
+            return replace(result, reward=np.full(result.outcome.shape, 9.0)) if cfg.reward else result
 
-        yield Stub(evaluate)
+        yield stand_in.Stub(evaluate)

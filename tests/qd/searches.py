@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 from qd import search as searching
 from qd.archive import Archive
 from qd.fitness import FitnessCfg
-from qd.judge import judge
 from qd.run.presets import SchedulerCfg
 from qd.run.settings import SearchCfg
 from qd.search import search
@@ -57,16 +55,6 @@ def crossing_by(opener) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Compute, "open", lambda self, cfg: opener(cfg))
         yield
-
-
-def found_and_fresh(folder: Path) -> Path:
-    """Two runs of one search, without figures: ``found`` as it ended, ``fresh`` with fresh episodes."""
-    with pytest.MonkeyPatch.context() as patch:
-        without_figures(patch)
-        run(folder / "found", iterations=6)
-        shutil.copytree(folder / "found", folder / "fresh")
-        judge(folder / "fresh", compute=compute_by(open_stand_in), stages=("fresh",))
-    return folder
 
 
 TIMES = ("wall_s", "episodes_per_s", "search_s")

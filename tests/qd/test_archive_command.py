@@ -17,7 +17,7 @@ from sim.files.command import run_command
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
-from tests.qd.searches import crossing_by, without_figures
+from tests.qd.searches import crossing_by
 
 SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "1", "--iterations", "1"]
 TINY = ["--device", "cpu", *SIZE]
@@ -36,7 +36,6 @@ def narrow_policy(observation: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    without_figures(monkeypatch)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     with crossing_by(stand_in.open_stand_in):

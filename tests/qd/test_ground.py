@@ -1,6 +1,5 @@
 """A search on ground with friction and softness of its own, and what uses its run."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +17,8 @@ from sim.robots.robot import RobotCfg
 from sim.spaces.registry import get_space
 from tests.builders import fresh_values
 from tests.qd import stand_in
-from tests.qd.searches import crossing_by, without_figures
+from tests.qd.robots import Robots
+from tests.qd.searches import crossing_by
 
 SPACE = get_space("super_gaussian+friction+softness")
 
@@ -31,7 +31,6 @@ def search(*words: str) -> int:
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    without_figures(monkeypatch)
     monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
     size = ["--scheduler.emitters", "2", "--scheduler.batch-size", "4", "--iterations", "1"]
     assert search("--space", SPACE.name, "--run-dir", "run", "--method", "hard_random", *size) == 0
@@ -53,23 +52,13 @@ def test_a_run_goes_on_with_its_ground_and_exports_it(run):
         Export(run=run, elite="0", formats=("stl",), overwrite=True).execute()
 
 
-@contextmanager
-def nobody_crosses_ice(cfg):
-    """Who steps on a slippery patch 11, in the middle of the way, falls; all others arrive."""
-
-    def evaluate(genes, seeds):
-        fails = np.repeat(genes[:, 64 + 11, None] < 0.0, cfg.num_replicas, axis=1)
-        return stand_in.make_result(np.ones((*fails.shape, 6)), base_collision=fails)
-
-    yield stand_in.Stub(evaluate)
-
-
 def test_a_minimal_terrain_may_be_a_patch(run):
     archive = read_archive(run).rows(np.arange(1))
     archive.genes[0, 64:96], archive.genes[0, 96:] = -1.0, 1.0  # slippery and soft everywhere
     fresh = replace(fresh_values(archive), goal_rate=np.zeros(1))
     write_archive(run / "archive.npz", archive.corrected_by(fresh))
-    minima = minimise(run, compute=stand_in.compute_by(nobody_crosses_ice), elite="0", how="greedy")
+    ice = Robots(lambda cfg, genes, seeds: genes[:, 64 + 11] < 0.0)  # robots fall on patch 11, in the middle of the way
+    minima = minimise(run, compute=stand_in.compute_by(ice), elite="0", how="greedy")
     (entry,) = minima.numbers["elites"]
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])

@@ -12,24 +12,16 @@ from qd import judge as judging
 from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
 from qd.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
-from qd.show import figures
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
-from tests.qd.robots import Robots
+from tests.qd.robots import OTHER, Robots
 from tests.qd.stand_in import compute_by, make_result
 
-RESULTS = Path(__file__).parents[2] / "results"
-OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
 SHIPPED = str(get_robot("anymal").policy_file)
-
-
-@pytest.fixture(autouse=True)
-def no_figures(monkeypatch):
-    monkeypatch.setattr(figures, "write_figures", lambda folder, archive, metrics: [])
 
 
 def archive_of(ratios, *, collided=None):
@@ -111,13 +103,8 @@ def result_of(cfg, genes, seeds):
 
 
 def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
-    return judge(
-        path,
-        compute=compute_by(robots or Robots(result_of)),
-        stages=stages,
-        certifiers=certifiers,
-        **changes,
-    )
+    compute = compute_by(robots or Robots(result_of))
+    return judge(path, compute=compute, stages=stages, certifiers=certifiers, **changes)
 
 
 def numbers_in(path):
@@ -150,9 +137,7 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     faults = int((failing & again & other).sum())
     assert 0 < faults < (failing & again).sum() < failing.sum() < len(archive)
     # A controller that does not cross at the search's settings is not asked with contact resolved.
-    asked = [
-        [cfg.resolved for cfg, _, _ in robots.crossed if cfg.policy == policy] for policy in (SHIPPED, OTHER["C-G"])
-    ]
+    asked = [[cfg.resolved for cfg, _ in robots.crossed if cfg.policy == policy] for policy in (SHIPPED, OTHER["C-G"])]
     assert asked[0] == [True] * failing.sum()
     assert (asked[1].count(False), asked[1].count(True)) == (failing.sum(), (failing & once).sum())
     assert len(set(robots.seeds)) == len(robots.seeds)
@@ -221,7 +206,7 @@ def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
     [
         ("policy", {"policy": OTHER["C-G"]}),
         ("certifier me", {"certifiers": {"me": SHIPPED}}),
-        ("certifier C-G", {"certifiers": {"C-G": f"{RESULTS}/cassie/C-G.pt"}}),
+        ("certifier C-G", {"certifiers": {"C-G": str(ROBOTS["cassie"].panel / "C-G.pt")}}),
         ("certifier S", {"certifiers": {"S": "sys:exit"}}),
         ("robot", {"robot": "cassie"}),
     ],

@@ -165,7 +165,7 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
 
     together, alone = Robots(fails), Robots(fails)
     cases, minima = apart((2, 0), together)
-    assert together.opened == 1 and together.crossed[0][0].num_replicas == 5
+    assert len(together.opened) == 1 and together.crossed[0][0].num_replicas == 5
     assert {number: (minimal.parts, minimal.scale) for number, minimal in minima.items()} == {
         0: ((2, 5), 0.625), 2: ((2, 5), 0.625),
     }  # fmt: skip

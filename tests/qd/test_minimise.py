@@ -2,50 +2,31 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd.archive import read_archive, write_archive
+from qd.archive import read_archive
 from qd.minimise import minimise, read_minimal
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
-from tests.qd.robots import Robots
+from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.stand_in import compute_by
 
-RESULTS = Path(__file__).parents[2] / "results"
-OTHER = {"C-G": f"{RESULTS}/anymal/C-G.pt"}
 SPACE = "sim.spaces.super_gaussian.SuperGaussian"
 
 
-def fails(cfg, genes, seeds):
-    """Nobody crosses bump 4 where it is higher than .1 m; C-G crosses everything."""
-    return (np.abs(genes[:, 4 * 8 + 7]) > 0.4) & ("C-G" not in cfg.policy)
-
-
 @pytest.fixture(autouse=True)
-def undrawn(request, monkeypatch):
+def minimal_undrawn(request, monkeypatch):
     """The figure takes longer to draw than the rest; one test draws it."""
     if "end_to_end" not in request.node.name:
         monkeypatch.setattr("qd.minimise.draw_minimal", lambda *_: None)
         monkeypatch.setattr("qd.minimise.save_figure", lambda *_: None)
 
 
-@pytest.fixture
-def elites(path):
-    """Numbers of two elites that fail for bump 4, which is .24 m high."""
-    archive = read_archive(path)
-    numbers = np.flatnonzero(archive.failing)[:2]
-    genes = archive.genes.copy()
-    genes[numbers, 4 * 8 : 5 * 8] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, 0.96)  # in the middle of the way, across it
-    write_archive(path / "archive.npz", replace(archive, genes=genes))
-    return numbers.tolist()
-
-
 def minimised(path, elites, robots=None, **changes):
     elite = " ".join(map(str, elites)) if elites else None
-    return minimise(path, compute=compute_by(robots or Robots(fails)), elite=elite, **changes)
+    return minimise(path, compute=compute_by(robots or Robots(bump_stops)), elite=elite, **changes)
 
 
 def test_minimal_terrains_from_end_to_end(path, elites, capsys):
@@ -78,13 +59,13 @@ def test_minimal_terrains_from_end_to_end(path, elites, capsys):
 
 
 def test_stopped_it_goes_on_and_results_of_several_calls_add_up(path, elites):
-    stopped, rest = Robots(fails, stop_after=9), Robots(fails)
+    stopped, rest = Robots(bump_stops, stop_after=9), Robots(bump_stops)
     with pytest.raises(KeyboardInterrupt):
         minimised(path, elites[1:], stopped, how="exhaustive")
     minimised(path, elites[1:], rest, how="exhaustive")
     # 1 + 8 subsets of four rows, eight rows of fresh episodes, five scales of four rows
     assert len(stopped.seeds) + len(rest.seeds) == 9 * 4 + 8 + 5 * 4 and rest.seeds
-    minimised(path, elites[1:], Robots(fails, stop_after=0), how="exhaustive")  # nothing is left to be crossed
+    minimised(path, elites[1:], Robots(bump_stops, stop_after=0), how="exhaustive")  # nothing is left to be crossed
     minima = minimised(path, elites[:1])
     hows = [(entry["elite"], entry["how"]) for entry in minima.numbers["elites"]]
     assert hows == [(elites[0], "greedy"), (elites[1], "exhaustive")] and sorted(minima.genes) == elites
@@ -113,7 +94,7 @@ def test_elites_that_are_not_named_are_some_that_fail_and_without_scales_there_i
 
 
 def test_what_cannot_be_minimised_is_refused_before_anything_is_crossed(path, made, elites, monkeypatch):
-    nobody, fine = Robots(fails, stop_after=0), np.flatnonzero(~read_archive(path).failing)[:1].tolist()
+    nobody, fine = Robots(bump_stops, stop_after=0), np.flatnonzero(~read_archive(path).failing)[:1].tolist()
     with pytest.raises(ValueError, match="fresh"):
         minimised(made / "found", elites, nobody)
     for numbers in (fine, [999]):

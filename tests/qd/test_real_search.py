@@ -11,7 +11,7 @@ from qd.workers.evaluator import open_evaluator
 from sim.crossing import CrossingCfg
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from tests.qd.searches import rows_of, run, without_figures
+from tests.qd.searches import rows_of, run
 
 ROBOT = get_robot("anymal")
 
@@ -24,11 +24,8 @@ def short_rollout(cfg, num_terrains):
 
 
 @pytest.mark.slow
-def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_number_of_processes(
-    tmp_path, device, monkeypatch
-):
+def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_number_of_processes(tmp_path, device):
     """Robots go on with the terrains of other groups; three emitters make groups of one and two."""
-    without_figures(monkeypatch)
     settings = {
         "replicas": 3,
         "reevaluate_every": 0,

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, Pipeline
+from qd.workers.evaluator import EvaluatorError
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from tests.builders import fresh_values
 from tests.qd import stand_in
-from tests.qd.searches import CFG, rows_of, run, without_figures
+from tests.qd.robots import Robots
+from tests.qd.searches import CFG, rows_of, run
 
 FILES = ["archive.json", "archive.npz", "checkpoint.bin", "config.json", "metrics.jsonl"]
 FIGURES = ["archive.png", "curves.png"]
@@ -30,21 +31,6 @@ GOLDEN = {
         "fitness": [5.15655, 4.97512, 4.70702, 4.56382, 3.88451],
     },
 }
-
-
-@pytest.fixture(autouse=True)
-def plain_figures(monkeypatch):
-    without_figures(monkeypatch)
-
-
-def opens(evaluate):
-    """Opens an evaluator that is a function of genes and seeds."""
-
-    @contextmanager
-    def opened(cfg: EvaluatorCfg):
-        yield stand_in.Stub(evaluate)
-
-    return opened
 
 
 @pytest.mark.parametrize("method", GOLDEN)
@@ -101,22 +87,22 @@ def in_groups(path, groups, *, opener=stand_in.open_stand_in, iterations=5):
     return run(path, scheduler=scheduler, iterations=iterations, reevaluate_every=2, opener=opener)
 
 
-class Lost(Pipeline):
-    """Lots crossed by the stand-in; it is lost when so many were taken."""
+class Lost(stand_in.Stub):
+    """The stand-in, which is lost when so many lots were taken."""
 
     def __init__(self, left):
-        super().__init__(1000)  # a sample of elites is one lot
-        self.left, self.lots, self.most = left, [], 0
+        super().__init__(stand_in.evaluate)
+        self.left, self.most = left, 0
 
     def put(self, terrains, seeds):
-        self.lots.append((terrains, seeds))
+        super().put(terrains, seeds)
         self.most = max(self.most, len(self.lots))
 
     def take(self, progress=None):
         self.left -= 1
         if self.left < 0:
             raise EvaluatorError("a worker process died")
-        return stand_in.evaluate(*self.lots.pop(0))
+        return super().take()
 
     def clear(self):
         assert not self.lots  # whatever is crossed anew finds nothing under way
@@ -175,8 +161,6 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
         assert {name: (path / name).read_bytes() for name in os.listdir(path)} == before
 
     refused("iterations must be at least 3", iterations=2)
-    refused("seed", seed=4)
-    refused(r"scheduler\.sigma0", scheduler=dataclasses.replace(CFG.scheduler, sigma0=1.0))
     before["checkpoint.bin"] = (tmp_path / "other/checkpoint.bin").read_bytes()
     (path / "checkpoint.bin").write_bytes(before["checkpoint.bin"])  # one that strayed here
     refused(r"checkpoint\.bin.*seed", iterations=5)
@@ -187,31 +171,24 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
 
 def test_an_interrupt_leaves_finished_iterations_and_says_how_to_go_on(tmp_path):
     path = tmp_path / "run"
-
-    def evaluate(genes, seeds):
-        if (path / "checkpoint.bin").exists():
-            raise KeyboardInterrupt
-        return stand_in.evaluate(genes, seeds)
-
     with pytest.raises(Interrupted, match=f"--resume {path}"):
-        run(path, iterations=3, opener=opens(evaluate))
+        run(path, iterations=3, opener=Robots(stop_after=12))  # an iteration has 12 terrains
     assert len(rows_of(path)) == 1
 
 
 def invalid_from(iteration, share):
-    """Opens a stand-in whose episodes are invalid from an iteration on: so large a share of each terrain's."""
-    crossed = []
+    """The stand-in, whose episodes are invalid from an iteration on: so large a share of each terrain's."""
 
-    def evaluate(genes, seeds):
-        crossed.append(len(genes))
+    def rule(cfg, genes, seeds):
         result = stand_in.evaluate(genes, seeds)
-        if len(crossed) < iteration:
+        if len(robots.crossed) < 12 * iteration:
             return result
         invalid = np.zeros(result.invalid.shape, bool)
         invalid[:, : round(share * result.invalid.shape[1])] = True
         return stand_in.make_result(result.penalties, invalid=invalid)
 
-    return opens(evaluate)
+    robots = Robots(rule)
+    return robots
 
 
 def test_an_iteration_of_invalid_episodes_alone_stops_the_search_with_those_before_saved(tmp_path):

@@ -1,7 +1,6 @@
-"""Made-up crossings, sets and tables."""
+"""Made-up sets and tables."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,30 +9,7 @@ from qd.evaluate.measures import Measured, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Tables, make_tables
 from sim.robots.find import get_robot
-from tests.qd.stand_in import Stub
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
-
-PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
-
-
-class Crosser:
-    """Opens evaluators that cross by a rule: policy and terrains -> on which of these all robots reach the goal."""
-
-    def __init__(self, rule: Callable[[str, np.ndarray], Sequence[bool]] = lambda policy, terrains: [True] * 999):
-        self.opened, self.lots, self.rule = [], [], rule
-
-    @contextmanager
-    def open(self, cfg):
-        self.opened.append(cfg)
-
-        def evaluate(terrains, seeds):
-            self.lots.append((cfg.policy, len(seeds)))
-            rows = [
-                [GOAL if goal else HIT] * cfg.num_replicas for goal in self.rule(cfg.policy, terrains)[: len(seeds)]
-            ]
-            return result_of(rows, names=PENALTIES, reward=np.full(np.shape(rows), 9.0) if cfg.reward else None)
-
-        yield Stub(evaluate)
 
 
 def make_set(name: str, count: int, first: int = 0) -> TerrainSet:

@@ -11,7 +11,7 @@ from qd.evaluate import dose as dose_module
 from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
 from sim.files.command import run_command
 from sim.spaces.dose import parse_doses
-from tests.qd.evaluate.made import Crosser
+from tests.qd.robots import Robots
 from tests.qd.stand_in import compute_by
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
@@ -19,18 +19,18 @@ STRONG, WEAK = "tests.sim.policies:stand", "tests.sim.policies:stretch"
 LIMITS = {STRONG: 0.27, WEAK: 0.12}
 
 
-def gets_over(policy, terrains):
+def fails(cfg, terrains, seeds):
     """Robots get over what is no higher than their limit, and over no slippery ground, whose genes end with a -1."""
     if terrains.ndim == 3:
-        return terrains.max(axis=(1, 2)) <= LIMITS[policy]
-    return terrains[:, 64] > 0.0
+        return terrains.max(axis=(1, 2)) > LIMITS[cfg.policy]
+    return terrains[:, 64] <= 0.0
 
 
 def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    crosser, controllers = Crosser(gets_over), {"base": WEAK, "C-G": STRONG}
+    robots, controllers = Robots(fails), {"base": WEAK, "C-G": STRONG}
     doses = parse_doses(["step_up=0.1,0.2,0.25,0.3 friction=0.2,0.9"], [])
-    given = {"compute": compute_by(crosser.open), "terrains": 3, "episodes": 4}
+    given = {"compute": compute_by(robots), "terrains": 3, "episodes": 4}
     report = measure_dose(anymal, controllers, doses, **given)
     assert json.loads(Path("runs/anymal-dose/dose.json").read_text()) == json.loads(json.dumps(report))
     assert Path("runs/anymal-dose/dose.png").stat().st_size > 10_000
@@ -44,9 +44,9 @@ def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
     assert first["interval"] == pytest.approx([0.757, 1.0], abs=1e-3) and first["resolved"] is False
     half = {(row["element"], row["controller"]): row["value"] for row in report["half"]}
     assert half["step_up", "base"] == pytest.approx(0.15) and half["step_up", "C-G"] == pytest.approx(0.275)
-    assert not any(cfg.resolved for cfg in crosser.opened)
+    assert not any(cfg.resolved for cfg in robots.opened)
     resolved = measure_dose(anymal, controllers, doses, resolved=True, **given)
-    assert crosser.opened[-1].resolved and all(row["resolved"] for row in resolved["dose"])
+    assert robots.opened[-1].resolved and all(row["resolved"] for row in resolved["dose"])
     assert Path("runs/anymal-dose/dose-resolved.json").exists()
 
 

@@ -1,13 +1,12 @@
 """Packs: which terrains one has, in which order, its files, and any controller tested on it."""
 
 import json
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd.archive import read_archive, write_archive
+from qd.archive import read_archive
 from qd.commands import Evaluate
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
@@ -30,18 +29,16 @@ from sim.files.command import run_command
 from sim.files.records import identity
 from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS
-from tests.qd.evaluate.made import Crosser
-from tests.qd.searches import found_and_fresh, without_figures
-from tests.qd.stand_in import Stub, compute_by, make_result
+from tests.qd.robots import OTHER, Robots, bump_stops
+from tests.qd.stand_in import compute_by
 from tests.train.results import BAD, GOAL, HIT, LATE, result_of
 
-TUNED = {"C-G": str(Path(__file__).parents[3] / "results/anymal/C-G.pt")}
 CPU = Compute(workers="1")
 
 
-def crosses(policy, heights):
+def fails(cfg, heights, seeds):
     """C-G crosses everything, others nothing but terrains whose highest point is below .2 m."""
-    return (np.abs(heights).max(axis=(1, 2)) < 0.2) | ("C-G" in policy)
+    return (np.abs(heights).max(axis=(1, 2)) >= 0.2) & ("C-G" not in cfg.policy)
 
 
 def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=0.0):
@@ -66,42 +63,24 @@ def test_what_comes_next(candidates, expected):
         assert choose_terrains(candidates, size) == expected[:size]
 
 
-@contextmanager
-def judges(cfg):
-    """Only C-G crosses bump 4 if it is higher than .1 m."""
-
-    def evaluate(genes, seeds):
-        fails = (np.abs(genes[:, 4 * 8 + 7]) > 0.4) & ("C-G" not in cfg.policy)
-        fails = np.repeat(fails[:, None], cfg.num_replicas, axis=1)
-        return make_result(np.ones((*fails.shape, 6)), base_collision=fails)
-
-    yield Stub(evaluate)
-
-
-def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
+def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    without_figures(monkeypatch)
-    run = found_and_fresh(tmp_path) / "fresh"
-    archive = read_archive(run)
-    first = np.flatnonzero(archive.failing)[:2]
-    archive.genes[first, 4 * 8 : 5 * 8] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, 0.96)
-    write_archive(run / "archive.npz", archive)
-    crosser, base = Crosser(crosses), {"base": str(anymal.policy_file)}
+    robots, base = Robots(fails), {"base": str(anymal.policy_file)}
 
     def make(controllers, **changes):
-        return make_pack(run, controllers, compute=compute_by(crosser.open), out=Path("pack"), **changes)
+        return make_pack(path, controllers, compute=compute_by(robots), out=Path("pack"), **changes)
 
-    given = {"compute": compute_by(judges)}
-    judge(run, stages=("resolved",), **given)
+    given = {"compute": compute_by(Robots(bump_stops))}
+    judge(path, stages=("resolved",), **given)
     with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
         make(base)
-    judge(run, stages=("others",), certifiers=TUNED, **given)
-    minimise(run, elite=" ".join(map(str, first)), judged=True, certifiers=TUNED, **given)
+    judge(path, stages=("others",), certifiers=OTHER, **given)
+    minimise(path, elite=" ".join(map(str, elites)), judged=True, certifiers=OTHER, **given)
     with pytest.raises(ValueError, match="anymal"):
         make(base, robot="cassie")
-    assert not Path("pack").exists() and not crosser.opened
+    assert not Path("pack").exists() and not robots.opened
 
-    content, archive = make(base | TUNED), read_archive(run)
+    content, archive = make(base | OTHER), read_archive(path)
     assert json.loads(Path("pack/pack.json").read_text()) == json.loads(json.dumps(content))
     assert {"command", "commit", "sources_sha256", "device", "versions", "seed", "date"} <= content.keys()
     verdicts = [about["verdict"] for about in content["terrains"]]
@@ -115,7 +94,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, tmp_path, monkeypatch):
     assert (content["searched"], content["certifiers"]) == ("base", ["C-G"])
     failing = sum(about["rates"]["base"]["goal_rate"] < 0.5 for about in content["terrains"])
     assert content["rates"]["base"]["failing"] == failing
-    few = make(TUNED, size=3)  # the first of the same; the searched controller is always among those that cross
+    few = make(OTHER, size=3)  # the first of the same; the searched controller is always among those that cross
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [about["name"] for about in few["terrains"]] == [about["name"] for about in content["terrains"][:3]]
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
@@ -182,8 +161,8 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
 
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
-    crosser = Crosser(crosses)
-    given = {"compute": compute_by(crosser.open), "episodes": 2}
+    robots = Robots(fails)
+    given = {"compute": compute_by(robots), "episodes": 2}
     stored = read_pack(Path("pack"))
     report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **given)
     (file,) = Path("runs").glob("anymal-*-pack.json")
@@ -195,7 +174,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     assert {value: part["failing"] for value, part in report["by"]["verdict"].items()} == {"fault": 1, "near-fault": 0}
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
-    assert not crosser.opened[0].reward and not crosser.opened[0].resolved
+    assert not robots.opened[0].reward and not robots.opened[0].resolved
     whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **given)
     assert whole["rates"]["terrains"] == 3
 

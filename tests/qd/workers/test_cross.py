@@ -1,7 +1,5 @@
 """The crossing service: results of every terrain in order, and what its cache finds, keeps apart and gives up."""
 
-from contextlib import contextmanager
-from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +14,8 @@ from sim.files.command import Interrupted
 from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
-from tests.qd.stand_in import Stub, compute_by
+from tests.qd.robots import Robots
+from tests.qd.stand_in import assert_same, compute_by
 
 ROBOT = get_robot("anymal")
 POLICY = str(ROBOT.policy_file)
@@ -25,66 +24,32 @@ GENES = SUPER_GAUSSIAN.hard_random(9, 3)
 SEEDS = np.arange(9, dtype=np.uint32)
 
 
-class StandIn:
-    """Opens evaluators that note the seeds of what they cross, and stop with an error before the ``stop``-th."""
-
-    def __init__(self, *, stop: int | None = None, invalid: bool = False) -> None:
-        self.cfgs, self.crossed, self.stop, self.invalid = [], [], stop, invalid
-
-    @contextmanager
-    def __call__(self, cfg):
-        self.cfgs.append(cfg)
-
-        def evaluate(genes, seeds, progress=None):
-            if self.stop is not None and len(self.crossed) + len(seeds) > self.stop:
-                raise KeyboardInterrupt
-            self.crossed += seeds.tolist()
-            result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
-            invalid = np.ones(result.invalid.shape, bool)
-            return stand_in.make_result(result.penalties, invalid=invalid) if self.invalid else result
-
-        yield Stub(evaluate)
-
-
 def cross_all(opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, **kwargs):
     with Crossings(ROBOT, compute_by(opened, TWO_WORKERS), cache=cache) as crossings:
         return crossings.cross(policy, genes, seeds, replicas=replicas, **kwargs)
-
-
-def arrays_of(result):
-    values = {field.name: getattr(result, field.name) for field in fields(result)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-
-
-def assert_same(result, expected):
-    assert arrays_of(result).keys() == arrays_of(expected).keys()
-    for name, values in arrays_of(expected).items():
-        np.testing.assert_array_equal(getattr(result, name), values, err_msg=name)
-        assert getattr(result, name).dtype == values.dtype
-    assert result.penalty_names == expected.penalty_names
 
 
 EXPECTED = stand_in.evaluate(GENES, SEEDS, 20)
 
 
 def test_cached_crossings_are_the_same_bit_for_bit_and_take_no_time(tmp_path):
-    first = cross_all(StandIn(), tmp_path)
-    again = StandIn()
+    first = cross_all(Robots(), tmp_path)
+    again = Robots()
     cached = cross_all(again, tmp_path)
-    assert again.cfgs == []
+    assert again.opened == []
     assert_same(cached, EXPECTED)
     assert (first.wall_s, cached.wall_s, cached.robot_steps) == (4.5, 0.0, 0)  # 0.5 s a terrain of the stand-in
 
 
 def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_another_order(tmp_path):
-    stopped = StandIn(stop=5)
+    stopped = Robots(stop_after=4)
     with pytest.raises(Interrupted, match="the same command goes on"):
         cross_all(stopped, tmp_path)
-    assert stopped.crossed == [0, 1, 2, 3]  # two lots of a terrain a worker
+    assert stopped.seeds == [0, 1, 2, 3]  # two lots of a terrain a worker
     order = np.array([8, 3, 5, 0, 7])
-    after = StandIn()
+    after = Robots()
     result = cross_all(after, tmp_path, GENES[order], SEEDS[order])
-    assert after.crossed == [8, 5, 7]
+    assert after.seeds == [8, 5, 7]
     assert_same(result, stand_in.evaluate(GENES[order], SEEDS[order], 20))
 
 
@@ -96,28 +61,28 @@ CHANGES = [
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: next(iter(change)))
 def test_crossings_of_another_kind_are_not_found(tmp_path, change):
-    cross_all(StandIn(), tmp_path)
-    other = StandIn()
+    cross_all(Robots(), tmp_path)
+    other = Robots()
     cross_all(other, tmp_path, **change)
     assert len(other.crossed) == len(GENES)
 
 
 def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path, monkeypatch):
-    cross_all(StandIn(), tmp_path)
+    cross_all(Robots(), tmp_path)
     for robot, compute in ((get_robot("cassie"), TWO_WORKERS), (ROBOT, Compute("cuda"))):
-        opened = StandIn()
+        opened = Robots()
         cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute_by(opened, compute), replicas=20,
               cache=tmp_path)  # fmt: skip
         assert len(opened.crossed) == len(GENES)
     monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
-    changed = StandIn()
+    changed = Robots()
     cross_all(changed, tmp_path)
     assert len(changed.crossed) == len(GENES)
 
 
 @pytest.mark.parametrize("damage", ["flip", "rename", "lacks"])
 def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, damage):
-    cross_all(StandIn(), tmp_path)
+    cross_all(Robots(), tmp_path)
     lots = sorted(tmp_path.iterdir())
     content = bytearray(lots[0].read_bytes())
     content[len(content) // 2] ^= 255
@@ -129,12 +94,12 @@ def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, dam
         cache = Cache(tmp_path)
         cache.write(lots[0].stem, {k: v for k, v in cache.read(lots[0].stem).items() if k != "outcome"})
     capsys.readouterr()
-    again = StandIn()
+    again = Robots()
     assert_same(cross_all(again, tmp_path), EXPECTED)
     assert len(again.crossed) in ((1, 2) if damage != "rename" else (2, 3, 4))
     out = capsys.readouterr().out
     assert out.count("\n") == 1 and str(lots[0]) in out
-    after = StandIn()
+    after = Robots()
     cross_all(after, tmp_path)
     assert after.crossed == []
 
@@ -154,39 +119,43 @@ def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
 
 
 def test_a_simulation_stays_open_for_calls_that_agree():
-    opened = StandIn()
+    opened = Robots()
     with Crossings(ROBOT, compute_by(opened, TWO_WORKERS)) as crossings:
         crossings.cross(POLICY, GENES[:2], SEEDS[:2], replicas=20, at_most=9)
         crossings.cross(POLICY, GENES, SEEDS, replicas=20)
-        assert [cfg.num_terrains for cfg in opened.cfgs] == [4]  # two lots of a terrain a worker
+        assert [cfg.num_terrains for cfg in opened.opened] == [4]  # two lots of a terrain a worker
         crossings.cross(POLICY, GENES, SEEDS, replicas=20, how="resolved")
-        assert [cfg.resolved for cfg in opened.cfgs] == [False, True]
+        assert [cfg.resolved for cfg in opened.opened] == [False, True]
 
 
 def test_lots_fill_the_device():
-    opened = StandIn()
+    opened = Robots()
     genes, seeds = np.zeros((5000, 64), np.float32), np.zeros(5000, np.uint32)
     for compute in (Compute("cuda"), Compute(workers="3")):
         with Crossings(ROBOT, compute_by(opened, compute)) as crossings:
             crossings.cross(POLICY, genes, seeds, replicas=20)
-    gpu, cpu = opened.cfgs
+    gpu, cpu = opened.opened
     assert (gpu.num_terrains, gpu.envs_of_worker) == (2 * (16_384 // 20), 2 * (16_384 // 20) * 20)
     assert (cpu.num_terrains, cpu.num_workers) == (6, 3)
 
 
 def test_no_terrains_open_nothing_and_a_controller_whose_code_has_no_file_is_not_stored(tmp_path):
-    opened = StandIn()
+    opened = Robots()
     result = cross_all(opened, genes=GENES[:0], seeds=SEEDS[:0], reward=True)
     assert result.penalties.shape == (0, 20, 6) and result.reward.shape == result.outcome.shape == (0, 20)
-    assert opened.cfgs == []
-    cross_all(StandIn(), tmp_path, policy="builtins:abs")
+    assert opened.opened == []
+    cross_all(Robots(), tmp_path, policy="builtins:abs")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
+    def invalid(cfg, genes, seeds):
+        result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+        return stand_in.make_result(result.penalties, invalid=np.ones(result.invalid.shape))
+
     with pytest.raises(AllInvalidError):
-        cross_all(StandIn(invalid=True), tmp_path)
-    assert cross_all(StandIn(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
+        cross_all(Robots(invalid), tmp_path)
+    assert cross_all(Robots(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
 
 
 def test_mujoco_c_gives_the_robots_penalties_and_is_stored_apart(tmp_path, monkeypatch):
@@ -202,12 +171,12 @@ def test_mujoco_c_gives_the_robots_penalties_and_is_stored_apart(tmp_path, monke
         yield from ((number, record) for number in reversed(range(len(terrains))))
 
     monkeypatch.setattr(service, "cross_terrains", cross_terrains)
-    cross_all(StandIn(), tmp_path)
+    cross_all(Robots(), tmp_path)
     for _ in range(2):
-        result = cross_all(StandIn(), tmp_path, how="mujoco_c")
+        result = cross_all(Robots(), tmp_path, how="mujoco_c")
         assert calls == SEEDS.tolist()
         assert (result.invalidity[:, 0] == Invalidity.STATE).all() and not result.invalidity[:, 1:].any()
         columns = [service.PENALTIES.index(name) for name in ROBOT.penalties]
         np.testing.assert_array_equal(result.penalties[3, 1], columns)
     with pytest.raises(ValueError, match="reward"):
-        cross_all(StandIn(), how="mujoco_c", reward=True)
+        cross_all(Robots(), how="mujoco_c", reward=True)
