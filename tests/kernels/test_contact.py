@@ -153,17 +153,6 @@ def test_records_are_what_the_solver_reads():
         assert abs(oracle.nearest_on_surface(grid, SPACING, point, 0.05)[0]) < 1e-5
 
 
-def test_depth_by_hand():
-    # A sphere of radius 0.1 whose centre is 0.06 m over flat ground at 0.25: distance 0.06, normal up; 0.11 m over it:
-    # no contact; 0.04 m under it: distance -0.04, still pushed up.
-    poses = [[5, 4, 0.31, 0, 0, 0, 1], [5, 4, 0.36, 0, 0, 0, 1], [5, 4, 0.21, 0, 0, 0, 1]]
-    records = collide(poses, np.zeros(3, int), np.full((1, 161, 321), 0.25), [(np.zeros(3), 0.1)])
-    order = np.argsort(records["env"])
-    assert records["env"][order].tolist() == [0, 2]
-    np.testing.assert_allclose(records["distance"][order], [0.06, -0.04], atol=1e-6)
-    np.testing.assert_allclose(records["normal"], [[0, 0, 1]] * 2, atol=1e-6)
-
-
 def test_contacts_past_the_capacity_are_counted_but_not_written():
     poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (6, 1))
     records = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], capacity=4)

@@ -1,4 +1,4 @@
-"""Courses against a NumPy builder, and every element by numbers worked out by hand."""
+"""Courses against a NumPy builder, and elements of any size by hand."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,12 @@ import warp as wp
 
 from kernels.course import Element, Kind, lay_out, place, rasterise, rasterise_elements
 from tests.kernels import course_oracle as oracle
-from tests.kernels.course_oracle import course, element
 
 
 def heights_of(genes):
     out = wp.zeros((len(genes), 161, 321), dtype=float)
     rasterise(wp.array(np.float32(genes)), 0.05, out)
     return out.numpy()
-
-
-@pytest.fixture
-def way():
-    """Heights along y = 4 m of a course of some elements, by the node from x = 4 m on."""
-    return lambda *elements: heights_of(course(*elements))[0, 80, 80:]
 
 
 def test_courses_equal_the_builders():
@@ -28,38 +21,6 @@ def test_courses_equal_the_builders():
         np.testing.assert_allclose(grid, oracle.heights(row), atol=5e-6)
     kinds = lay_out(wp.array(genes)).numpy()["kind"]
     assert len(np.unique(kinds)) == len(Kind)  # every kind is among them
-
-
-def test_stairs_have_their_risers_at_the_nearest_nodes(way):
-    # Treads of 0.28 m are 5.6 cells: risers 0, 6 (5.6), 11 (11.2) cells behind the first, which stands at 0.2 m.
-    ground = way(element("stairs", size=0.18, length=0.28, detail=3, turn=1))
-    assert ground[:5] == pytest.approx(0.0)
-    assert ground[5:11] == pytest.approx(0.18) and ground[11:16] == pytest.approx(0.36)
-    assert ground[16:] == pytest.approx(0.54)
-    down = way(element("stairs", size=0.18, length=0.28, detail=3, turn=-1))
-    assert down == pytest.approx(-ground)
-
-
-def test_stepping_stones():
-    # Stones of 0.2 m, 0.1 m apart: after a gap of 2 cells one of 4, and so on; the first lies on rows 78 to 82.
-    grid = heights_of(course(element("stones", size=0.3, length=20, detail=4, turn=2)))[0]
-    along = grid[80, 84 : 84 + 21]
-    assert along[:8] == pytest.approx([0, -0.3, 0, 0, 0, 0, 0, -0.3])
-    assert np.flatnonzero(grid[76:85, 84 + 3] == 0.0).tolist() == [0, 2, 3, 4, 5, 6, 8]
-    assert grid[80, 84 + 10] == pytest.approx(-0.3)  # the next ones are moved by half of 0.3 m: rows 81 to 85
-    assert grid[83, 84 + 10] == 0.0
-
-
-def test_what_does_not_fit_is_cut_or_left_out(way):
-    # 60 cells of flat ground twice and the least ground before each take 128 of 160 cells; 16 more: 16 are left.
-    before = [element("flat", length=60)] * 2
-    ramp = way(*before, element("ramp", lead=16, size=0.25, length=48, turn=1))
-    assert ramp[160] == pytest.approx(0.25 * 16 * 0.05)  # cut to 16 cells
-    nothing = way(*before, element("cross_slope", lead=16, size=0.25, length=48, turn=1))
-    assert not nothing.any()
-    # Stairs lose steps: of 8 with treads of 0.3 m, 6 cells, three have risers 0, 6 and 12 cells behind the first.
-    stairs = course(*before, element("stairs", lead=16, size=0.2, length=0.3, detail=8, turn=1))
-    assert lay_out(wp.array(stairs)).numpy()["detail"][0, 2] == 3
 
 
 def test_elements_of_any_size_lie_where_they_say():

@@ -5,7 +5,6 @@ import pytest
 import warp as wp
 
 from kernels.episode import (
-    PARKING_HEIGHT,
     Invalidity,
     Outcome,
     begin_episodes,
@@ -13,7 +12,6 @@ from kernels.episode import (
     latch_outcomes,
     make_episodes,
     note_base_forces,
-    park_ended,
 )
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.crossing import CrossingCfg, make_task
@@ -97,21 +95,6 @@ def test_an_ended_episode_stays_ended():
     latch((q, qd), state)
     assert state.outcome.numpy().tolist() == [Outcome.INVALID, Outcome.GOAL, Outcome.TIME_OUT, Outcome.GOAL]
     assert not state.counted.numpy().any()
-
-
-def test_robots_whose_episode_ended_are_parked_and_the_others_left_alone():
-    rng, outcome = np.random.default_rng(8), [Outcome.RUNNING, Outcome.GOAL, Outcome.INVALID]
-    before = [np.float32(rng.normal(size=size)) for size in ((3, 9), (3, 8), (3, 9))]
-    before[0][2, 0] = before[1][2, 3] = np.nan  # what made it invalid must not stay
-    arrays = [wp.array(values) for values in before]
-    park_ended(wp.array(outcome, dtype=int), wp.array([0.3, -0.4], dtype=float), *arrays)
-    q, qd, targets = (array.numpy() for array in arrays)
-    for values, now in zip(before, (q, qd, targets), strict=True):
-        np.testing.assert_array_equal(now[0], values[0])
-    parked = np.float32([0, 0, float(PARKING_HEIGHT), 0, 0, 0, 1, 0.3, -0.4])
-    np.testing.assert_array_equal(q[1:], [parked, parked])
-    np.testing.assert_array_equal(targets[1:, 7:], np.float32([[0.3, -0.4]] * 2))
-    assert not qd[1:].any()
 
 
 def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it():

@@ -104,31 +104,6 @@ def test_nearest_point(reach):
     assert near > 8
 
 
-def test_the_cut_of_a_cell_by_hand():
-    # One cell of 0.05 m, only its (high x, high y) corner raised to 0.1: the cut runs between the two other corners, so
-    # the low triangle is flat, and at (0.04, 0.04) the high one stands at 0.1 * (0.8 + 0.8 - 1) = 0.06.
-    terrain = make_terrain([[[0, 0], [0, 0.1]]])
-    height, normal, _, _ = sample(terrain, [[0.02, 0.02, 0], [0.04, 0.04, 0]], 0.01)
-    np.testing.assert_allclose(height, [0, 0.06], atol=1e-6)
-    # Its gradient is 0.1 / 0.05 = 2 along x and y: normal (-2, -2, 1) / 3.
-    np.testing.assert_allclose(normal, [[0, 0, 1], [-2 / 3, -2 / 3, 1 / 3]], atol=1e-6)
-
-
-def test_nearest_point_by_hand():
-    # A riser of 0.2 m in the cell between x = 0.2 and x = 0.25 (a 76 degree ramp): upward normal (-4, 0, 1) / sqrt(17).
-    grid = np.zeros((9, 9), np.float32)
-    grid[:, 5:] = 0.2
-    # The foot of the perpendicular from (0.2, 0.2, 0.1), half way up, is (0.1 / 4) * 4 / sqrt(17) = 0.0242536 away; the
-    # ground straight below is 0.1 m away.
-    # Over the upper edge: (0.24, 0.2, 0.23) is nearest to the edge (0.25, 0.2, 0.2): sqrt(0.01^2 + 0.03^2) = 0.0316228.
-    # Inside the riser by the same 0.0242536: (0.25, 0.2, 0.1).
-    points = [[0.2, 0.2, 0.1], [0.24, 0.2, 0.23], [0.25, 0.2, 0.1]]
-    _, _, distance, normal = sample(make_terrain(grid[None]), points, 0.06)
-    np.testing.assert_allclose(distance, [0.0242536, 0.0316228, -0.0242536], atol=1e-6)
-    riser = np.array([-4, 0, 1]) / np.sqrt(17)
-    np.testing.assert_allclose(normal, [riser, np.array([-1, 0, 3]) / np.sqrt(10), riser], atol=1e-5)
-
-
 @pytest.mark.parametrize(("nrow", "ncol"), [(161, 321), (2, 2), (10, 18)])
 def test_ceiling_is_an_upper_bound(nrow, ncol):
     grid = rough(nrow, ncol)
