@@ -42,11 +42,13 @@ def height_in_mujoco_c(robot, ground, z, duration_s):
 
 def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device):
     # At 20 degrees a = g (sin - mu cos), or rest where mu exceeds the tangent, 0.36; the box's own friction is 1.
+    # Downhill is half way between x and y, where a pyramid of friction would hold by mu / sqrt(2) alone.
     robot, angle = free_body(tmp_path, 'type="box" size="0.15 0.15 0.03"', mass=4.0, friction=1.0), np.radians(20.0)
-    frictions, duration_s = (0.15, 0.3, 0.5, 1.0), 0.8
-    sim = simulate(robot, [slope(-angle)] * 4, device, uniform(friction=frictions))
-    start = lying(4, 8.0, 4.0, 0.0, (0, 1, 0), angle)
-    start[:, :3] += 0.03 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+    frictions, duration_s, half = (0.15, 0.3, 0.45, 1.0), 0.8, np.sqrt(0.5)
+    along = np.arctan(half * np.tan(angle))
+    sim = simulate(robot, [slope(-along, -along)] * 4, device, uniform(friction=frictions))
+    start = lying(4, 8.0, 4.0, 0.0, (-half, half, 0), angle)
+    start[:, :3] += 0.03 * np.array([half * np.sin(angle), half * np.sin(angle), np.cos(angle)])
     stepper = Stepper(sim)
     put(sim, start)
     stepper.run(duration_s)

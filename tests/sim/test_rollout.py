@@ -9,6 +9,7 @@ from kernels.penalties import PENALTIES
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import step_penalties, to_mujoco
 from sim.rollout import Rollout
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
 from tests.sim.policies import Remembers, stretch
 from tests.sim.scenes import FLAT, crossing, positions, put, spike, velocities
@@ -34,14 +35,23 @@ def test_a_robot_that_stands_times_out(anymal, device):
     np.testing.assert_allclose(result.penalties[0, :, PENALTIES.index("vel_x")], 0.34, atol=0.1)
 
 
-def test_a_robot_that_walks_to_the_goal_stops_at_its_edge(robot, device):
-    # From (13, 4) +- 0.1 m, half a metre to go at .75 m/s; a physics step of .005 s takes it in by 1 cm at most.
-    rollout = crossing(robot, device, robot.policy_file, start=(13.0, 4.0), max_duration_s=3.0)
-    result = rollout.evaluate(FLAT[None], np.array([1]))
-    assert result.reached_goal.all()
+def test_the_shipped_controller_walks_to_the_edge_of_the_goal(robot, device):
+    terrains = np.stack([FLAT, crossing_terrain("stairs_up_down", 4, 3)])
+    rollout = Rollout(robot, robot.policy_file, num_terrains=2, num_replicas=4, device=device)
+    result = rollout.evaluate(terrains, np.array([1, 2], np.uint32))
+    assert result.reached_goal.all() and not result.fallen.any()
+    # 11.5 m at 0.75 m/s: it keeps up with its command, and does not run ahead of it.
+    assert ((result.duration_s > 14.0) & (result.duration_s < 18.0)).all()
+    # A physics step of .005 s takes it in by 1 cm at most.
     distance = np.linalg.norm(result.final_position[..., :2] - [14.0, 4.0], axis=-1)
     assert ((distance > 0.49) & (distance < 0.5)).all()
-    assert (result.duration_s > 0.3).all()
+
+
+def test_a_robot_whose_legs_whip_as_it_falls_has_failed(cassie, device):
+    # On this terrain all eight fall, and two of them swing an ankle at more than 100 rad/s before the pelvis is down.
+    rollout = Rollout(cassie, cassie.policy_file, num_terrains=1, num_replicas=8, device=device)
+    result = rollout.evaluate(SUPER_GAUSSIAN.hard_random(300, 0)[7:8], np.array([7], np.uint32))
+    assert result.base_collision.sum() >= 6 and not result.invalid.any()
 
 
 def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
@@ -96,13 +106,9 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout):
     assert np.isfinite(result.penalties[~expected]).all()
     # The step that broke is the first after the first poll at 0.1 s.
     assert result.duration_s[1, 2] == pytest.approx(0.105, abs=0.0051)
-    # Nothing of it is left the next time: the solver's memory of a world that was not finite is cleared too.
-    again = rollout.evaluate(grids, seeds)
-    assert not again.invalid.any()
     if rollout.sim.device == "cpu":
         for name in ("penalties", "outcome", "fallen", "duration_s", "final_position"):
             np.testing.assert_array_equal(getattr(result, name)[~expected], getattr(clean, name)[~expected])
-            np.testing.assert_array_equal(getattr(again, name), getattr(clean, name))
 
 
 def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_they_act_in(anymal, device):

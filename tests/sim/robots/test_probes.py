@@ -6,7 +6,7 @@ import newton
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import ConvexHull, Delaunay
+from scipy.spatial import ConvexHull
 
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import (
@@ -18,9 +18,6 @@ from sim.robots.probes import (
     max_spacing,
     shape_strips,
 )
-from sim.terrain import SPACING
-from tests.kernels import oracle
-from tests.sim.scenes import Stepper, free_body, lying, positions, put, simulate
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2.0
 
@@ -140,32 +137,6 @@ def test_a_mesh_is_scaled_and_collides_as_its_hull():
 def test_a_mesh_without_volume_is_refused():
     with pytest.raises(ValueError, match="volume"):
         hull_probes(CORNERS * [1, 1, 0])
-
-
-def test_no_edge_slips_between_the_probes(device, tmp_path):
-    # Ridges of one node, as sharp as the grid makes them, under a lying plate at twelve places: a ridge enters its hull
-    # by no more than the tolerance and what the contacts give.
-    plate, _ = MESHES["plate"]
-    height, num = 0.3, 12
-    grid = np.zeros((161, 321), np.float32)
-    grid[:, [158, 162]] = height
-    robot = free_body(tmp_path, 'type="mesh" mesh="shape"', mass=1.0)
-    points = " ".join(f"{value:.9f}" for value in np.ravel(plate))
-    asset = f'<asset><mesh name="shape" vertex="{points}"/></asset><worldbody>'
-    robot.model_file.write_text(robot.model_file.read_text().replace("<worldbody>", asset))
-    sim = simulate(robot, [grid] * num, device)
-    q = lying(num, 8, 4, height + 0.012)
-    q[:, 0] += np.linspace(-0.02, 0.02, num)
-    put(sim, q)
-    Stepper(sim).run(1.0)
-    tolerance = hull_probes(plate).tolerance
-    # Points of both ridges, lowered by the tolerance and 2 mm: outside of the plate, seen from the plate.
-    low = height - tolerance - 0.002
-    ridges = np.array([[x * SPACING, 4 + y, low] for x in (158, 162) for y in np.linspace(-0.05, 0.05, 21)])
-    for row in positions(sim):
-        assert row[2] > height - tolerance
-        local = (ridges - row[:3]) @ oracle.rotation_matrix(row[3:7])
-        assert (Delaunay(plate).find_simplex(local) < 0).all()
 
 
 def test_probes_of_the_robots_stand_where_their_geoms_are(robot):
