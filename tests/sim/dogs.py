@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from tests.docs import code_of
+
 LEGS = {"FL": (0.2, 0.12), "FR": (0.2, -0.12), "HL": (-0.2, 0.12), "HR": (-0.2, -0.12)}
 JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "knee"))
 TRUNK, THIGH, SHANK, FOOT = (0.25, 0.08, 0.05), (0.03, 0.15), (0.015, 0.13), 0.025
@@ -58,70 +60,19 @@ def mjcf(*, drive: str = DRIVE, trunk: str | None = None, asset: str = "") -> st
 """
 
 
-def _link(name: str, mass: float, com: float, inertia: tuple[float, float, float], shape: str, z: float = 0.0) -> str:
-    x, y, z_inertia = inertia
-    return f"""
-  <link name="{name}">
-    <inertial><origin xyz="0 0 {com}"/><mass value="{mass}"/>
-      <inertia ixx="{x}" iyy="{y}" izz="{z_inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><origin xyz="0 0 {z}"/><geometry>{shape}</geometry></collision>
-  </link>"""
-
-
-def _joint(name: str, parent: str, child: str, xyz: str, limit: str = "") -> str:
-    return f"""
-  <joint name="{name}" type="{"revolute" if limit else "fixed"}">
-    <parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}"/><axis xyz="0 1 0"/>{limit}
-  </joint>"""
-
-
 def urdf(*, trunk: str | None = None) -> str:
-    """The same dog as a URDF, with a capsule tag, cylinders, visuals that are nowhere, and feet on fixed joints."""
-    trunk = trunk or f'<box size="{" ".join(str(2 * half) for half in TRUNK)}"/>'
-    thigh = f'<capsule radius="{THIGH[0]}" length="{THIGH[1]}"/>'
-    shank = f'<cylinder radius="{SHANK[0]}" length="{SHANK[1]}"/>'
+    """The URDF of docs/robots.md with all legs, a capsule tag, and visuals that are nowhere."""
+    (text,) = code_of("docs/robots.md", "xml")
+    before, _, leg = text.partition("  <!-- FR, HL")[0].partition('  <link name="FL_thigh">')
+    leg = f'  <link name="FL_thigh">{leg.replace("cylinder", "capsule", 1)}'
+    if trunk is not None:
+        before = before.replace('<box size="0.5 0.16 0.1"/>', trunk)
     missing = '<visual><geometry><mesh filename="package://nowhere/trunk.dae"/></geometry></visual>'
-    parts = [_link("trunk", 8.0, 0.0, (0.03, 0.2, 0.2), trunk).replace("<collision>", f"{missing}<collision>")]
-    for leg, (x, y) in LEGS.items():
-        hip, knee = (
-            f'<limit lower="{span[0]}" upper="{span[1]}" effort="30" velocity="30"/>'
-            for span in ((-1.5, 2.5), (-2.6, -0.1))
-        )
-        parts += [
-            _link(f"{leg}_thigh", 0.8, -0.07, (0.002, 0.002, 0.0005), thigh, -THIGH[1] / 2),
-            _link(f"{leg}_shank", 0.3, -0.07, (0.0006, 0.0006, 0.0001), shank, -SHANK[1] / 2),
-            _link(f"{leg}_foot", 0.1, 0.0, (0.00005, 0.00005, 0.00005), f'<sphere radius="{FOOT}"/>'),
-            _joint(f"{leg}_hip", "trunk", f"{leg}_thigh", f"{x} {y} 0", hip),
-            _joint(f"{leg}_knee", f"{leg}_thigh", f"{leg}_shank", "0 0 -0.15", knee),
-            _joint(f"{leg}_ankle", f"{leg}_shank", f"{leg}_foot", "0 0 -0.15"),
-        ]
-    return f'<robot name="dog">{"".join(parts)}\n</robot>\n'
+    before = before.replace("<collision>", f"{missing}<collision>")
+    legs = (leg.replace("FL_", f"{name}_").replace("0.2 0.12 0", f"{x} {y} 0") for name, (x, y) in LEGS.items())
+    return f"{before}{''.join(legs)}</robot>\n"
 
 
-SETTINGS = '''"""The dog's settings, as docs/robots.md describes them."""
-
-from sim.robots.robot import RobotCfg
-from sim.robots.training import TrainingCfg
-
-LEGS = ("FL", "FR", "HL", "HR")
-
-ROBOT = RobotCfg(
-    name="dog",
-    model_file="{model}",
-    base_geoms=("trunk",),
-    foot_geoms=tuple(f"{{leg}}_foot" for leg in LEGS),
-    limb_geoms=tuple(f"{{leg}}_{{part}}" for leg in LEGS for part in ("thigh", "shank")),
-    joint_names=tuple(f"{{leg}}_{{joint}}" for leg in LEGS for joint in ("hip", "knee")),
-    default_joint_pos=(0.6, -1.2) * 4,
-    default_base_height=0.29,
-    footprint=(0.3, 0.2),
-    scan_x=(-0.4, -0.2, 0.0, 0.2, 0.4),
-    scan_y=(-0.2, 0.0, 0.2),
-    contact_force_limit=150.0,
-    penalties=("yaw_rate", "vel_x", "vel_y", "collision"),
-    collision_bit=False,{more}
-)
-'''
 GAINS = """
     stiffness=(60.0,) * 8,
     damping=(2.0,) * 8,
@@ -131,31 +82,25 @@ CONTROLLER = '''"""A trot by the clock: hips swing, and a leg that swings forwar
 
 import torch
 
-from sim.policy.adapters import read_row
-
 
 class Trot:
-    """Diagonal legs in turn, three times a second; steers by shorter strides on the inner side."""
+    """Diagonal legs in turn, three times a second."""
 
     faultline_factory = True
 
     def __init__(self, robot, device):
         self.robot, self.step = robot, 0
         self.phase = torch.tensor([0.0, 0.5, 0.5, 0.0], device=device)
-        self.left = torch.tensor([1.0, -1.0, 1.0, -1.0], device=device)
 
     def reset(self):
         self.step = 0
 
     def __call__(self, row):
-        sensed = read_row(row, self.robot)
         turn = 2.0 * torch.pi * (3.0 * self.step * self.robot.control_dt + self.phase)
         self.step += 1
-        stride = 0.35 - 0.15 * self.left * sensed.command[:, 2:3]
-        hip = stride * torch.cos(turn)
-        knee = -0.5 * torch.clamp(torch.sin(turn), min=0.0).expand_as(hip)
-        legs = torch.stack([hip - 0.5 * knee, knee], dim=2)
-        return legs.flatten(1) / self.robot.action_scale
+        knee = -0.5 * torch.sin(turn).clamp(min=0.0)
+        legs = torch.stack([0.35 * torch.cos(turn) - 0.5 * knee, knee], dim=1)
+        return legs.flatten().expand(len(row), -1) / self.robot.action_scale
 '''
 
 
@@ -165,7 +110,9 @@ def write_dog(folder: Path, *, model: str | None = None, suffix: str = "xml", mo
     (folder / f"dog.{suffix}").write_text(mjcf() if model is None else model)
     (folder / "dog_trot.py").write_text(CONTROLLER)
     file = folder / "dog.py"
-    file.write_text(SETTINGS.format(model=f"dog.{suffix}", more=more))
+    (text,) = (code for code in code_of("docs/robots.md", "python") if code.startswith("# mine/dog.py"))
+    text = text.replace("dog.xml", f"dog.{suffix}").removesuffix(")\n")
+    file.write_text(f"from sim.robots.training import TrainingCfg\n{text}{more}\n)\n")
     return file
 
 

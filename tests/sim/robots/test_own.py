@@ -50,7 +50,7 @@ def test_a_file_is_a_robot(tmp_path, monkeypatch):
 
 def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
     file = write_dog(tmp_path)
-    replace_once(file, "    default_base_height=0.29,\n", "")
+    replace_once(file, "default_base_height=0.29,", "")
     # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
     assert get_robot(str(file)).default_base_height == pytest.approx(0.2911, abs=3e-3)
 

@@ -3,29 +3,10 @@
 import shutil
 from pathlib import Path
 
-RIDGES = '''
-import torch
+from tests.docs import code_of
 
-
-class Ridges:
-    """Ridges across the way: their height, how far apart they are, and how they are turned."""
-
-    num_genes = 3
+MORE = """
     sigma0 = 0.4
-
-    def rasterise(self, genes, x, y):
-        height, distance, turn = (genes[:, k, None, None] for k in range(3))
-        along = (x - 8) * torch.cos(0.5 * turn) + (y - 4) * torch.sin(0.5 * turn)
-        ridges = torch.cos(2 * torch.pi * along / (0.9 + 0.5 * distance)).clamp(min=0) ** 2
-        return (0.15 + 0.15 * height) * ridges * ((x > 4) & (x < 12))
-
-    def hard_random(self, count, rng):
-        genes = rng.uniform(-1, 1, (count, 3))
-        genes[:, 0] = 1
-        return genes
-
-    def describe(self, genes):
-        return f"ridges of {0.15 + 0.15 * genes[0]:.2f} m"
 
     def parts(self, genes):
         return ["ridges"]
@@ -33,13 +14,13 @@ class Ridges:
     def without(self, genes, parts):
         genes[:, 0] = -1
         return genes
-'''
+"""
 
 
 def write_ridges(folder: Path, name: str = "space.py") -> str:
-    """Writes the space; returns what a command line calls it."""
+    """Writes the space of docs/terrains.md, with parts; returns what a command line calls it."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text(RIDGES)
+    (folder / name).write_text(code_of("docs/terrains.md", "python")[1] + MORE)
     return f"{folder / name}:Ridges"
 
 

@@ -51,7 +51,7 @@ def test_a_space_from_a_file(ridges):
     assert heights[80, 169] == 0.0 and not heights[:, :80].any()
     assert heights_of(np.array([[5.0, 0.0, 0.0]]), space).max() == pytest.approx(0.3)  # genes are clipped
     assert (space.hard_random(4, 0)[:, 0] == 1).all()
-    assert space.describe([0.0, 0.0, 0.0]) == "ridges of 0.15 m"
+    assert space.describe([0.0, 0.0, 0.0]) == "ridges of 0.15 m, 0.90 m apart"
     assert not heights_of(space.without(space.hard_random(2, 0), [0]), space).any()
 
 
