@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from qd.archive import FRESH, Archive, FaultCounts, FreshValues
 from sim.files.records import robot_identity
 from sim.robots.shipped import ROBOTS
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 OBSERVATIONS, ACTIONS = 235, 12
 
@@ -49,6 +50,19 @@ def small_archive(num_elites: int = 3) -> Archive:
         episodes=np.full(num_elites, 4),
         iteration=np.arange(num_elites) + 1,
     )
+
+
+def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Archive:
+    """So many elites with hard-random genes, one a cell, which all of a robot's penalties make and nobody crosses."""
+    columns, rates = np.full((num_elites, 6), 1.0 / 6.0), np.zeros(num_elites)
+    return replace(
+        small_archive(num_elites), robot=robot, **robot_identity(ROBOTS[robot]), iterations=3,
+        penalties=ROBOTS["anymal"].penalties, scales=(1.0,) * 6, ratios=columns, penalty_mean=columns,
+        penalty_std=columns, collision_rate=rates, goal_rate=rates, fallen_rate=rates,
+        genes=np.clip(SUPER_GAUSSIAN.hard_random(max(num_elites, 1), seed)[:num_elites], -1.0, 1.0),
+        fitness=np.linspace(9.0, 1.0, num_elites), end_position=np.full((num_elites, 2), 6.0, np.float32),
+        iteration=np.ones(num_elites, np.int64),
+    )  # fmt: skip
 
 
 def fresh_values(archive: Archive) -> FreshValues:

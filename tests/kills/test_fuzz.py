@@ -1,4 +1,4 @@
-"""Damaged files into the readers of the three formats that runs go on from, and files that would run code."""
+"""Damaged files into the readers of the four formats that runs leave and go on from, and files that would run code."""
 
 import contextlib
 import hashlib
@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 import torch
 
-from qd.archive import read_archive
+from qd.archive import read_archive, write_archive
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.cross import Cache
 from sim.policy.loaders import load_policy
 from sim.recording.file import read_recording
 from sim.robots.find import get_robot
+from tests.builders import judged_archive
 from tests.kills import runs
 from tests.kills.faults import run_child
 from train.ppo.checkpoint import read_checkpoint
@@ -53,10 +54,17 @@ def read_training(file: Path) -> Any:
     return content["iter"], {name: value.numpy().tobytes() for name, value in content["actor_state_dict"].items()}
 
 
+def read_elites(file: Path) -> Any:
+    return pickle.dumps(read_archive(file))
+
+
 def read_crossings(file: Path) -> Any:
     """None if the cache takes the file for absent."""
     arrays = Cache(file.parent).read(file.stem)
     return None if arrays is None else {name: array.tobytes() for name, array in arrays.items()}
+
+
+READERS = (read_search, read_training, read_elites, read_crossings)
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +75,12 @@ def formats(tmp_path_factory) -> dict[Callable[[Path], Any], Path]:
     state = {"metrics": [{"iteration": 1, "elites": 3}], "genes": np.linspace(-1, 1, 200, dtype=np.float32)}
     save_checkpoint(folder / "checkpoint.bin", state)
     Cache(folder).write("key", {"outcome": np.arange(80, dtype=np.uint8), "duration_s": np.linspace(0, 20, 80)})
-    files = ("checkpoint.bin", "training/checkpoint.pt", "key.npz")
-    return dict(zip((read_search, read_training, read_crossings), map(folder.joinpath, files), strict=True))
+    write_archive(folder / "archive.npz", judged_archive())
+    files = ("checkpoint.bin", "training/checkpoint.pt", "archive.npz", "key.npz")
+    return dict(zip(READERS, map(folder.joinpath, files), strict=True))
 
 
-@pytest.mark.parametrize("read", [read_search, read_training, read_crossings])
+@pytest.mark.parametrize("read", READERS)
 def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, read):
     whole, expected, num_refused = formats[read].read_bytes(), read(formats[read]), 0
     assert expected is not None

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from sim.rollout import RolloutResult
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
 SCALES = (1.0, 2.0, 1.0, 4.0, 1.0, 1.0)
+GOAL, HIT, LATE, OUT, BAD = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT, Outcome.INVALID
 
 
 def make_result(penalties, *, base_collision=None, invalid=None, late=None, names=PENALTIES) -> RolloutResult:
@@ -20,11 +22,10 @@ def make_result(penalties, *, base_collision=None, invalid=None, late=None, name
     collided = never if base_collision is None else np.asarray(base_collision, dtype=bool)
     excluded = never if invalid is None else np.asarray(invalid, dtype=bool)
     cases = [excluded, collided, never if late is None else np.asarray(late, dtype=bool)]
-    kinds = [Outcome.INVALID, Outcome.BASE_COLLISION, Outcome.TIME_OUT]
     return RolloutResult(
         penalties=penalties,
         penalty_names=tuple(names[: penalties.shape[2]]),
-        outcome=np.select(cases, kinds, Outcome.GOAL).astype(np.uint8),
+        outcome=np.select(cases, [BAD, HIT, LATE], GOAL).astype(np.uint8),
         invalidity=np.where(excluded, np.uint8(2), np.uint8(0)),  # Invalidity.STATE
         fallen=never,
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
@@ -35,6 +36,20 @@ def make_result(penalties, *, base_collision=None, invalid=None, late=None, name
         busy_steps=300 * len(penalties),
         wall_s=0.5 * len(penalties),
     )
+
+
+def result_of(outcomes, *, names=PENALTIES[:2], vel_x=0.0, reward=None, **given) -> RolloutResult:
+    """Episodes of 12 s that ended so, shape (T, R), without penalties but for ``vel_x``; nobody fell unless given."""
+    outcome = np.array(outcomes, np.uint8)
+    invalid = outcome == BAD
+    penalties = np.zeros((*outcome.shape, len(names)))
+    penalties[..., 1] = vel_x
+    penalties[invalid] = np.nan
+    given = {"duration_s": np.full(outcome.shape, 12.0, np.float32)} | given
+    if reward is not None:
+        given["reward"] = np.where(invalid, np.nan, reward)
+    given = {name: np.array(values) for name, values in given.items()}
+    return replace(make_result(penalties, invalid=invalid, names=names), outcome=outcome, **given)
 
 
 def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> RolloutResult:

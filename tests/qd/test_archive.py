@@ -55,22 +55,6 @@ def test_scores_by_hand():
     assert archive.reachable_coverage == 3 / 10  # two ratios have 10 reachable cells
 
 
-def test_flipped_bytes_never_raise_anything_but_a_value_error(tmp_path):
-    file = tmp_path / "archive.npz"
-    with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
-        read_archive(file)
-    write_archive(file, judged_archive())
-    whole = file.read_bytes()
-    refused = 0
-    for position in np.random.default_rng(1).integers(0, len(whole), 200):
-        file.write_bytes(whole[:position] + bytes([whole[position] ^ 0xFF]) + whole[position + 1 :])
-        try:
-            read_archive(file)
-        except ValueError:
-            refused += 1
-    assert refused > 100  # the rest hit fields of the zip format that nobody reads
-
-
 def changed_file(folder, archive, **changes):
     """The file of an archive with other arrays, or without those that are None."""
     write_archive(folder / "archive.npz", archive)
@@ -81,6 +65,8 @@ def changed_file(folder, archive, **changes):
 
 @pytest.mark.parametrize("name", ["cell", "end_position", "robot_sha256", "fresh_reproduced", "certifiers"])
 def test_a_file_that_lacks_an_array_is_refused_by_its_name(tmp_path, name):
+    with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
+        read_archive(tmp_path / "archive.npz")
     changed_file(tmp_path, judged_archive(), **{name: None})
     with pytest.raises(ValueError, match=name):
         read_archive(tmp_path)

@@ -99,16 +99,6 @@ def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_t
     assert not np.isin(hard.ask(), first).all(axis=1).any()
 
 
-def test_cma_me_is_judged_by_the_archive_it_fills():
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, method="cma_me"))
-    search.ask()
-    search.tell(evaluation_with(np.arange(12), [1.0] * 12), 1)
-    before = [emitter.restarts for emitter in search.emitters]
-    search.ask()
-    search.tell(evaluation_with(np.arange(12), [0.5] * 12), 2)  # nothing new: both start again at an elite
-    assert [emitter.restarts - old for emitter, old in zip(search.emitters, before, strict=True)] == [1, 1]
-
-
 def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     search = make_search(SchedulerCfg(emitters=5, batch_size=2, method="cma_me+cma_mae+uniform_random"))
     assert [type(emitter) for emitter in search.emitters] == [

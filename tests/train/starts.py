@@ -9,7 +9,7 @@ import torch
 
 from qd.archive import write_archive
 from qd.evaluate.marks import TRAINED_ON, marks_of
-from tests.train.archives import make_archive
+from tests.builders import make_archive
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 

@@ -17,9 +17,8 @@ from sim.policy.loaders import load_policy
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.spaces import registry as spaces
-from tests.builders import fresh_values
+from tests.builders import fresh_values, make_archive
 from tests.sim.spaces.spaces import move, write_ridges
-from tests.train.archives import make_archive
 from tests.train.starts import PPO, make_places, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import Finetune

@@ -16,10 +16,8 @@ from qd.workers.evaluator import Compute
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.robots.find import get_robot
-from tests.builders import fresh_values
-from tests.qd.stand_in import Stub, compute_by
-from tests.train.archives import make_archive
-from tests.train.results import result_of
+from tests.builders import fresh_values, make_archive
+from tests.qd.stand_in import Stub, compute_by, result_of
 from tests.train.starts import PPO, write_actor
 from train import harden as module
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RoundSearchCfg

@@ -9,7 +9,7 @@ from qd.evaluate.measures import Measured, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Tables, make_tables
 from sim.robots.find import get_robot
-from tests.train.results import BAD, GOAL, HIT, LATE, result_of
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
 
 def make_set(name: str, count: int, first: int = 0) -> TerrainSet:

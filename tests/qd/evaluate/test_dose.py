@@ -12,8 +12,7 @@ from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
 from sim.files.command import run_command
 from sim.spaces.dose import parse_doses
 from tests.qd.robots import Robots
-from tests.qd.stand_in import compute_by
-from tests.train.results import BAD, GOAL, HIT, LATE, result_of
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 
 STRONG, WEAK = "tests.sim.policies:stand", "tests.sim.policies:stretch"
 LIMITS = {STRONG: 0.27, WEAK: 0.12}

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,9 @@ from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
-from sim.files.records import robot_digest
-from sim.robots.find import get_robot
+from tests.builders import make_archive
 from tests.qd.robots import Robots
 from tests.qd.stand_in import PENALTIES, compute_by
-from tests.train.archives import make_archive
 from tests.train.starts import write_trained
 
 STAND, STRETCH = "tests.sim.policies:stand", "tests.sim.policies:stretch"
@@ -29,8 +26,7 @@ CPU = Compute()
 
 def write_elites(path, count, *, robot="anymal", seed=0):
     """An archive file of made-up elites."""
-    archive = make_archive(count, robot=robot, seed=seed)
-    write_archive(path, replace(archive, robot_sha256=robot_digest(get_robot(robot))))
+    write_archive(path, make_archive(count, robot=robot, seed=seed))
     return path
 
 

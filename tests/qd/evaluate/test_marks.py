@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
-from tests.train.archives import make_archive
+from tests.builders import make_archive
 from tests.train.starts import write_actor, write_trained
 
 GENES = make_archive(20).genes

@@ -13,7 +13,7 @@ from qd.evaluate.measures import (
     terrain_rates,
     velocity_error,
 )
-from tests.train.results import BAD, GOAL, HIT, LATE, OUT, result_of
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, OUT, result_of
 
 
 def test_rates_of_a_terrain():

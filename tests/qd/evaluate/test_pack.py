@@ -30,8 +30,7 @@ from sim.files.records import identity
 from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.qd.robots import OTHER, Robots, bump_stops
-from tests.qd.stand_in import compute_by
-from tests.train.results import BAD, GOAL, HIT, LATE, result_of
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 
 CPU = Compute(workers="1")
 

@@ -23,12 +23,10 @@ from qd.evaluate.sets import (
 )
 from qd.run.settings import as_settings
 from sim.bank import heights_of
-from sim.files.records import robot_digest
 from sim.spaces.course import COURSE
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import fresh_values
+from tests.builders import fresh_values, make_archive
 from tests.qd.searches import CFG
-from tests.train.archives import make_archive
 
 PARTS = ("test", "validation")
 
@@ -142,10 +140,10 @@ def test_the_far_third_is_the_farthest():
         np.testing.assert_array_equal(getattr(far, field), getattr(whole, field)[places])
 
 
-def write_run(folder: Path, archive: Archive, robot, seed: int | None = None) -> Path:
+def write_run(folder: Path, archive: Archive, seed: int | None = None) -> Path:
     """A run with its config, as far as it is read for the seed."""
     folder.mkdir()
-    write_archive(folder / "archive.npz", replace(archive, robot_sha256=robot_digest(robot)))
+    write_archive(folder / "archive.npz", archive)
     if seed is not None:
         settings = as_settings(replace(CFG, seed=seed))
         config = {"settings": settings, "iterations": 3, "device": "CPU", "sessions": []}
@@ -156,17 +154,17 @@ def write_run(folder: Path, archive: Archive, robot, seed: int | None = None) ->
 def test_an_independent_archive_is_of_another_search(tmp_path, anymal):
     archive, kin = make_archive(20), make_archive(20, seed=4)
     kin.genes[3] = archive.genes[5]
-    trained = write_run(tmp_path / "trained", archive, anymal, seed=0)
-    other = write_run(tmp_path / "other", make_archive(20, seed=1), anymal, seed=1)
+    trained = write_run(tmp_path / "trained", archive, seed=0)
+    other = write_run(tmp_path / "other", make_archive(20, seed=1), seed=1)
     for path, archive_path in ((other, trained), (other / "archive.npz", trained), (trained, None)):
         assert len(read_independent(path, archive_path, anymal)) == 20
     course = replace(make_archive(9), space="course", genes=COURSE.hard_random(9, 0))
     for path, field in (
-        (write_run(tmp_path / "kin", kin, anymal, seed=5), "1 elites in both"),
-        (write_run(tmp_path / "same-seed", make_archive(20, seed=2), anymal, seed=0), "seed 0"),
-        (write_run(tmp_path / "cassie", make_archive(9, robot="cassie"), anymal), "cassie"),
-        (write_run(tmp_path / "empty", make_archive(0), anymal), "empty"),
-        (write_run(tmp_path / "course", course, anymal), "course"),
+        (write_run(tmp_path / "kin", kin, seed=5), "1 elites in both"),
+        (write_run(tmp_path / "same-seed", make_archive(20, seed=2), seed=0), "seed 0"),
+        (write_run(tmp_path / "cassie", make_archive(9, robot="cassie")), "cassie"),
+        (write_run(tmp_path / "empty", make_archive(0)), "empty"),
+        (write_run(tmp_path / "course", course), "course"),
     ):
         with pytest.raises(ValueError, match=field):
             read_independent(path, trained, anymal)

@@ -13,7 +13,7 @@ from qd.evaluate.show import show_tables
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
 from sim.files.records import robot_identity
 from tests.qd.evaluate.made import make_measured, make_set
-from tests.train.results import BAD, GOAL, HIT, LATE, result_of
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
 ABOUT = {who: {"policy": f"{who}.pt", "sha256": sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))}
 SET = replace(make_set("generated", 5), numbers=np.array([10, 3, 7, 5, 8]))

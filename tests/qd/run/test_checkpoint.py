@@ -1,9 +1,7 @@
 import hashlib
-import os
 import pickle
 import zlib
 
-import numpy as np
 import pytest
 
 from qd.run import checkpoint
@@ -15,38 +13,18 @@ def wrap(payload: bytes) -> bytes:
     return b"faultline search checkpoint 1\n" + hashlib.sha256(payload).digest() + payload
 
 
-class Bomb:
-    def __init__(self, function, *arguments):
-        self.call = function, arguments
-
-    def __reduce__(self):
-        return self.call
-
-
-BOMBS = [
-    Bomb(os.system, "touch {}"),
-    {"archive": Bomb(eval, "open('{}', 'w')")},
-    Bomb(np.testing.measure, "open('{}', 'w')"),
-    Bomb(pickle.loads, b"cos\nsystem\n"),
-]
-
-
-@pytest.mark.parametrize("content", BOMBS)
-def test_a_pickle_that_would_run_code_is_refused(tmp_path, content):
-    target, path = tmp_path / "ran", tmp_path / "checkpoint.bin"
-    path.write_bytes(wrap(zlib.compress(pickle.dumps(content, protocol=4).replace(b"{}", str(target).encode()))))
-    with pytest.raises(ValueError, match="is no checkpoint of a search"):
-        load_checkpoint(path)
-    assert not target.exists()
-
-
-def test_admitted_modules_are_no_way_to_their_neighbours(tmp_path):
-    # Protocol 4 names may have dots: numpy.dtype is admitted, what hangs on it is not.
-    path = tmp_path / "checkpoint.bin"
-    for name in (b"dtype.__init__", b"dtype.mro", b"ndarray.tofile", b"os"):
-        path.write_bytes(wrap(zlib.compress(b"\x80\x04\x8c\x05numpy\x8c" + bytes([len(name)]) + name + b"\x93.")))
-        with pytest.raises(ValueError, match="is no part of a search"):
-            load_checkpoint(path)
+@pytest.mark.parametrize(
+    "name",
+    [  # protocol 4 names may have dots: numpy.dtype is admitted, what hangs on it is not
+        "posix system", "builtins eval", "pickle loads", "numpy.testing measure", "numpy dtype.__init__",
+        "numpy dtype.mro", "numpy ndarray.tofile", "numpy os",
+    ],
+)  # fmt: skip
+def test_what_is_no_part_of_a_search_is_never_looked_up(tmp_path, name):
+    names = b"".join(b"\x8c" + bytes([len(part)]) + part.encode() for part in name.split())
+    (tmp_path / "checkpoint.bin").write_bytes(wrap(zlib.compress(b"\x80\x04" + names + b"\x93.")))
+    with pytest.raises(ValueError, match="is no part of a search"):
+        load_checkpoint(tmp_path / "checkpoint.bin")
 
 
 def test_a_bomb_of_zeros_is_refused(tmp_path, monkeypatch):
