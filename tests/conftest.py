@@ -22,7 +22,6 @@ from sim.files.records import provenance
 from sim.robots.find import get_robot
 from sim.robots.shipped import ROBOTS
 from sim.simulation import Simulation
-from tests.sim.scenes import Stepper
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
 
@@ -102,9 +101,3 @@ def eight(robot, device):
     """Eight robots, each on a grid of its own; a test puts ground and robots where it wants them."""
     bank = TerrainBank(8, device=device)
     return Simulation(robot, bank, np.arange(8))
-
-
-@pytest.fixture(scope="session")
-def eight_stepper(eight):
-    """Steps the eight robots by four physics steps at a time."""
-    return Stepper(eight)

@@ -12,7 +12,6 @@ import trimesh
 from PIL import Image
 
 from sim.maps.heightmap import as_terrain, read_heightmap
-from sim.maps.hfield import as_hfield
 from sim.maps.terrain_files import ExportedTerrain, block_of, glb_of, mjcf_of, npy_of, stl_of, write_terrain
 from sim.robots.shipped import ROBOTS
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -65,16 +64,6 @@ def test_a_scene_has_the_simulations_options_and_takes_its_robots(rough):
     for _ in range(100):
         mujoco.mj_step(model, data)
     assert 0.2 < data.xpos[1, 2] - 0.2 < 0.7  # it has come down on the ground, and not through it
-
-
-def test_a_margin_continues_the_edge(rough):
-    plain, wide = as_hfield(rough), as_hfield(rough, margin=((10, 20), (30, 40)))
-    assert wide.data.shape == (NUM_COLS + 70, NUM_ROWS + 30)
-    np.testing.assert_array_equal(wide.data[40:-30, 10:-20], plain.data)  # its first row has the highest x
-    assert (wide.data[:40, 10:-20] == plain.data[0]).all()
-    # 8 m and 1.5 m of margin along y, 16 m and 3.5 m along x; more beyond the high ends moves the middle.
-    assert wide.size[:2] == pytest.approx((4.75, 9.75))
-    assert wide.position[:2] == pytest.approx((8.25, 4.25))
 
 
 def test_an_image_of_flat_ground_reads_back_and_says_where_it_lies(tmp_path):

@@ -74,15 +74,6 @@ def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
         load_policy(tmp_path / "gone.pt", anymal, "cpu")
 
 
-def test_a_controller_trained_for_another_robot_is_warned_of(tmp_path, anymal, capsys):
-    path = save_checkpoint(tmp_path / "mine.pt", STATE)
-    (tmp_path / "mine.train.json").write_text('{"settings": {"robot_sha256": "0123456789abcdef"}}')
-    load_policy(path, anymal, "cpu")
-    assert "0123456789ab" in capsys.readouterr().err
-    load_policy(anymal.policy_file, anymal, "cpu")
-    assert capsys.readouterr().err == ""
-
-
 def runner_of(policy, observation, action):
     """A runner in the middle of episodes: none begins."""
     return PolicyRunner(policy, observation, action, wp.zeros(len(action), dtype=int, device=action.device))

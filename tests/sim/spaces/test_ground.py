@@ -5,7 +5,6 @@ import pytest
 
 from sim.bank import heights_of, terrains_of
 from sim.spaces.course import COURSE
-from sim.spaces.ground import values_of
 from sim.spaces.registry import get_space, identity, load_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels.course_oracle import course, element
@@ -90,13 +89,6 @@ def test_an_element_of_a_course_has_its_ground_behind_it():
     )
     flat = np.concatenate([course()[0], np.full(64, -1.0)])
     assert space.describe(flat).splitlines()[0] == "flat ground"
-
-
-def test_words_are_the_numbers_of_the_device():
-    genes = BOTH.uniform_random(1, 4)
-    ground = terrains_of(genes, BOTH)[1]
-    for kind, first, values in (("friction", 64, ground.friction), ("softness", 96, ground.time_constant_s)):
-        np.testing.assert_allclose(values_of(kind, genes[0, first : first + 32]), values.ravel(), rtol=1e-5)
 
 
 def test_ground_is_named_by_the_space(tmp_path):

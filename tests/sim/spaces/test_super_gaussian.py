@@ -48,10 +48,6 @@ def test_what_is_no_space_and_no_genes_is_refused(call, field):
         call()
 
 
-def test_clip_keeps_the_inside_and_cuts_the_outside():
-    assert clipped([-1.5, 0.25, 7.0]).tolist() == [-1.0, 0.25, 1.0]
-
-
 def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
     genes = SUPER_GAUSSIAN.hard_random(2, 5)
     five = SuperGaussian(num_bumps=5)
