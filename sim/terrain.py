@@ -173,26 +173,23 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     return np.pad(tile, ((0, 0), (_FIRST_COL, _FIRST_COL)), mode="edge").astype(np.float32)
 
 
-def training_tiles(num_levels: int, num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray]:
+def training_tiles(num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray]:
     """The tiles of the training curriculum: a row a level from 0 up, a column a type.
 
     Columns go to :data:`TILE_TYPES` in order, in shares .1, .1, .35, .25, .2; every other smooth slope is inverted.
 
     Args:
-        num_levels: Number of levels, 1 to 10; level l has difficulty l / 10 whatever their number.
         num_columns: Number of columns; 20 and its multiples give the shares exactly.
         seed: Int or Generator.
 
     Returns:
-        Heights [m] float32 of shape (num_levels * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
+        Heights [m] float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
         index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
     """
-    _check_positive(num_levels=num_levels, num_columns=num_columns)
-    if num_levels > NUM_LEVELS:
-        raise ValueError(f"num_levels must be at most {NUM_LEVELS}, got {num_levels}: levels are 0..{NUM_LEVELS - 1}")
+    _check_positive(num_columns=num_columns)
     ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
-    heights = np.empty((num_levels * num_columns, NUM_ROWS, NUM_COLS), np.float32)
+    heights = np.empty((NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), np.float32)
     for i, rng in enumerate(np.random.default_rng(seed).spawn(len(heights))):
         level, column = divmod(i, num_columns)
         heights[i] = training_tile(TILE_TYPES[types[column]], level, rng, inverted=column % 2 == 1)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from kernels.episode import Outcome
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
@@ -19,7 +20,7 @@ from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words, wilson_interval
 from sim.files.records import robot_identity
 from sim.policy.spec import about_controllers
-from sim.rates import hits_of
+from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.dose import LEVEL_SPACE, Dose
@@ -109,8 +110,12 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
         return array.reshape(-1, len(dose.values), array.shape[1]).swapaxes(0, 1).reshape(len(dose.values), -1)
 
     outcome = by_value(result.outcome)
-    (goal, counted), (success, _) = hits_of(outcome, "goal"), hits_of(outcome, "success")
-    hits = {"goal": goal, "success": success, "fallen": by_value(result.fallen) & counted}
+    counted = counted_episodes(outcome == Outcome.INVALID)
+    hits = {
+        "goal": (outcome == Outcome.GOAL) & counted,
+        "success": (outcome != Outcome.BASE_COLLISION) & counted,
+        "fallen": by_value(result.fallen) & counted,
+    }
     rows = []
     for number, value in enumerate(dose.values):
         count = int(counted[number].sum())

@@ -28,7 +28,7 @@ from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.command import publish
 from sim.files.records import identity, robot_identity
-from sim.policy.spec import controller_hash, crosser_name, name_of, spec_of
+from sim.policy.spec import about_controllers, crosser_name, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -123,10 +123,7 @@ def evaluate(
         name: {controller: measure(result, scales) for controller, result in row.items()}
         for name, row in results.items()
     }
-    about = {
-        name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
-        for name, policy in controllers.items()
-    }
+    about = about_controllers(controllers, robot)
     return make_tables(crossed, sets, robot, controllers=about, episodes=episodes, seed=seed)
 
 

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.workers.process import Crosser, WorkerProcess
 from qd.workers.process import EvaluatorError as EvaluatorError
+from qd.workers.process import WorkerProcess
 from qd.workers.shards import join_results
 from sim.crossing import SolverCfg, resolved
 from sim.device import resolve_device as resolve_warp_device
@@ -186,7 +186,7 @@ def check_policy(policy: str, robot: RobotCfg | str, device: str) -> None:
     load_policy(policy, get_robot(robot), device if local_device.startswith("cuda") else "cpu")
 
 
-def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Crosser:
+def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Rollout:
     """The simulation of an evaluator, for a share of its terrains."""
     robot = get_robot(cfg.robot)
     robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())
@@ -213,7 +213,7 @@ def _ray_workers() -> Any:
         raise ValueError("--workers ray needs Ray, which is not installed: pip install -e '.[cluster]'") from None
 
 
-Build = Callable[[EvaluatorCfg, int], Crosser]
+Build = Callable[[EvaluatorCfg, int], Rollout]
 
 
 @contextmanager

@@ -9,34 +9,16 @@ import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from numpy.typing import NDArray
 
 from sim.files.command import UserError, with_traceback
+from sim.rollout import Rollout
 
 
 class EvaluatorError(UserError):
     """The evaluation cannot go on; what was saved before is whole."""
-
-
-class Crosser(Protocol):
-    """What lets robots cross terrains: :class:`sim.rollout.Rollout`."""
-
-    def clear(self) -> None:
-        """Forget what is under way."""
-        ...
-
-    def put(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Let terrains be crossed behind those under way."""
-        ...
-
-    def take(self, progress: Callable[[float], None] | None = None) -> Any:
-        """Wait for the :class:`sim.rollout.RolloutResult` of the terrains that were put in first.
-
-        ``progress`` may put in more.
-        """
-        ...
 
 
 class WorkerProcess:
@@ -45,7 +27,7 @@ class WorkerProcess:
     ``build``, a module-level function, is called in the process with ``cfg`` and ``num_terrains``.
     """
 
-    def __init__(self, num_terrains: int, build: Callable[[Any, int], Crosser], cfg: Any) -> None:
+    def __init__(self, num_terrains: int, build: Callable[[Any, int], Rollout], cfg: Any) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads and CUDA may hang
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
@@ -92,7 +74,7 @@ class WorkerProcess:
         self.connection.close()
 
 
-def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Crosser]) -> None:
+def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Rollout]) -> None:
     """A worker's life: build, then evaluate until the other end closes."""
     inbox: queue.SimpleQueue[tuple[NDArray, NDArray] | None] = queue.SimpleQueue()
     under_way = 0

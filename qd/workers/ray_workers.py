@@ -21,8 +21,8 @@ import ray
 from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
 
-from qd.workers.evaluator import EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
-from qd.workers.process import Crosser, EvaluatorError
+from qd.workers.evaluator import Build, EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
+from qd.workers.process import EvaluatorError
 from qd.workers.shards import copied, flaw_of, join_results
 from sim.files.command import debugging
 from sim.files.records import code_fingerprint
@@ -77,7 +77,7 @@ class RayWorker:
         controller: PackedCode,
         robot: PackedRobot | str,
         space: PackedCode | None,
-        build: Callable[[EvaluatorCfg, int], Crosser],
+        build: Build,
     ) -> None:
         self._cfg, self._controller, self._robot, self._space, self._build = cfg, controller, robot, space, build
 
@@ -117,7 +117,7 @@ class RayWorkers(Pipeline):
     A worker that fails in any way is replaced, and its terrains are crossed again by another.
     """
 
-    def __init__(self, cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Crosser]) -> None:
+    def __init__(self, cfg: EvaluatorCfg, build: Build) -> None:
         super().__init__(cfg.num_terrains)
         gpus = int(cfg.device.startswith("cuda"))
         self._cfg, self._count = cfg, parse_workers(cfg.workers).count
@@ -268,7 +268,7 @@ def _reason_of(error: BaseException) -> str:
 
 
 @contextmanager
-def open_ray_workers(cfg: EvaluatorCfg, build: Callable[[EvaluatorCfg, int], Crosser]) -> Iterator[RayWorkers]:
+def open_ray_workers(cfg: EvaluatorCfg, build: Build) -> Iterator[RayWorkers]:
     """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.evaluator.open_evaluator`."""
     connect(parse_workers(cfg.workers).count)
     workers = RayWorkers(cfg, build)

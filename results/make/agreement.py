@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from qd.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings, How
-from results.make.common import Script, parse
-from sim.rates import agreement, crossing_rates
+from results.make.common import Script, agreement, crossing_rates, parse
 from sim.spaces.registry import SUPER_GAUSSIAN
 
 KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else

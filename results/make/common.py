@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kernels.episode import Outcome
 from qd.archive import Archive
 from qd.run.directory import read_archive_of
 from qd.run.settings import SearchCfg, preset
 from qd.workers.evaluator import Compute
 from sim.device import resolve_device
 from sim.files.atomic import write_atomically
-from sim.files.intervals import t_interval
+from sim.files.intervals import bootstrap_interval, t_interval
 from sim.files.records import identity, provenance, sources_sha256
+from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 
@@ -151,3 +154,38 @@ def is_current(file: Path) -> bool:
 
 if __name__ == "__main__":
     sys.exit(not is_current(Path(sys.argv[1])))
+
+
+def crossing_rates(outcome: NDArray[np.uint8], kind: str) -> NDArray[np.float64]:
+    """Rate of ``success`` (no base collision) or ``goal`` on each terrain, NaN if it is invalid, shape (num_terrains,).
+
+    Outcomes (:class:`kernels.episode.Outcome`) have shape (num_terrains, num_episodes); one that still runs is invalid.
+    """
+    hit = outcome != Outcome.BASE_COLLISION if kind == "success" else outcome == Outcome.GOAL
+    return terrain_means(hit, counted_episodes((outcome == Outcome.INVALID) | (outcome == Outcome.RUNNING)))
+
+
+def agreement(ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int) -> dict[str, Any]:
+    """How far rates of terrains lie from those of other crossings of the same terrains.
+
+    Args:
+        ours: Outcomes, shape (num_terrains, num_episodes).
+        theirs: Outcomes of the other crossings, shape (num_terrains, any number of episodes).
+        seed: Draws the resamples.
+
+    Returns:
+        ``terrains``, those that are valid in both; of each kind the mean of our rate minus theirs
+        (``success_bias``) with its 95 % bootstrap interval over terrains (``success_bias_interval``), and the mean of
+        its size (``success_difference``), None without terrains.
+    """
+    numbers: dict[str, Any] = {}
+    for kind in ("success", "goal"):
+        apart = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
+        apart = apart[np.isfinite(apart)]
+        numbers |= {
+            "terrains": len(apart),
+            f"{kind}_bias": float(apart.mean()) if len(apart) else None,
+            f"{kind}_bias_interval": bootstrap_interval(apart, seed),
+            f"{kind}_difference": float(np.abs(apart).mean()) if len(apart) else None,
+        }
+    return numbers

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from results.make.common import parse
+from results.make.common import agreement, parse
 from sim.crossing import SolverCfg, resolved
-from sim.rates import agreement
 from sim.rollout import Rollout, RolloutResult
 from sim.spaces.registry import SUPER_GAUSSIAN
 

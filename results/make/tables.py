@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
-from results.make.common import SEEDS, Script, parse, published_controllers
+from results.make.common import SEEDS, Script, crossing_rates, parse, published_controllers
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
-from sim.rates import crossing_rates
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import finetune
 

@@ -15,6 +15,7 @@ from sim.terrain import SPACING
 
 LEAST_EXTENT = 1e-3
 """Of flat ground, whose range is 0 where a size or scale may not be [m]."""
+_THICKNESS = 1.0  # of the ground below its lowest point [m]
 _QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
 
 
@@ -36,13 +37,12 @@ Margins = tuple[tuple[int, int], tuple[int, int]]
 """Nodes to add at low y and high y, and at low x and high x."""
 
 
-def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thickness: float = 1.0) -> Hfield:
+def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0) -> Hfield:
     """A height grid as a heightfield with the same surface.
 
     Args:
         heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
         margin: Nodes of edge height to add, on every side or on each.
-        thickness: Of the ground below its lowest point [m].
     """
     margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
     grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")
@@ -51,7 +51,7 @@ def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0, thick
     (low_y, _), (low_x, _) = margins
     return Hfield(
         data=((grid - lowest) / extent).T[::-1],
-        size=(half_y, half_x, extent, thickness),
+        size=(half_y, half_x, extent, _THICKNESS),
         position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
     )
 

@@ -46,7 +46,7 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
             noise[level, column] = crossing_terrain("noise", level, noise_rng)
     types = ("noise",) * cfg.noise_columns
     if cfg.num_columns:
-        tiles, type_index = training_tiles(NUM_LEVELS, cfg.num_columns, tile_rng)
+        tiles, type_index = training_tiles(cfg.num_columns, tile_rng)
         noise = np.concatenate([tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS), noise], axis=1)
         types = (*(TILE_TYPES[k] for k in type_index), *types)
     return Tiles(heights=noise.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)

@@ -18,7 +18,7 @@ def test_grid_order(tiles):
     assert tiles.type_of_column[-2:] == ("noise", "noise")
     without_noise = tiles.heights.reshape(NUM_LEVELS, 7, NUM_ROWS, NUM_COLS)[:, :5].reshape(-1, NUM_ROWS, NUM_COLS)
     rng = np.random.default_rng(3).spawn(2)[0]
-    np.testing.assert_array_equal(without_noise, training_tiles(NUM_LEVELS, 5, rng)[0])
+    np.testing.assert_array_equal(without_noise, training_tiles(5, rng)[0])
 
 
 def test_noise_grows_with_the_level(tiles):
