@@ -25,8 +25,6 @@ class ArchiveFitness:
     """Weight of u, the share of episodes without base collision; u is 0 if none collided."""
     intervals: int = 10
     """Intervals of each ratio."""
-    reevaluate_every: int = 50
-    """After every so many iterations up to 200 elites cross 40 fresh episodes each. 0: never."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +72,6 @@ class Archive(ControllerFlags, WorkerFlags):
             alpha=cfg.fitness.alpha,
             lam=cfg.fitness.lam,
             intervals=cfg.intervals,
-            reevaluate_every=cfg.reevaluate_every,
         )
         sizes = {name: getattr(cfg, name) for name in ("preset", "iterations", "seed", "replicas", "scheduler")}
         return cls(**sizes, fitness=fitness)
@@ -110,7 +107,6 @@ class Archive(ControllerFlags, WorkerFlags):
             seed=self.seed,
             replicas=self.replicas,
             intervals=self.fitness.intervals,
-            reevaluate_every=self.fitness.reevaluate_every,
             fitness=replace(fitness, alpha=self.fitness.alpha, lam=self.fitness.lam),
             scheduler=replace(self.scheduler, method=self.method or self.scheduler.method),
         )

@@ -26,24 +26,16 @@ SPECIALIST = "specialist"
 _INVALID = OUTCOMES.index("invalid")
 
 
-def fresh_numbers(archive: Archive, fresh: FreshValues, *, sampled: bool = False) -> dict[str, Any]:
-    """What fresh episodes say of an archive, as metrics and reports have it.
-
-    Of a sample of the elites what sums over all of them is left out.
-    """
-    std = fresh.std()
-    numbers = {
+def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
+    """What fresh episodes say of an archive, as reports have it."""
+    std, corrected = fresh.std(), fresh.corrected_elites()
+    return {
         "reevaluated": len(fresh.reproduced),
         "elites_reproduced": int(fresh.reproduced.sum()),
         "elites_same_cell": int((fresh.valid & (fresh.cell == archive.cell)).sum()),
         "mean_std": float(std.mean()) if len(std) else None,
         "mean_std_interval": bootstrap_interval(std, 0),
         "mean_fitness_corrected": float(fresh.fitness[fresh.valid].mean()) if len(std) else None,
-    }
-    if sampled:
-        return numbers
-    corrected = fresh.corrected_elites()
-    return numbers | {
         "corrected_elites": len(corrected),
         "corrected_coverage": len(corrected) / archive.cells.num_cells,
         "corrected_qd_score": float((fresh.fitness[corrected] - FITNESS_FLOOR).sum()),

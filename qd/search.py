@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
-from qd.faults import fresh_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.groups import rank, summary_of
-from qd.judge import fresh_values
 from qd.minima import read_minimal
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import SearchBar, clock, describe_search
@@ -36,8 +34,6 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, is_own
 
-_MOST_SAMPLED = 200  # elites that cross fresh episodes in the middle of a search (the paper's figure of mean STD)
-_SAMPLE_STREAM = 3
 _SAME = ("robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
          "collision_bit")  # fmt: skip
 
@@ -123,8 +119,7 @@ def _run_iterations(
     for iteration in range(len(metrics) + 1, cfg.iterations + 1):
         for group in range(num_under_way, num_groups):
             pipeline.put(scheduler.ask(group), _group_seeds(cfg, scheduler, iteration, group))
-        samples = bool(cfg.reevaluate_every) and iteration % cfg.reevaluate_every == 0
-        goes_ahead = iteration < cfg.iterations and not samples  # a sample is crossed with nothing else under way
+        goes_ahead = iteration < cfg.iterations
         results, evaluations, search_s = [], [], 0.0
         for group in range(num_groups):
             result = pipeline.take(bar.within(iteration, group, num_groups))
@@ -142,8 +137,6 @@ def _run_iterations(
         archive = archive_of(cfg, scheduler, iteration)
         row = _metrics_row(archive, join_results(results, join=1), join_evaluations(evaluations), iteration)
         row["search_s"] = search_s
-        if samples:
-            row |= _sample_elites(cfg, archive, pipeline)
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
         row |= {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
@@ -173,16 +166,6 @@ def _metrics_row(archive: Archive, result: RolloutResult, evaluation: Evaluation
         "rollout_s": float(result.wall_s),
         "mean_duration_s": float(result.duration_s.mean()),
     }
-
-
-def _sample_elites(cfg: SearchCfg, archive: Archive, pipeline: Pipeline) -> dict[str, Any]:
-    """How reliable some elites of this iteration are, in fresh episodes (the paper's mean STD over iterations)."""
-    sample = archive
-    if len(archive) > _MOST_SAMPLED:
-        rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(_SAMPLE_STREAM,)))
-        sample = archive.rows(np.sort(rng.choice(len(archive), _MOST_SAMPLED, replace=False)))
-    fresh = fresh_values(sample, pipeline, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
-    return fresh_numbers(sample, fresh, sampled=True)
 
 
 def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:

@@ -48,8 +48,6 @@ class SearchCfg:
     """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
     scheduler: SchedulerCfg
-    reevaluate_every: NonNegativeInt = 50
-    """Every so many iterations, up to 200 elites cross 40 fresh episodes each; 0: never."""
 
     def __post_init__(self) -> None:
         check(self)

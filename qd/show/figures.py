@@ -15,7 +15,7 @@ from qd.archive import Archive
 from qd.faults import FRESH_EPISODES, fault_numbers, fresh_numbers
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
-from sim.files.figures import as_png, bar_lengths, new_figure
+from sim.files.figures import as_png, new_figure
 from sim.ground import GroundMaps
 from sim.maps.picture import LENGTH, height_colors, tinted
 
@@ -94,37 +94,24 @@ def _title(archive: Archive) -> str:
 
 
 def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
-    """QD score, archive size with reachable coverage, mean fitness, and mean STD if looked at, over the iterations."""
-    looks = [row for row in metrics if row.get("mean_std") is not None]
-    num_panels = 4 if looks else 3
-    figure = new_figure(3.5 * num_panels, 3.4)
+    """QD score, archive size with reachable coverage, and mean fitness over the iterations."""
+    figure = new_figure(10.5, 3.4)
     figure.suptitle(f"{_title(archive)}: {len(archive):,} elites")
     panels = (("qd_score", "QD score"), ("elites", "elites"), ("mean_fitness", "mean fitness"))
     iterations = [row["iteration"] for row in metrics]
-    drawn = figure.subplots(1, num_panels, sharex=True)
-    for axes, (key, label) in zip(drawn[:3], panels, strict=True):
+    drawn = figure.subplots(1, len(panels), sharex=True)
+    for axes, (key, label) in zip(drawn, panels, strict=True):
         axes.plot(iterations, [row[key] for row in metrics], color=_BLUE, marker="." if len(metrics) < 30 else "")
         axes.set_ylabel(label)
         if key != "mean_fitness":
             axes.set_ylim(bottom=0)
         if key == "elites":
             _add_coverage_axis(axes, archive.cells.num_cells)
-    if looks:
-        _draw_std(drawn[3], looks)
     for axes in drawn:
         axes.set_xlabel("iteration")
         axes.grid(alpha=0.3)
         axes.xaxis.get_major_locator().set_params(integer=True)
     return figure
-
-
-def _draw_std(axes: Axes, looks: Sequence[dict[str, Any]]) -> None:
-    """The paper's mean STD with its 95 % intervals, where elites were looked at again."""
-    means = [row["mean_std"] for row in looks]
-    lengths = bar_lengths(means, [row["mean_std_interval"] for row in looks])
-    axes.errorbar([row["iteration"] for row in looks], means, lengths, color=_BLUE, marker=".", capsize=3)
-    axes.set_ylabel(f"mean STD of elites\n({FRESH_EPISODES} fresh episodes)")
-    axes.set_ylim(bottom=0)
 
 
 def _add_coverage_axis(axes: Axes, num_cells: int) -> None:

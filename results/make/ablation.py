@@ -1,34 +1,56 @@
 """What the fitness gains by subtracting standard deviations, the paper's ablation: ablation.json.
 
-Every few iterations up to 200 elites of a search with alpha 1 and of one with alpha 0 cross 40 fresh episodes; compared
-are the means of their standard deviations.
+After every few iterations up to 200 elites of a search with alpha 1 and of one with alpha 0 cross 40 fresh episodes;
+compared are the means of their standard deviations.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from qd.run.directory import RunDirectory
+import numpy as np
+
+from qd.archive import Archive
+from qd.faults import fresh_numbers
+from qd.judge import fresh_values
+from qd.run.settings import SearchCfg
 from qd.search import search
+from qd.workers.cross import Crossings
 from results.make.common import parse
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
+MOST_ELITES, STREAM = 200, 3  # of the random numbers that choose them
+
+
+def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossings) -> dict[str, Any]:
+    """What fresh episodes say of some of the elites that a search has found so far."""
+    rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(STREAM,)))
+    some = archive.rows(np.sort(rng.choice(len(archive), min(len(archive), MOST_ELITES), replace=False)))
+
+    def cross(terrains: Any, seeds: Any) -> Any:
+        return crossings.cross(policy, terrains, seeds, replicas=cfg.replicas, space=cfg.space, label="fresh episodes")
+
+    fresh = fresh_values(some, cross, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
+    return fresh_numbers(some, fresh) | {"elites": len(archive)}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Runs both searches and writes their mean STD with 95 % bootstrap intervals over elites."""
     script = parse(__doc__, argv, "ablation.json")
     every = 1 if script.small else 6
-    cfg = script.search_cfg(18, seed=script.seed, reevaluate_every=every)
-    rows = {}
-    for name, alpha in ALPHAS.items():
-        run = script.runs / "ablation" / name
-        search(replace(cfg, fitness=replace(cfg.fitness, alpha=alpha)), run, script.compute)
-        rows[name] = [row for row in RunDirectory(run).read_metrics() if row["iteration"] % every == 0]
+    cfg = script.search_cfg(18, seed=script.seed)
+    iterations = [*range(every, cfg.iterations + 1, every)]
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ALPHAS}
+    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
+        for name, alpha in ALPHAS.items():
+            for count in iterations:  # each from the start, so that what was done is found when this is begun again
+                of_alpha = replace(cfg, iterations=count, fitness=replace(cfg.fitness, alpha=alpha))
+                archive = search(of_alpha, script.runs / "ablation" / f"{name}-{count}", script.compute)
+                rows[name].append(look_again(archive, of_alpha, script.policy, crossings))
     return script.write(
         {
             "preset": cfg.preset,
-            "iterations": [row["iteration"] for row in rows["alpha_1"]],
+            "iterations": iterations,
             "mean_std": {name: [row["mean_std"] for row in of_run] for name, of_run in rows.items()},
             "intervals": {name: [row["mean_std_interval"] for row in of_run] for name, of_run in rows.items()},
             "elites": {name: [row["elites"] for row in of_run] for name, of_run in rows.items()},

@@ -1,13 +1,10 @@
 """Figures that need no screen: an empty one, and one as PNG."""
 
 import io
-from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.text import Text
-from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 _DPI = 150
@@ -37,10 +34,3 @@ def as_png(figure: Figure) -> bytes:
         image = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     image.save(content, "PNG", optimize=True, dpi=(_DPI, _DPI))
     return content.getvalue()
-
-
-def bar_lengths(values: ArrayLike, intervals: Sequence[Sequence[float] | None]) -> NDArray[np.float64]:
-    """How far error bars of values (count,) go below and above, shape (2, count); NaN, which draws none, without."""
-    limits = np.array([interval or (np.nan, np.nan) for interval in intervals], np.float64).reshape(-1, 2)
-    means = np.asarray(values, np.float64)
-    return np.maximum([means - limits[:, 0], limits[:, 1] - means], 0.0)  # equal limits may be off by rounding

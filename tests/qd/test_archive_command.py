@@ -91,7 +91,7 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
 
 def test_flags_come_to_the_settings_of_the_run():
     flags = ["--method", "map_elites", "--seed", "4", "--fitness.alpha", "0.5", "--fitness.intervals", "5"]
-    flags += ["--fitness.penalties", "yaw_rate", "vel_x", "contact_force", "--fitness.reevaluate-every", "0"]
+    flags += ["--fitness.penalties", "yaw_rate", "vel_x", "contact_force"]
     assert archive(*TINY, *flags, "--run-dir", "a") == 0
     settings = config_of("a")["settings"]
     assert (settings["preset"], settings["seed"], settings["intervals"], settings["replicas"]) == ("small", 4, 5, 1)

@@ -28,7 +28,6 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_num
     """Robots go on with the terrains of other groups; three emitters make groups of one and two."""
     settings = {
         "replicas": 3,
-        "reevaluate_every": 0,
         "fitness": FitnessCfg(penalties=ROBOT.penalties, scales=(1.0, 2.0, 1.0, 300.0, 0.05, 0.3)),
         "scheduler": SchedulerCfg(method="cma_mae+map_elites", emitters=3, batch_size=2, sigma0=1.0, groups=2),
     }

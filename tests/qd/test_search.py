@@ -71,7 +71,7 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
 
 def in_groups(path, groups, *, opener=stand_in.open_stand_in, iterations=5):
     scheduler = dataclasses.replace(CFG.scheduler, emitters=5, batch_size=3, groups=groups)
-    return run(path, scheduler=scheduler, iterations=iterations, reevaluate_every=2, opener=opener)
+    return run(path, scheduler=scheduler, iterations=iterations, opener=opener)
 
 
 class Lost(stand_in.Stub):
@@ -100,13 +100,13 @@ class Lost(stand_in.Stub):
 
 
 def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
-    """Five emitters make groups of one, two and two, which are put in ahead; elites are sampled at times."""
+    """Five emitters make groups of one, two and two, which are put in ahead."""
     pipeline = Lost(99)
     whole = in_groups(tmp_path / "whole", 3, opener=pipeline.opened)
     assert pipeline.most == 3 and not pipeline.lots
     assert whole.iterations == 5 and len(whole) > 10
     expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
-    # Lost within the second iteration, at the sample at its end, and within the third, of five.
+    # Lost within the second iteration, at its end, and within the third, of five.
     for lots in (4, 6, 8):
         path = tmp_path / f"lost-{lots}"
         with pytest.raises(EvaluatorError):

@@ -22,20 +22,14 @@ def rows(count: int) -> list[dict]:
 
 def test_curves_show_what_the_metrics_say():
     metrics = rows(4)
-    metrics[1] |= {"mean_std": 2.0, "mean_std_interval": [1.5, 3.0]}
-    metrics[2] |= {"mean_std": None, "mean_std_interval": None}  # all elites invalid
-    metrics[3] |= {"mean_std": 1.0, "mean_std_interval": [1.0, 1.0]}
     figure = draw_curves(small_archive(), metrics)
-    left, middle, right, std, *_ = figure.axes
+    left, middle, right, *_ = figure.axes
     assert left.lines[0].get_xydata().tolist() == [[1, 20], [2, 40], [3, 60], [4, 80]]
     assert middle.lines[0].get_ydata().tolist() == [5, 10, 15, 20]
     assert right.lines[0].get_ydata().tolist() == [2, 3, 4, 5]
     # two ratios have 10 reachable cells, so the right-hand scale is ten times the left-hand one
     coverage = next(axes for axes in figure.axes if "coverage" in axes.get_ylabel())
     assert coverage.get_ylim()[1] == pytest.approx(10 * middle.get_ylim()[1])
-    line, _, (bars,) = std.containers[0]
-    assert line.get_xydata().tolist() == [[2, 2], [4, 1]]
-    assert [segment[:, 1].tolist() for segment in bars.get_segments()] == [[1.5, 3.0], [1.0, 1.0]]
 
 
 def test_archive_figure_has_a_line_an_elite_and_the_worst_on_top():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sim.files.figures import as_png, bar_lengths, new_figure
+from sim.files.figures import as_png, new_figure
 from sim.files.intervals import bootstrap_interval, rate_words, t_interval, value_words, wilson_interval
 
 
@@ -45,14 +45,6 @@ def test_the_bootstrap_resamples_terrains_or_families():
     assert bootstrap_interval(np.array([1.0, 1.0, 1.0, 0.0]), 0, families=np.array([5, 5, 5, 7])) == [0.0, 1.0]
     assert bootstrap_interval(np.array([0.4]), 0) is None
     assert bootstrap_interval(np.array([0.2, 0.9]), 0, families=np.array([5, 5])) is None
-
-
-def test_bars_reach_from_the_value_to_its_limits():
-    lengths = bar_lengths([0.5, 0.2, 1.0], [(0.3, 0.9), None, (1.0, 1.0 - 1e-17)])
-    assert np.allclose(lengths[:, 0], [0.2, 0.4])
-    assert np.isnan(lengths[:, 1]).all()  # nothing is drawn
-    assert (lengths[:, 2] == 0.0).all()  # not below zero, which matplotlib refuses
-    assert bar_lengths([], []).shape == (2, 0)
 
 
 @pytest.mark.parametrize("colours", [None, "viridis"])
