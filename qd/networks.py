@@ -80,9 +80,9 @@ class Networks(nn.ModuleList):
         count = len(range(MEMBERS)[members])
         alike = rows.shape[1] < count * self._num_maps
         for index, layer in enumerate(self):
-            assert isinstance(layer, nn.Conv2d)
+            assert isinstance(layer, nn.Conv2d) and layer.bias is not None
             weight, bias = (
-                part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, _bias_of(layer))
+                part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, layer.bias)
             )
             rows = nn.functional.relu(rows) if index else rows
             if index == len(_CONVOLUTIONS):
@@ -103,11 +103,6 @@ class Networks(nn.ModuleList):
 def _beside(channels_in: int, channels_out: int, size: Any, stride: Any = 1, padding: Any = 0) -> nn.Conv2d:
     channels = MEMBERS * channels_in, MEMBERS * channels_out
     return nn.Conv2d(*channels, size, groups=MEMBERS, stride=stride, padding=padding)
-
-
-def _bias_of(layer: nn.Conv2d) -> Tensor:
-    assert layer.bias is not None
-    return layer.bias
 
 
 def _pooled(rows: Tensor, networks: int) -> Tensor:
@@ -178,25 +173,17 @@ class Training:
         current.wait_stream(self._stream)
 
     def _take_steps(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
-        batch_maps, batch_targets, batch_turned = self._reserved(maps, targets, turned[0])
+        if self._batch is None:  # memory of a batch, the same in every step
+            count = turned[0].numel()
+            batch = maps.new_empty(count, *maps.shape[1:]), targets.new_empty(count, *targets.shape[1:])
+            self._batch = *batch, torch.empty_like(turned[0])
+        batch_maps, batch_targets, batch_turned = self._batch
         for rows, mirrored in zip(drawn.flatten(1), turned, strict=True):
             # Outside of the graph, since the tensors of all terrains grow and move.
             torch.index_select(maps, 0, rows, out=batch_maps)
             torch.index_select(targets, 0, rows, out=batch_targets)
             batch_turned.copy_(mirrored)
             self._take_step()
-
-    def _reserved(self, maps: Tensor, targets: Tensor, turned: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Memory of a batch, the same in every step; a batch of another size needs another, and another graph."""
-        if self._batch is None or self._batch[2].shape != turned.shape:
-            count = turned.numel()
-            self._batch = (
-                maps.new_empty(count, *maps.shape[1:]),
-                targets.new_empty(count, *targets.shape[1:]),
-                torch.empty_like(turned),
-            )
-            self._graph = None
-        return self._batch
 
     def _take_step(self) -> None:
         if self._stream is None or self._eager_steps < _EAGER_STEPS:

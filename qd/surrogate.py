@@ -228,7 +228,8 @@ class Surrogate:
             children = slice(first, first + each)
             genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
             prediction = self.predict(genes[children])
-            gain[children] = self._gain(prediction, best)
+            cell = self.cells_of(prediction.ratios, prediction.collided)  # of each network
+            gain[children] = torch.where(cell >= 0, (prediction.fitness - best[cell]).clamp_min(0.0), 0.0).mean(0)
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
             rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])
@@ -237,12 +238,6 @@ class Surrogate:
         spread[chosen] = -torch.inf
         disputed = spread.argsort(descending=True, stable=True)[: num_proposals - len(chosen)]
         return genes[torch.cat([chosen, disputed])]
-
-    def _gain(self, prediction: Prediction, best: Tensor) -> Tensor:
-        """QD score that terrains would add, the mean over the networks, shape (N,)."""
-        cells = self.cells_of(prediction.ratios, prediction.collided)
-        gains = (prediction.fitness - best[cells]).clamp_min(0.0)
-        return torch.where(cells >= 0, gains, 0.0).mean(0)
 
     def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""

@@ -22,24 +22,14 @@ class TerrainBank:
     Terrains are replaced in place, so that captured graphs go on reading them.
     """
 
-    def __init__(
-        self,
-        num_terrains: int,
-        *,
-        device: str,
-        nrow: int = NUM_ROWS,
-        ncol: int = NUM_COLS,
-        with_ground: bool = False,
-    ) -> None:
-        """Make flat terrains of ``nrow`` nodes along y and ``ncol`` along x.
-
-        With ``with_ground`` they have maps of friction and softness, which contacts then pay for.
-        """
-        if num_terrains < 1 or nrow < 2 or ncol < 2:
-            raise ValueError(f"a bank needs at least 1 terrain of 2 x 2 nodes, got {num_terrains} of {nrow} x {ncol}")
+    def __init__(self, num_terrains: int, *, device: str, with_ground: bool = False) -> None:
+        """Make flat terrains; with ``with_ground`` they have maps of friction and softness, which contacts pay for."""
+        if num_terrains < 1:
+            raise ValueError(f"a bank needs at least 1 terrain, got {num_terrains}")
+        shape = num_terrains, NUM_ROWS, NUM_COLS
         self.terrain = Terrain()
-        self.terrain.heights = wp.zeros((num_terrains, nrow, ncol), dtype=float, device=device)
-        self.terrain.ceilings = wp.zeros(ceiling_shape(num_terrains, nrow, ncol), dtype=float, device=device)
+        self.terrain.heights = wp.zeros(shape, dtype=float, device=device)
+        self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
         self.terrain.spacing = SPACING
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
         self.device = device
@@ -51,7 +41,7 @@ class TerrainBank:
 
     @property
     def heights(self) -> wp.array:
-        """Node heights [m] on the device, shape (num_terrains, nrow, ncol)."""
+        """Node heights [m] on the device, shape (num_terrains, NUM_ROWS, NUM_COLS)."""
         return self.terrain.heights
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:

@@ -22,29 +22,7 @@ class Course(TerrainSpace):
     """Kerbs, steps, stairs, ramps, ditches and the like between x = 4 m and x = 12 m, over the full width.
 
     An element has six genes (:data:`kernels.course.GENES`): its kind, the flat ground before it, and four parameters
-    (:data:`kernels.course.PARAMETERS`). Where their ranges come from; what no standard stands beside is chosen here:
-
-    - ramp, 1:12 to 1:3: the running slope of a new ramp is at most 1:12 (2010 ADA Standards, 405.2), that of a ramp
-      for scaffold work at most 1:3 (34 Pa. Code 6.27(b)).
-    - cross slope, 1:48 to 1:3: at most 1:48 on a walking surface (2010 ADA Standards, 403.3); on a roadside, slopes
-      steeper than 1:3 count as critical for vehicles (AASHTO Roadside Design Guide).
-    - sill, 0.013 m to 0.15 m: a threshold is at most 1/2 in (13 mm) high (2010 ADA Standards, 404.2.5), that of an
-      outer door other than the required exit at most 7 3/4 in (196 mm) over the floor beside it (IRC R311.3.2).
-    - rail or hose, 0.02 m to 0.172 m: up to a rail of profile 60E1 (EN 13674-1), 172 mm high.
-    - kerb, 0.03 m to 0.25 m: 3 cm where one lowered kerb serves wheels and canes (DIN 18040-3); raised ones have
-      20 cm at most (RASt 06), and the range goes beyond.
-    - step, 0.10 m to 0.40 m: from about the lowest riser of a stair, 4 in (IBC 1011.5.2), to about two of the highest
-      of homes, 7 3/4 in (IRC R311.7.5.1).
-    - stairs, 2 to 8 steps of 0.12 m to 0.22 m on treads of 0.22 m to 0.35 m: around the risers of 7 in at most and
-      treads of 11 in at least (IBC 1011.5.2), 7 3/4 in and 10 in of homes (IRC R311.7.5). Of the 9 1/2 in of each in
-      work places (29 CFR 1910.25(c)) the tread lies within, the riser above.
-    - pallet, one or two of 0.10 m to 0.16 m, 0.8 m to 1.2 m long: around the flat wooden pallet of 800 mm x 1,200 mm x
-      144 mm (EN 13698-1).
-    - ditch, 0.10 m to 0.80 m wide, 0.05 m to 0.80 m deep: drainage channels open up to 1 m (EN 1433); the depth is
-      chosen here.
-    - beam over a ditch, 0.3 m to 1.0 m wide: around the 18 in that a scaffold's walkway has at least
-      (29 CFR 1926.451(b)(2)).
-    - stepping stones and rubble: chosen here.
+    (:data:`kernels.course.PARAMETERS`). docs/terrains.md says which standards their ranges come from.
     """
 
     name: ClassVar[str] = "course"
