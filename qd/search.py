@@ -29,7 +29,7 @@ from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import Interrupted, command_line, say
 from sim.policy.spec import ControllerSpec, spec_of
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, is_own
@@ -76,7 +76,7 @@ def search(
         scheduler.compute_on(compute.device)
         done = len(metrics)
         say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
-        if note := robot.scaled_by_another(policy):
+        if note := scaled_by_another(robot, policy):
             print(note)
         if done < cfg.iterations:
             try:

@@ -29,7 +29,7 @@ from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.command import publish
 from sim.files.records import identity, robot_identity
 from sim.policy.spec import about_controllers, crosser_name, spec_of
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import load_space
@@ -115,7 +115,7 @@ def evaluate(
     sets = sets or make_sets((), _SMALL[0], seed)
     controllers = {name: spec_of(policy, robot) for name, policy in controllers.items()}
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
-    scales = robot.read_penalty_scales(others[0] if others else None)
+    scales = read_penalty_scales(robot, others[0] if others else None)
     results = cross_sets(
         controllers, sets, robot=robot, compute=compute, episodes=episodes, reward=True, cache=cache,
     )  # fmt: skip

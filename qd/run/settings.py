@@ -12,6 +12,7 @@ from qd.run.presets import SchedulerCfg, preset_of
 from sim.files.records import robot_identity
 from sim.files.settings import NonNegativeInt, PositiveInt, check, from_builtins
 from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
+from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 
 Settings = dict[str, Any]
@@ -82,7 +83,7 @@ def preset(
         space=space,
         space_sha256=space_sha256,
         collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=robot.read_penalty_scales(policy)),
+        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy)),
         **preset_of(name),
     )
 

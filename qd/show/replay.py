@@ -23,6 +23,7 @@ from sim.files.intervals import rate_words, wilson_interval
 from sim.maps.heightmap import as_terrain, fitted, read_heightmap
 from sim.policy.spec import ControllerSpec, crosser_name
 from sim.recording.recorder import Recording
+from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 
 OWN_FOLDER = RUNS / "terrains"
@@ -139,7 +140,7 @@ def source_of_map(
 def fitness_of(robot: RobotCfg, policy: str | None) -> FitnessCfg:
     """The robot's penalties with their scales; 1 each, and so raw sums, where they were never measured."""
     try:
-        scales = robot.read_penalty_scales(policy)
+        scales = read_penalty_scales(robot, policy)
     except ValueError as error:
         print(f"{error}; penalties are compared as they are, unscaled", flush=True)
         scales = (1.0,) * len(robot.penalties)

@@ -16,8 +16,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sim.policy.spec import ControllerSpec, RobotSettings, controller_hash
+from sim.policy.spec import ControllerSpec, controller_hash
 from sim.robots.model_files import read_model_files
+from sim.robots.robot import RobotCfg
 
 PENALTY_DEFINITION = "squared"
 """How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
@@ -107,7 +108,7 @@ def _output(command: Sequence[str | Path]) -> str | None:
     return done.stdout.strip()
 
 
-def robot_digest(robot: RobotSettings) -> str:
+def robot_digest(robot: RobotCfg) -> str:
     """SHA-256 of a robot: its settings without those of training, its model and its meshes.
 
     A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
@@ -124,12 +125,12 @@ def robot_digest(robot: RobotSettings) -> str:
     return digest.hexdigest()
 
 
-def robot_identity(robot: RobotSettings) -> dict[str, str]:
+def robot_identity(robot: RobotCfg) -> dict[str, str]:
     """The keys ``robot_sha256`` and ``penalty_definition``, which every record of a robot has."""
     return {"robot_sha256": robot_digest(robot), "penalty_definition": PENALTY_DEFINITION}
 
 
-def identity(robot: RobotSettings, policy: str | Path) -> dict[str, str | None]:
+def identity(robot: RobotCfg, policy: str | Path) -> dict[str, str | None]:
     """What a record of a robot under a controller names: ``robot``, ``policy`` (a name without folders), their hashes.
 
     ``policy_sha256`` is None for a controller without a file.
@@ -138,7 +139,7 @@ def identity(robot: RobotSettings, policy: str | Path) -> dict[str, str | None]:
     return {"robot": robot.name, **robot_identity(robot), **controller}
 
 
-def check_robot(record: Mapping[str, Any], robot: RobotSettings, file: Path, remedy: str) -> None:
+def check_robot(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
     """Refuses the record in a file that is of the robot before it changed; ``remedy`` is what else helps."""
     expected, now = record.get("robot_sha256"), robot_digest(robot)
     if expected != now:
@@ -148,7 +149,7 @@ def check_robot(record: Mapping[str, Any], robot: RobotSettings, file: Path, rem
         )
 
 
-def check_identity(record: Mapping[str, Any], robot: RobotSettings, file: Path, remedy: str) -> None:
+def check_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
     """Refuses a record of a robot that has changed since (:func:`check_robot`) or of penalties defined otherwise."""
     definition = record.get("penalty_definition")
     if definition != PENALTY_DEFINITION:

@@ -8,40 +8,16 @@ import sys
 import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import Field, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Protocol
+from typing import Any
+
+from sim.robots.robot import RobotCfg
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
 _NAMED = re.compile(r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
-
-
-class RobotSettings(Protocol):
-    """What names and records take of a robot's settings, a dataclass (:class:`sim.robots.robot.RobotCfg`)."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    @property
-    def name(self) -> str:
-        """What files are called after it."""
-        ...
-
-    @property
-    def policy_file(self) -> Path:
-        """The controller that comes with it."""
-        ...
-
-    @property
-    def model_file(self) -> Path:
-        """MJCF or URDF."""
-        ...
-
-    @property
-    def spec(self) -> str:
-        """Name or settings file."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,12 +68,12 @@ class ControllerSpec:
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
 
 
-def spec_of(policy: str, robot: RobotSettings) -> str:
+def spec_of(policy: str, robot: RobotCfg) -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
-def name_of(policy: str | Path, robot: RobotSettings) -> str:
+def name_of(policy: str | Path, robot: RobotCfg) -> str:
     """How files of results name a controller, the inverse of :func:`spec_of`: :data:`SHIPPED` lies at no fixed path."""
     return SHIPPED if is_same(str(policy), str(robot.policy_file)) else str(policy)
 
@@ -192,7 +168,7 @@ def firsts(names: Iterable[str]) -> list[str]:
     return list(first.values())
 
 
-def about_controllers(controllers: Mapping[str, str], robot: RobotSettings) -> dict[str, dict[str, str | None]]:
+def about_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
     """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
     return {
         name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
@@ -200,7 +176,7 @@ def about_controllers(controllers: Mapping[str, str], robot: RobotSettings) -> d
     }
 
 
-def controllers_of(policies: Sequence[str], robot: RobotSettings, *, flag: str = "policies") -> dict[str, str]:
+def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
 
     Args:
@@ -237,7 +213,7 @@ def label_suffix(policy: str) -> str:
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 
-def crosser_name(robot: RobotSettings, policy: str) -> str:
+def crosser_name(robot: RobotCfg, policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
     return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
 

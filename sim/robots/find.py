@@ -1,10 +1,14 @@
-"""Which robot a command line or a file names."""
+"""Which robot a command line or a file names, and the penalty scales that were measured with it."""
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.records import check_identity
+from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
@@ -54,3 +58,36 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
     robot = robot or ROBOTS[name]
     check_identity(record, robot, file, "make it anew")
     return robot
+
+
+def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[float, ...]:
+    """Scales of the penalties, in their order; an error says how to measure those of the command line's policy."""
+    given = policy if robot.settings_file is not None else None  # a shipped robot's are of its own controller
+    remedy = f"run `{command_line('calibrate', robot=robot.spec, policy=given)}`"
+    if given is None and not robot.policy_file.exists():
+        remedy = f"train its controller first with `{robot.train_command}`, or name one with --policy; then {remedy}"
+    if not robot.scales_file.exists():
+        raise ValueError(f"no penalty scales of robot '{robot.name}': expected {robot.scales_file}; {remedy}")
+    content = read_json(robot.scales_file)
+    check_identity(content, robot, robot.scales_file, remedy)
+    scales = content.get("scales")
+    scales = scales if isinstance(scales, dict) else {}
+    missing = [name for name in robot.penalties if not _is_positive(scales.get(name))]
+    if missing:
+        raise ValueError(f"{robot.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
+    return tuple(float(scales[name]) for name in robot.penalties)
+
+
+def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
+    """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
+
+    Scales of the robot's own controller make searches against others comparable: this is no mistake.
+    """
+    measured = read_json(robot.scales_file) if robot.scales_file.exists() else {}
+    if measured.get("policy_sha256") in (None, controller_hash(policy)):
+        return None
+    return f"Penalties are scaled by those of {measured.get('policy')}, with which {robot.scales_file} was measured."
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, int | float) and value is not True and 0.0 < value <= sys.float_info.max

@@ -1,6 +1,5 @@
-"""Settings of a robot, and the penalty scales that were measured with it."""
+"""Settings of a robot."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -8,11 +7,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from sim.files.atomic import read_json
 from sim.files.command import command_line
-from sim.files.records import check_identity
 from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
-from sim.policy.spec import controller_hash
 from sim.robots.training import LearningCfg, TrainingCfg, TuningCfg
 
 ROBOTS_DIR = Path(__file__).parent
@@ -161,34 +157,3 @@ class RobotCfg:
     def train_command(self) -> str:
         """The command that trains the controller that comes with the robot."""
         return command_line("train", robot=self.spec, export=self.policy_file)
-
-    def read_penalty_scales(self, policy: str | None = None) -> tuple[float, ...]:
-        """Scales of the penalties, in their order; an error says how to measure those of the command line's policy."""
-        given = policy if self.settings_file is not None else None  # a shipped robot's are of its own controller
-        remedy = f"run `{command_line('calibrate', robot=self.spec, policy=given)}`"
-        if given is None and not self.policy_file.exists():
-            remedy = f"train its controller first with `{self.train_command}`, or name one with --policy; then {remedy}"
-        if not self.scales_file.exists():
-            raise ValueError(f"no penalty scales of robot '{self.name}': expected {self.scales_file}; {remedy}")
-        content = read_json(self.scales_file)
-        check_identity(content, self, self.scales_file, remedy)
-        scales = content.get("scales")
-        scales = scales if isinstance(scales, dict) else {}
-        missing = [name for name in self.penalties if not _is_positive(scales.get(name))]
-        if missing:
-            raise ValueError(f"{self.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
-        return tuple(float(scales[name]) for name in self.penalties)
-
-    def scaled_by_another(self, policy: str) -> str | None:
-        """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
-
-        Scales of the robot's own controller make searches against others comparable: this is no mistake.
-        """
-        measured = read_json(self.scales_file) if self.scales_file.exists() else {}
-        if measured.get("policy_sha256") in (None, controller_hash(policy)):
-            return None
-        return f"Penalties are scaled by those of {measured.get('policy')}, with which {self.scales_file} was measured."
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and value is not True and 0.0 < value <= sys.float_info.max

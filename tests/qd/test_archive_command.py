@@ -12,10 +12,10 @@ import torch
 from qd.archive import read_archive
 from qd.commands import Archive
 from qd.judge import judge
+from qd.run import settings
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
-from sim.robots.robot import RobotCfg
 from tests.qd import stand_in
 from tests.qd.searches import crossing_by
 
@@ -36,7 +36,7 @@ def narrow_policy(observation: torch.Tensor) -> torch.Tensor:
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
+    monkeypatch.setattr(settings, "read_penalty_scales", lambda robot, policy=None: stand_in.SCALES)
     before = signal.getsignal(signal.SIGTERM)
     with crossing_by(stand_in.open_stand_in):
         yield

@@ -10,7 +10,7 @@ import pytest
 from kernels.episode import Outcome
 from qd.calibrate import calibrate, measured
 from sim.files.records import identity
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
@@ -64,7 +64,7 @@ def test_the_file_is_what_the_robot_reads(tmp_path, monkeypatch):
     calibrated(tmp_path, robots(), terrains=12, replicas=4)
     monkeypatch.setattr(RobotCfg, "scales_file", property(lambda self: out))
     content = json.loads(out.read_text())
-    assert ROBOT.read_penalty_scales() == tuple(content["scales"].values())
+    assert read_penalty_scales(ROBOT) == tuple(content["scales"].values())
     assert (content["terrains"], content["episodes"], content["invalid_episodes"], content["seed"]) == (60, 240, 0, 0)
     assert identity(ROBOT, ROBOT.policy_file).items() <= content.items()
     assert (content["space"], content["crossing"]["speed"]) == ("super_gaussian", 0.75)

@@ -7,7 +7,7 @@ import pytest
 
 from sim.files.records import identity, robot_digest, robot_identity
 from sim.policy.loaders import load_policy
-from sim.robots.find import get_robot, robot_of
+from sim.robots.find import get_robot, read_penalty_scales, robot_of
 from sim.robots.shipped import ROBOTS
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.dogs import write_dog
@@ -26,7 +26,7 @@ def readers(file):
     """What reads a record of the robot."""
     robot = get_robot(str(file))
     record = {"robot": "dog"} | json.loads(robot.scales_file.read_text())
-    return robot.read_penalty_scales, lambda: robot_of(record, str(file), file.parent)
+    return lambda: read_penalty_scales(robot), lambda: robot_of(record, str(file), file.parent)
 
 
 def test_what_was_made_with_the_robot_before_it_changed_is_refused(dog):

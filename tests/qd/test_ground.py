@@ -9,11 +9,11 @@ from qd.archive import read_archive, write_archive
 from qd.causes import causes_at, effects_of
 from qd.commands import Archive
 from qd.minimise import minimise
+from qd.run import settings
 from qd.show.commands import Export
 from sim.bank import terrains_of
 from sim.files.command import run_command
 from sim.maps.heightmap import read_heightmap
-from sim.robots.robot import RobotCfg
 from sim.spaces.registry import get_space
 from tests.builders import fresh_values
 from tests.qd import stand_in
@@ -31,7 +31,7 @@ def search(*words: str) -> int:
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(RobotCfg, "read_penalty_scales", lambda self, policy=None: stand_in.SCALES)
+    monkeypatch.setattr(settings, "read_penalty_scales", lambda robot, policy=None: stand_in.SCALES)
     size = ["--scheduler.emitters", "2", "--scheduler.batch-size", "4", "--iterations", "1"]
     assert search("--space", SPACE.name, "--run-dir", "run", "--method", "hard_random", *size) == 0
     return tmp_path / "run"

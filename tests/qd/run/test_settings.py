@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from qd.fitness import FitnessCfg
+from qd.run import settings as module
 from qd.run.presets import SchedulerCfg
 from qd.run.settings import as_settings, differences, find_policy, from_settings, is_searched, preset
 from sim.files.records import robot_digest
@@ -14,10 +15,14 @@ from sim.robots.shipped import ROBOTS
 from tests.qd import stand_in
 
 
-def robot(policy_file: Path = ROBOTS["anymal"].policy_file, scales=stand_in.SCALES):
-    """ANYmal with another controller and other scales."""
-    changed = {"policy_file": policy_file, "read_penalty_scales": lambda self, policy=None: scales}
-    kind = type("Robot", (RobotCfg,), changed)
+@pytest.fixture(autouse=True)
+def of_made_up_scales(monkeypatch):
+    monkeypatch.setattr(module, "read_penalty_scales", lambda robot, policy=None: stand_in.SCALES)
+
+
+def robot(policy_file: Path = ROBOTS["anymal"].policy_file):
+    """ANYmal with another controller."""
+    kind = type("Robot", (RobotCfg,), {"policy_file": policy_file})
     return kind(**{field.name: getattr(ROBOTS["anymal"], field.name) for field in dataclasses.fields(RobotCfg)})
 
 

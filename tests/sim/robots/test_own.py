@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 from sim.files.records import robot_digest
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.model import build_robot, geom_names, joint_names
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
@@ -42,7 +42,7 @@ def test_a_file_is_a_robot(tmp_path, monkeypatch):
     assert (dog.settings_file, dog.spec, dog.model_file) == (file, str(file), tmp_path / "mine" / "dog.xml")
     assert (dog.policy_file, dog.scales_file) == (file.with_name("dog.pt"), file.with_name("dog.scales.json"))
     with pytest.raises(ValueError, match=re.escape(str(dog.scales_file))):
-        dog.read_penalty_scales()
+        read_penalty_scales(dog)
     (tmp_path / "link.py").symlink_to(file)
     assert get_robot(dog) is dog
     assert get_robot("link.py") == pickle.loads(pickle.dumps(dog)) == dog

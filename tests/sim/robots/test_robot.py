@@ -9,7 +9,7 @@ import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.files.records import robot_identity
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.model import build_robot, leaf_name
 from tests.sim.scenes import GAINS, ONLY_ANYMAL, ONLY_CASSIE
 
@@ -150,7 +150,7 @@ def test_penalty_scales_are_read(anymal, monkeypatch, tmp_path):
     monkeypatch.setattr(type(anymal), "scales_file", file)
     scales = {name: 0.5 + k for k, name in enumerate(anymal.penalties)}
     file.write_text(json.dumps({"scales": scales, **robot_identity(anymal)}))
-    assert anymal.read_penalty_scales() == (0.5, 1.5, 2.5, 3.5, 4.5, 5.5)
+    assert read_penalty_scales(anymal) == (0.5, 1.5, 2.5, 3.5, 4.5, 5.5)
     file.write_text(json.dumps({"scales": scales | {"stumble": 0.0}, **robot_identity(anymal)}))
     with pytest.raises(ValueError, match="stumble"):
-        anymal.read_penalty_scales()
+        read_penalty_scales(anymal)
