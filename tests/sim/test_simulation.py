@@ -95,7 +95,6 @@ def test_solver_options_arrive(anymal, device):
     ("terrains", "added_base_mass", "field"),
     [
         ([0, 2], None, "terrain_of_env"),
-        ([-1, 0], None, "terrain_of_env"),
         ([0, 0], np.array([0.0, -60.0]), "added_base_mass"),  # more than the base has
     ],
 )

@@ -94,25 +94,6 @@ def test_cassies_published_limits_and_frames(c_model, builder):
         np.testing.assert_allclose(data.joint(f"{joint}_left").xaxis, axis, atol=1e-6)
 
 
-def test_the_default_pose_is_symmetric(robot, c_model):
-    data = mujoco.MjData(c_model)
-    data.qpos[:] = [0, 0, robot.default_base_height, 1, 0, 0, 0, *robot.default_joint_pos]
-    mujoco.mj_forward(c_model, data)
-    feet = {name: data.geom(name).xpos for name in robot.foot_geoms}
-    pairs = {"anymal": [("LF", "RF"), ("LH", "RH")], "cassie": [("left", "right")]}[robot.name]
-    foot = {"anymal": "FOOT", "cassie": "toe"}[robot.name]
-    for left, right in pairs:
-        np.testing.assert_allclose(feet[f"{left}_{foot}"] * [1, -1, 1], feet[f"{right}_{foot}"], atol=1e-6)
-    if robot.name == "anymal":
-        np.testing.assert_allclose(feet["LF_FOOT"] * [-1, 1, 1], feet["LH_FOOT"], atol=1e-6)
-    # ANYmal's feet of .03 m hang at most 6 cm over the ground; Cassie's toes of .02 m begin .15 m over it (legged_gym's
-    # 1 m), level to 3 degrees; none in it, within the stance that the start looks at.
-    low, high = {"anymal": (0.03, 0.09), "cassie": (0.15, 0.18)}[robot.name]
-    for position in feet.values():
-        assert low <= position[2] < high
-        assert (np.abs(position[:2]) < robot.footprint).all()
-
-
 def test_what_is_asked_of_each_robot(anymal, cassie):
     # The paper: six penalties of ANYmal and no bit; five of Cassie and whether the pelvis collides.
     assert anymal.penalties == ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
