@@ -2,13 +2,15 @@
 
 import socket
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from qd.archive import FRESH, Archive, FaultCounts, FreshValues
+from qd.archive import FRESH, Archive, FaultCounts, FreshValues, write_archive
+from sim.files.atomic import to_json
 from sim.files.records import robot_identity
 from sim.robots.shipped import ROBOTS
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -92,6 +94,16 @@ def judged_archive() -> Archive:
         ),
     )
     return replace(archive, fresh=fresh, faults=faults)
+
+
+def write_run(folder: Path, archive: Archive, settings: dict | None = None) -> Path:
+    """A run's directory, with as much of its config as is read for its settings."""
+    folder.mkdir(parents=True)
+    write_archive(folder / "archive.npz", archive)
+    if settings is not None:
+        config = {"settings": settings, "iterations": archive.iterations, "device": "CPU", "sessions": []}
+        (folder / "config.json").write_bytes(to_json(config))
+    return folder
 
 
 def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):

@@ -1,8 +1,7 @@
 """What a program does to the files under a folder, step by step, and a fault at any of them.
 
-A step is what the system sees: a file opened for writing, a half of what is written, a flush to the disk, a rename, a
-new folder, a removal. A fault strikes before its step is done, so that all of them together leave every state of the
-disk that a kill can leave.
+A step is what the system sees: a file opened for writing, the second half of what is written, a rename, a new folder. A
+fault strikes before its step is done, so that all of them together leave every state of the disk that a kill can leave.
 """
 
 import builtins
@@ -29,8 +28,7 @@ def kill(name: str, path: str) -> None:
 
 def fill(name: str, path: str) -> None:
     """There is no space for what the step would write."""
-    if name != "unlink":
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
 
 class Steps:
@@ -47,10 +45,10 @@ class Steps:
         self, folder: Path, *, log: Path | None = None, fault: Callable[[str, str], None] = kill, at: int | None = None
     ) -> None:
         self._folder, self._log, self._fault, self._at, self._count = str(folder), log, fault, at, 0
-        self._open, self._os_open, self._fsync = io.open, os.open, os.fsync
+        self._open, self._os_open = io.open, os.open
         io.open = builtins.open = self._watched_open
-        os.open, os.fsync = self._watched_os_open, self._watched_fsync
-        for name, place in (("replace", 1), ("unlink", 0), ("mkdir", 0)):
+        os.open = self._watched_os_open
+        for name, place in (("replace", 1), ("mkdir", 0)):
             setattr(os, name, self._watched(name, getattr(os, name), place))
 
     def take(self, name: str, path: str | bytes) -> None:
@@ -84,10 +82,6 @@ class Steps:
             self.take("open", os.fspath(path))
         return self._os_open(path, flags, *rest, **named)
 
-    def _watched_fsync(self, handle: int) -> None:
-        self.take("fsync", os.readlink(f"/proc/self/fd/{handle}"))
-        self._fsync(handle)
-
 
 class _File:
     """A file being written, in two halves that reach the disk one after the other."""
@@ -97,10 +91,10 @@ class _File:
 
     def write(self, data: Any) -> int:
         half = len(data) // 2
-        for name, part in (("write", data[:half]), ("rest", data[half:])):
-            self._steps.take(name, self._path)
-            self._file.write(part)
-            self._file.flush()
+        self._file.write(data[:half])
+        self._file.flush()
+        self._steps.take("rest", self._path)
+        self._file.write(data[half:])
         return len(data)
 
     def __enter__(self) -> "_File":

@@ -48,13 +48,6 @@ def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
     assert (some.family.tolist(), some.cause.tolist()) == ([2, 0], ["drop", "ridge"])
 
 
-def test_scores_by_hand():
-    archive = dataclasses.replace(small_archive(), fitness=np.array([5.0, 1.0, -3.0]))
-    assert archive.qd_score == 25.0 + 21.0 + 17.0
-    assert archive.mean_fitness == 1.0
-    assert archive.reachable_coverage == 3 / 10  # two ratios have 10 reachable cells
-
-
 def changed_file(folder, archive, **changes):
     """The file of an archive with other arrays, or without those that are None."""
     write_archive(folder / "archive.npz", archive)

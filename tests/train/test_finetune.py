@@ -11,13 +11,12 @@ import torch
 from qd.archive import write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.sets import split_elites
-from sim.files.atomic import to_json
 from sim.files.command import run_command
 from sim.policy.loaders import load_policy
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.spaces import registry as spaces
-from tests.builders import fresh_values, make_archive
+from tests.builders import fresh_values, make_archive, write_run
 from tests.sim.spaces.spaces import move, write_ridges
 from tests.train.starts import PPO, make_places, write_actor
 from train.cfg import FinetuneCfg, RunCfg
@@ -217,14 +216,11 @@ def test_a_space_of_ones_own_runs_only_where_it_is_named(places, tmp_path, monke
 @pytest.fixture(scope="module")
 def searched(places):
     """A run of a search whose controller fails 8 of its 10 elites in fresh episodes."""
-    archive, run = make_archive(10), places / "searched"
+    archive = make_archive(10)
     fresh = replace(fresh_values(archive), goal_rate=np.array([0.1] * 8 + [0.9] * 2))
     digest = controller_hash(places / "start.pt")
-    run.mkdir()
-    write_archive(run / "archive.npz", replace(archive, fresh=fresh, policy_sha256=digest))
-    config = {"settings": {"policy": str(places / "start.pt")}, "iterations": 3, "device": "cpu", "sessions": []}
-    (run / "config.json").write_bytes(to_json(config))
-    return run
+    archive = replace(archive, fresh=fresh, policy_sha256=digest)
+    return write_run(places / "searched", archive, {"policy": str(places / "start.pt")})
 
 
 def test_which_elites_are_trained_on(places, searched):

@@ -1,13 +1,11 @@
 """The sets that controllers are evaluated on, and the elites that are held out."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qd.archive import Archive, FaultCounts, write_archive
+from qd.archive import FaultCounts
 from qd.evaluate.labels import SETS
 from qd.evaluate.marks import marks_of
 from qd.evaluate.sets import (
@@ -25,7 +23,7 @@ from qd.run.settings import as_settings
 from sim.bank import heights_of
 from sim.spaces.course import COURSE
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import fresh_values, make_archive
+from tests.builders import fresh_values, make_archive, write_run
 from tests.qd.searches import CFG
 
 PARTS = ("test", "validation")
@@ -140,28 +138,17 @@ def test_the_far_third_is_the_farthest():
         np.testing.assert_array_equal(getattr(far, field), getattr(whole, field)[places])
 
 
-def write_run(folder: Path, archive: Archive, seed: int | None = None) -> Path:
-    """A run with its config, as far as it is read for the seed."""
-    folder.mkdir()
-    write_archive(folder / "archive.npz", archive)
-    if seed is not None:
-        settings = as_settings(replace(CFG, seed=seed))
-        config = {"settings": settings, "iterations": 3, "device": "CPU", "sessions": []}
-        (folder / "config.json").write_text(json.dumps(config))
-    return folder
-
-
 def test_an_independent_archive_is_of_another_search(tmp_path, anymal):
-    archive, kin = make_archive(20), make_archive(20, seed=4)
+    archive, kin, first = make_archive(20), make_archive(20, seed=4), as_settings(replace(CFG, seed=0))
     kin.genes[3] = archive.genes[5]
-    trained = write_run(tmp_path / "trained", archive, seed=0)
-    other = write_run(tmp_path / "other", make_archive(20, seed=1), seed=1)
+    trained = write_run(tmp_path / "trained", archive, first)
+    other = write_run(tmp_path / "other", make_archive(20, seed=1), as_settings(CFG))
     for path, archive_path in ((other, trained), (other / "archive.npz", trained), (trained, None)):
         assert len(read_independent(path, archive_path, anymal)) == 20
     course = replace(make_archive(9), space="course", genes=COURSE.hard_random(9, 0))
     for path, field in (
-        (write_run(tmp_path / "kin", kin, seed=5), "1 elites in both"),
-        (write_run(tmp_path / "same-seed", make_archive(20, seed=2), seed=0), "seed 0"),
+        (write_run(tmp_path / "kin", kin, as_settings(CFG)), "1 elites in both"),
+        (write_run(tmp_path / "same-seed", make_archive(20, seed=2), first), "seed 0"),
         (write_run(tmp_path / "cassie", make_archive(9, robot="cassie")), "cassie"),
         (write_run(tmp_path / "empty", make_archive(0)), "empty"),
         (write_run(tmp_path / "course", course), "course"),

@@ -4,21 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from qd.archive import write_archive
 from qd.run import directory
-from qd.run.directory import RunDirectory, claimed, find_run, folder_for, free_path, read_archive_of, search_seed
+from qd.run.directory import RunDirectory, claimed, find_run, folder_for, read_archive_of, search_seed
 from sim.robots.find import get_robot
-from tests.builders import small_archive
+from tests.builders import small_archive, write_run
 from tests.qd.searches import CFG
 
 ORIGIN = {"command": "faultline archive", "commit": "c", "device": "CPU", "seed": 3}
-
-
-def test_a_run_without_a_name_gets_a_folder_of_its_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("a", "a-2", "a-3"):
-        assert free_path("a") == Path("runs") / name
-        free_path("a").mkdir(parents=True)
 
 
 def test_a_claim_keeps_others_out_and_leaves_no_empty_directory(tmp_path):
@@ -79,8 +71,7 @@ def results(tmp_path, monkeypatch):
 
 
 def make_run(path: Path, time: float = 0.0, **changes) -> Path:
-    path.mkdir(parents=True)
-    write_archive(path / "archive.npz", dataclasses.replace(small_archive(), **changes))
+    write_run(path, dataclasses.replace(small_archive(), **changes))
     os.utime(path / "archive.npz", (time, time))
     return path
 

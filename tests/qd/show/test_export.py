@@ -7,24 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import write_archive
 from qd.show.elites import open_run
 from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
 from sim.bank import heights_of
 from sim.maps.heightmap import as_terrain, read_heightmap
-from tests.builders import fresh_values, small_archive
+from tests.builders import fresh_values, small_archive, write_run
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """The newest run: three elites, with what fresh episodes say."""
     monkeypatch.chdir(tmp_path)
-    folder = Path("runs/anymal-small-0")
-    folder.mkdir(parents=True)
     archive = small_archive(3)
     fresh = dataclasses.replace(fresh_values(archive), goal_rate=np.array([0.1, 0.2, 0.9]))
-    write_archive(folder / "archive.npz", dataclasses.replace(archive, fresh=fresh))
-    return folder
+    return write_run(Path("runs/anymal-small-0"), dataclasses.replace(archive, fresh=fresh))
 
 
 def export(elite, **options):

@@ -10,14 +10,13 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.archive import write_archive
 from qd.show.commands import Film
 from qd.show.crossed import moment_of_failure, title_of, typical_episode
 from qd.show.film import Shot, as_gif, as_mp4, follow, pictures_of, pose_at
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import open_context
-from tests.builders import small_archive
+from tests.builders import small_archive, write_run
 from tests.qd.recordings import recording_of, stand_in_cross
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -175,10 +174,7 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr("qd.show.recordings.Simulation", lambda robot, device: stand_in_cross([]))
     monkeypatch.setattr("qd.show.film.FPS", 2)
     monkeypatch.setattr("qd.show.film.GIF_FPS", 2.0)
-    folder = Path("runs/anymal-small-0")
-    folder.mkdir(parents=True)
-    write_archive(folder / "archive.npz", small_archive(3))
-    return folder
+    return write_run(Path("runs/anymal-small-0"), small_archive(3))
 
 
 def film(*argv):
