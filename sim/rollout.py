@@ -44,13 +44,13 @@ class RolloutResult:
     """Simulated time up to the end [s], float32."""
     final_position: np.ndarray
     """Base position at the end, world-local [m], (T, R, 3) float32."""
-    physics_steps: int
+    physics_steps: int = 0
     """Physics steps run for it: since the result before, or since it was put in if nothing else was."""
-    robot_steps: int
+    robot_steps: int = 0
     """Physics steps of all robots in that time, those that waited included."""
-    busy_steps: int
+    busy_steps: int = 0
     """Those of them in which a robot had an episode, each to the end of its control step."""
-    wall_s: float
+    wall_s: float = 0.0
     """Time that took [s]."""
     reward: np.ndarray | None = None
     """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""

@@ -146,6 +146,8 @@ class FinetuneCfg(TrainCfg):
             raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
         if self.num_envs < self.terrains:
             raise ValueError(f"num_envs must be at least as many as terrains, {self.terrains}, got {self.num_envs}")
+        if not self.task.crosses:
+            raise ValueError("task.crosses must be True in a fine-tuning, whose terrains are to be crossed, got False")
         if self.mix != "generated" and self.archive:
             raise ValueError(f"mix {self.mix} takes no terrains from an archive, got --archive: leave it out")
 

@@ -180,8 +180,7 @@ class FineTuning(Training):
         """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
         self.mix = Mix(
             kind=cfg.mix, num_terrains=cfg.terrains, draw=cfg.recipe.draw, genes=elites.genes, spaces=elites.spaces,
-            crosses=cfg.task.crosses, seed=cfg.seed, device=device,
-            goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
+            seed=cfg.seed, device=device, goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
         )  # fmt: skip
         if start is not None:
             before = recorded_marks(str(cfg.policy or robot.policy_file))

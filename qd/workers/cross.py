@@ -132,13 +132,8 @@ class _Stored:
             if set(_ARRAYS) - arrays.keys() or any(len(values) != len(rows) for values in arrays.values()):
                 self._cache.discard(key, f"it must hold {', '.join(_ARRAYS)} of {len(rows)} terrains")
                 continue
-            yield numbers, self._result({name: values[places] for name, values in arrays.items()})
-
-    def _result(self, arrays: dict[str, Any]) -> RolloutResult:
-        """A result that took no time."""
-        return RolloutResult(
-            **arrays, penalty_names=self._penalty_names, physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0
-        )
+            chosen: dict[str, Any] = {name: values[places] for name, values in arrays.items()}
+            yield numbers, RolloutResult(**chosen, penalty_names=self._penalty_names)
 
     def write(self, terrains: NDArray[Any], seeds: NDArray[Any], result: RolloutResult) -> None:
         """Stores a lot."""
@@ -369,7 +364,7 @@ def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutRe
         penalties=np.zeros((*shape, len(penalty_names))), penalty_names=penalty_names,
         outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
         duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
-        physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0, reward=np.zeros(shape) if cfg.reward else None,
+        reward=np.zeros(shape) if cfg.reward else None,
     )  # fmt: skip
 
 
@@ -383,5 +378,4 @@ def _as_result(terrains: Sequence[PlainCrossings], penalty_names: tuple[str, ...
         fallen=np.zeros(outcome.shape, bool),
         duration_s=np.array([terrain.duration_s for terrain in terrains]).astype(np.float32),
         final_position=np.full((*outcome.shape, 3), np.nan, np.float32),
-        physics_steps=0, robot_steps=0, busy_steps=0, wall_s=0.0,
     )  # fmt: skip

@@ -129,10 +129,6 @@ class Recording:
             fallen=self.fallen,
             duration_s=self.duration_s,
             final_position=position,
-            physics_steps=0,
-            robot_steps=0,
-            busy_steps=0,
-            wall_s=0.0,
         )
 
     def qpos(self, terrain: int, episode: int) -> NDArray[np.float64]:

@@ -11,16 +11,7 @@ from sim.ground import GroundMaps
 from sim.robots.training import Draw
 from sim.spaces.base import TerrainSpace
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import (
-    CROSSING_TYPES,
-    NUM_COLS,
-    NUM_LEVELS,
-    NUM_ROWS,
-    TILE_SHARES_PERCENT,
-    TILE_TYPES,
-    hand_crafted_crossings,
-    training_tile,
-)
+from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from train.task.curriculum import Tiles
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
@@ -44,8 +35,6 @@ class Mix:
     genes: tuple[NDArray[np.float32], ...]
     """Elites to train on, a part of each archive, shape (E, genes of its space); E sums up over the parts. None except
     with mix generated."""
-    crosses: bool
-    """Whether robots cross; else they are told velocities in the middle."""
     seed: int
     device: str
     spaces: tuple[TerrainSpace, ...] = (SUPER_GAUSSIAN,)
@@ -59,7 +48,7 @@ class Mix:
     episodes: NDArray[np.int64] = field(init=False)
     """Valid episodes that ended on each elite when it was last trained on before the present exchange, shape (E,)."""
     crossed: NDArray[np.int64] = field(init=False)
-    """How many of them reached the goal; where robots do not cross, the end of the time."""
+    """How many of them reached the goal."""
 
     def __post_init__(self) -> None:
         if self.kind == "generated" and self.num_elites == 0:
@@ -93,7 +82,8 @@ class Mix:
     def terrains(self) -> Tiles:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
         rng = self._rng(0)
-        heights, types = self._hand_crafted(rng)
+        heights, numbers, _ = hand_crafted_crossings(self.num_hand_crafted, rng)
+        types = tuple(CROSSING_TYPES[number] for number in numbers)
         if self.kind == "hand-crafted":
             return Tiles(heights=heights, type_of_column=types)
         count = self.num_terrains - self.num_hand_crafted
@@ -152,22 +142,6 @@ class Mix:
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
 
-    def _hand_crafted(self, rng: np.random.Generator) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-        count = self.num_hand_crafted
-        if count == 0:
-            return np.zeros((0, NUM_ROWS, NUM_COLS), np.float32), ()
-        if self.crosses:
-            heights, types, _ = hand_crafted_crossings(count, rng)
-            return heights, tuple(CROSSING_TYPES[kind] for kind in types)
-        kinds = rng.choice(len(TILE_TYPES), size=count, p=TILE_SHARES_PERCENT / 100)
-        levels = rng.integers(NUM_LEVELS, size=count)
-        inverted = rng.integers(2, size=count)
-        tiles = [
-            training_tile(TILE_TYPES[kind], int(level), rng, inverted=bool(turned))
-            for kind, level, turned in zip(kinds, levels, inverted, strict=True)
-        ]
-        return np.stack(tiles), tuple(TILE_TYPES[kind] for kind in kinds)
-
     def draw_rows(self) -> NDArray[np.int64]:
         """Elites of the next exchange: none twice, unless there are too few."""
         if self.kind != "generated":
@@ -205,6 +179,6 @@ class Mix:
             on_elite = terrain >= self.num_hand_crafted
             rows = self.rows[terrain[on_elite] - self.num_hand_crafted]
             valid = counts["episodes"] - counts["invalid"]
-            for sums, part in zip(present, (valid, counts["goal" if self.crosses else "time_out"]), strict=True):
+            for sums, part in zip(present, (valid, counts["goal"]), strict=True):
                 sums += np.bincount(rows, part[on_elite], self.num_elites).astype(np.int64)
         return present

@@ -7,24 +7,23 @@ from sim.bank import terrains_of
 from sim.spaces.course import COURSE
 from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import CROSSING_TYPES, TILE_TYPES
+from sim.terrain import CROSSING_TYPES
 from train.task.mix import Mix
 
 ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 
 
-def make_mix(*, kind="generated", terrains=6, elites=ELITES, crosses=True, seed=0, **changes) -> Mix:
+def make_mix(*, kind="generated", terrains=6, elites=ELITES, seed=0, **changes) -> Mix:
     genes = elites if kind == "generated" else np.zeros((0, 64), np.float32)
     return Mix(
-        kind=kind, num_terrains=terrains, crosses=crosses, seed=seed, device="cpu", **{"genes": (genes,), **changes}
+        kind=kind, num_terrains=terrains, seed=seed, device="cpu", **{"genes": (genes,), **changes}
     )
 
 
-def counts(goals, episodes, time_outs=None, invalid=None):
+def counts(goals, episodes, invalid=None):
     """What became of the episodes of 12 robots on 6 terrains, two on each."""
     return {
         "goal": np.repeat(np.float32(goals), 2),
-        "time_out": np.repeat(np.float32(goals if time_outs is None else time_outs), 2),
         "episodes": np.repeat(np.float32(episodes), 2),
         "invalid": np.repeat(np.float32([0] * 6 if invalid is None else invalid), 2),
     }
@@ -50,8 +49,6 @@ def test_the_other_mixes():
     assert first.type_of_column == (*CROSSING_TYPES[:2], *["hard-random"] * 3)
     assert not first.heights[2:, :, :81].any() and np.abs(first.heights[2:]).max() > 0.1  # flat up to x = 4 m
     assert not any(np.array_equal(before, after) for before in first.heights[2:] for after in second.heights[2:])
-    tiles = make_mix(kind="hand-crafted", crosses=False, terrains=40).next()  # robots told velocities
-    assert set(tiles.type_of_column) <= set(TILE_TYPES) and len(set(tiles.type_of_column)) > 2
 
 
 def test_exchanges_differ_and_follow_from_the_seed():
@@ -84,14 +81,6 @@ def test_what_is_remembered_of_an_elite_is_its_last_exchange():
     mix.next(counts([0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 0, 1]))  # no episode ended on the second of them
     assert mix.episodes[second[0]] == 2 and mix.crossed[second[0]] == 2
     assert mix.episodes[second[1]] == dict(zip(first, [8, 10, 8], strict=True)).get(second[1], 0)  # as before
-
-
-def test_without_a_goal_it_is_the_end_of_the_time_that_counts():
-    mix = make_mix(crosses=False)
-    mix.next()
-    first = mix.rows.copy()
-    mix.next(counts([0] * 6, [4] * 6, time_outs=[4] * 6))
-    assert (mix.success()[first] == 1.0).all()
 
 
 def test_a_resume_between_exchanges_counts_what_was_before_it_too():
