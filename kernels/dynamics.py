@@ -114,7 +114,6 @@ class TreeSizes:
 
 @cache
 def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
-    """The kernel for models of these sizes."""
     snippet = lanes.snippet(_BODY, words=sizes.words, **asdict(sizes), **dict(codes))
 
     @wp.func_native(snippet=snippet)

@@ -109,7 +109,6 @@ class Sizes:
 
 @cache
 def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> Any:
-    """The kernel for models of these sizes."""
     values = {"step": int(step), "chunk": _CHUNK} | asdict(sizes) | dict(codes)
     snippet = lanes.snippet(_BODY, words=sizes.words, **values)
 

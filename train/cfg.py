@@ -200,5 +200,4 @@ class HardenCfg:
 
 
 def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:
-    """Gives sizes to those settings that are 0."""
     return replace(cfg, **{name: getattr(cfg, name) or size for name, size in sizes.items() if hasattr(cfg, name)})

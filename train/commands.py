@@ -147,5 +147,4 @@ def _run_dir(flags: _OfTraining, name: str) -> Path:
 
 
 def _part(kind: type[_Cfg], flags: Any) -> _Cfg:
-    """The settings among flags."""
     return kind(**{setting.name: getattr(flags, setting.name) for setting in fields(kind)})  # pyright: ignore[reportArgumentType]

@@ -122,8 +122,6 @@ def _begin(robot: RobotCfg, cfg: HardenCfg, run_dir: Path, compute: Compute) -> 
 
 @dataclass(kw_only=True)
 class _Hardening:
-    """A hardening at work."""
-
     robot: RobotCfg
     cfg: HardenCfg
     path: Path
@@ -251,7 +249,6 @@ def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, f
 
 
 def _show(content: Mapping[str, Any]) -> None:
-    """Prints the rounds."""
     goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
     counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
     rows = [

@@ -103,8 +103,6 @@ class RayWorker:
 
 @dataclass(eq=False)
 class _Shard:
-    """Terrains that one worker crosses."""
-
     terrains: NDArray
     seeds: NDArray
     tries: int = 0
@@ -201,7 +199,6 @@ class RayWorkers(Pipeline):
         self._deal()
 
     def _start_missing(self) -> None:
-        """Starts workers for the devices that have none."""
         if time.monotonic() - self._grown_at < _GROW_EVERY_S:
             return
         self._grown_at = time.monotonic()

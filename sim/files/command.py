@@ -178,7 +178,6 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
 
 
 def _wrapped(text: str) -> str:
-    """Paragraphs that fit the terminal."""
     width = max(40, get_terminal_size().columns)
     return "\n\n".join(textwrap.fill(paragraph, width) for paragraph in text.split("\n\n"))
 

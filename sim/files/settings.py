@@ -102,7 +102,6 @@ def _in_words(expected: str) -> str:
 
 
 def _choices(annotation: Any) -> tuple[Any, ...]:
-    """Values of the literals in an annotation."""
     parts = get_args(annotation)
     return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
 

@@ -298,6 +298,5 @@ def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[Proc
 
 
 def _join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
-    """Crossings of one terrain that were run in parts."""
     names = vars(parts[0])
     return PlainCrossings(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

@@ -156,8 +156,6 @@ def _add_geom(root: ET.Element, name: str, position: tuple[float, float, float],
 
 @dataclass(frozen=True, kw_only=True)
 class _Patch:
-    """Ground of one geom."""
-
     rows: slice
     cols: slice
     margin: Margins  # nodes that continue the edge, before and behind along y, and along x

@@ -131,7 +131,6 @@ class Progress:
 
 
 def _scalars_of(row: dict[str, Any]) -> dict[str, float]:
-    """The numbers of a row by their names in TensorBoard."""
     scalars = {f"train/{name}": value for name, value in row.items() if not isinstance(value, dict)}
     for group, values in row.items():
         if isinstance(values, dict):

@@ -51,8 +51,6 @@ class Mix:
     """How many of them reached the goal."""
 
     def __post_init__(self) -> None:
-        if self.kind == "generated" and self.num_elites == 0:
-            raise ValueError("mix generated needs elites to train on, got none: give an archive that has some")
         self.episodes = np.zeros(self.num_elites, np.int64)
         self.crossed = np.zeros(self.num_elites, np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
