@@ -53,30 +53,6 @@ def test_parity_with_the_oracle(num_envs, num_joints, num_scan):
         np.testing.assert_allclose(got[env, split:], expected[split:], atol=3e-4)
 
 
-def test_one_row_by_hand():
-    # A level base at 0.6 m turned by 90 degrees over a plateau of 0.2 m that starts at y = 4 (row 80).
-    q, qd = upright(1, 2, x=2, y=3.9, z=0.6)
-    q[0, 3:7] = 0, 0, np.sqrt(0.5), np.sqrt(0.5)
-    q[0, 7:] = -0.5, 0.7
-    qd[0, :3] = 0, 0.5, 0.1
-    qd[0, 6:] = 2, -4
-    grids = np.zeros((1, 161, 321))
-    grids[:, 80:] = 0.2
-    # Ahead of the base is +y: the point 0.5 m ahead stands on 0.2 m, the one 0.5 m behind on 0.
-    row = observe((q, qd), [[0.75, -0.1, 0.4]], [[1.5, -3]], [0], grids, [(0.5, 0.0), (-0.5, 0.0)])[0]
-    expected = [
-        1.0, 0, 0.2,  # (0.5, 0, 0.1) m/s in the base frame, times 2
-        0, 0, 0,
-        0, 0, -1,
-        1.5, -0.2, 0.1,  # times 2, 2, 0.25
-        0, 0.2,  # -0.5 + 0.5, 0.7 - 0.5
-        0.1, -0.2,  # times 0.05
-        1.5, -3,
-        -0.5, 0.5,  # (0.6 - 0.5 - 0.2) * 5, (0.6 - 0.5 - 0) * 5
-    ]  # fmt: skip
-    np.testing.assert_allclose(row, expected, atol=2e-6)
-
-
 def test_the_scan_is_clipped_at_a_metre_and_a_wild_state_gives_a_bounded_row():
     # 0.5 m below the base is the zero: a base at 3 m sees (3 - 0.5) -> 1 m, times 5; one at -2 m sees -1 m.
     q, qd = upright(3, 1)

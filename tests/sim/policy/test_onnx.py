@@ -26,8 +26,7 @@ def port(name, shape, kind=FLOAT):
 
 def graph_model(nodes, inputs, outputs, weights=()):
     graph = helper.make_graph(list(nodes), "policy", inputs, outputs, initializer=list(weights))
-    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("their.own", 1)]
-    return helper.make_model(graph, opset_imports=opsets, ir_version=8)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
 def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
@@ -37,12 +36,6 @@ def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=No
     node = helper.make_node("Gemm", ["obs", "w", "b"], ["actions"], transB=1)
     ports = [port("obs", [batch, columns or observations])], [port("actions", [batch, columns or actions])]
     return graph_model([node], *ports, weights)
-
-
-def one_node(kind, inputs, outputs, **attributes):
-    """A graph of one node whose inputs and outputs are rows of as many columns as a robot has joints."""
-    ports = [[port(name, ["b", ACTIONS]) for name in names] for names in (inputs, outputs)]
-    return graph_model([helper.make_node(kind, inputs, outputs, **attributes)], *ports)
 
 
 def save(path, model):
@@ -81,8 +74,9 @@ MODELS = {
     "doubles": graph_model(
         [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
     ),
-    "two inputs": one_node("Sum", ["a", "b"], ["c"]),
-    "a foreign operator": one_node("Surprise", ["obs"], ["actions"], domain="their.own"),
+    "two inputs": graph_model(
+        [helper.make_node("Sum", ["a", "b"], ["c"])], [port(name, ["n", 12]) for name in "ab"], [port("c", ["n", 12])]
+    ),
     "no graph": graph_model([], [], []),
     "half a file": linear().SerializeToString()[:-9],
 }

@@ -15,7 +15,6 @@ from sim.robots.probes import (
     box_strips,
     hull_probes,
     make_probes,
-    max_spacing,
     shape_strips,
 )
 
@@ -35,15 +34,6 @@ def uncovered(points, strips):
     for centre, radius in zip(centres, radii, strict=True):
         gap = np.minimum(gap, np.linalg.norm(points - centre, axis=1) - radius)
     return gap
-
-
-@pytest.mark.parametrize(
-    # Shank: r = 17.5 mm, sag 5 mm: s = 2 sqrt(2 * 17.5 * 5 - 25) = 2 sqrt(150) = 24.4949 mm. Smaller than the sag: 2 r.
-    ("radius", "spacing"),
-    [(0.0175, 0.0244949), (0.003, 0.006)],
-)
-def test_spacing_lets_a_ridge_sink_by_the_bound(radius, spacing):
-    assert max_spacing(radius) == pytest.approx(spacing, abs=1e-7)
 
 
 CAPSULES = [(0.0175, 0.1), (0.06, 0.04), (0.003, 0.2)]
