@@ -12,7 +12,6 @@ from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import (
     MAX_MESH_PROBES,
     MAX_SAG,
-    box_strips,
     hull_probes,
     make_probes,
     shape_strips,
@@ -60,16 +59,8 @@ def test_probes_cover_a_shape_and_none_sticks_out(kind, size, shape):
     for strip in strips:  # kernels.contact bounds a strip by its ends and takes first and last as its outermost
         extent = np.ptp(strip.centres, axis=0)
         assert (np.diff(strip.centres[:, extent.argmax()]) > 0).all() and np.sort(extent)[:2].max() < 1e-12
-
-
-@pytest.mark.parametrize("longest", [0, 1, 2])
-def test_strips_of_a_box_run_along_its_longest_side(longest):
-    # 0.5 x 0.16 x 0.1 m, probes of 2 cm at most 26.5 mm apart: 19 along, 6 and 4 across. Of those 24 rows 16 are at the
-    # rim; each of the 8 within has a probe on both end faces.
-    strips = box_strips(tuple(np.roll([0.25, 0.08, 0.05], longest)))
-    assert sorted(len(strip.centres) for strip in strips) == [1] * 16 + [19] * 16
-    for strip in strips:
-        assert np.ptp(strip.centres, axis=0)[np.arange(3) != longest].max() < 1e-12
+        if kind == GeoType.BOX and len(strip.centres) > 1:  # long rows make few contacts
+            assert size[extent.argmax()] == max(size)
 
 
 def ball(count, size):
