@@ -1,6 +1,5 @@
 """A search and a training of a fraction of a second, by their own commands, and what each comes to."""
 
-import json
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,11 @@ import faultline
 from qd import search as searching
 from qd.archive import ARCHIVE_FILE
 from qd.run.checkpoint import load_checkpoint
-from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE, METRICS_FILE
+from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE
 from qd.scheduler import Scheduler
 from sim.robots.find import get_robot
 from tests.kills.faults import Steps
-from tests.qd.searches import TIMES, crossing_by
+from tests.qd.searches import crossing_by, rows_of
 from tests.qd.stand_in import open_stand_in
 from train.ppo import training
 from train.ppo.checkpoint import CHECKPOINT, read_checkpoint
@@ -31,7 +30,7 @@ _TRAIN = (
     "train --device cpu --num-envs 6 --task.curriculum.num-columns 2 --task.curriculum.noise-columns 1 "
     "--ppo.hidden-dims 16 8 --ppo.steps-per-env 4 --ppo.epochs 1 --ppo.mini-batches 2"
 )
-_OF_A_CLOCK = (*TIMES, "rollout_s", "physics_steps", "robot_steps", "idle_share")
+_OF_A_CLOCK = ("rollout_s", "physics_steps", "robot_steps", "idle_share")
 
 
 @cache
@@ -64,9 +63,8 @@ def search(path: Path, *, iterations: int, **watched: Any) -> int:
 def search_outcome(path: Path) -> tuple[Any, ...]:
     """What a search comes to: the archive's bytes, its metrics without a clock's, and what it would ask next."""
     state = load_checkpoint(path / CHECKPOINT_FILE)
-    rows = [json.loads(line) for line in (path / METRICS_FILE).read_text().splitlines()]
+    rows = [{key: value for key, value in row.items() if key not in _OF_A_CLOCK} for row in rows_of(path)]
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
-    rows = [{key: value for key, value in row.items() if key not in _OF_A_CLOCK} for row in rows]
     return (path / ARCHIVE_FILE).read_bytes(), rows, Scheduler.from_state(state).ask().tobytes()
 
 

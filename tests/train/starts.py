@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from qd.archive import write_archive
 from qd.evaluate.marks import TRAINED_ON, marks_of
-from tests.builders import make_archive
+from tests.builders import make_archive, write_run
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 
@@ -42,7 +41,6 @@ def write_trained(folder: Path, genes: np.ndarray) -> Path:
 
 def make_places(folder: Path) -> Path:
     """A folder with an archive of ten elites and a controller."""
-    (folder / "archive").mkdir()
-    write_archive(folder / "archive" / "archive.npz", make_archive(10))
+    write_run(folder / "archive", make_archive(10))
     write_actor(folder / "start.pt")
     return folder

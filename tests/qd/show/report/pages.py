@@ -7,12 +7,12 @@ import re
 
 import numpy as np
 
-from qd.archive import read_archive, write_archive
+from qd.archive import read_archive
 from qd.run.settings import as_settings, preset
 from qd.show.report import report
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot
-from tests.builders import fresh_values
+from tests.builders import fresh_values, write_run
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.test_figures import rows
 from tests.qd.test_groups import grouped_archive
@@ -29,9 +29,7 @@ def make_run(root):
     archive, _ = grouped_archive()
     archive = dataclasses.replace(archive, iterations=4)
     archive = archive.corrected_by(fresh_values(archive))
-    folder = root / "run"
-    folder.mkdir()
-    write_archive(folder / "archive.npz", archive)
+    folder = write_run(root / "run", archive)
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows(4)))
     small = preset("small", get_robot("anymal"))
     fitness = dataclasses.replace(small.fitness, penalties=archive.penalties, scales=archive.scales)
