@@ -91,8 +91,11 @@ class App:
         if number in self.tabs:
             self.tabs[number].act(name, value)
         elif name == "hello" and number in self.page.get_clients():
-            query, width, height = value
-            window = (int(width), int(height))
+            try:
+                query, width, height = value
+                window = (int(width), int(height))
+            except (TypeError, ValueError, OverflowError):  # anybody may write it; the page's own comes, too
+                return
             self.tabs[number] = Tab(client, self._bars[number], self._common, window, str(query))
 
     def leave(self, number: int) -> None:

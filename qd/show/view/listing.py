@@ -163,7 +163,7 @@ def map_svg(listing: Listing, listed: NDArray[np.int64], picked: int) -> str:
             place = f'cx="{20 * x:.0f}" cy="{160 - 20 * y:.0f}" r="{radius}"'
             dots.append(f'<circle data-elite="{number}" {place} fill="{color}"><title>{words}</title></circle>')
     ends = "".join(
-        f'<text x="{20 * x:.0f}" y="{154 - 20 * y:.0f}" text-anchor="middle">{words}</text>'
+        f'<text x="{20 * x:.0f}" y="{154 - 20 * y:.0f}" text-anchor="middle" class="place">{words}</text>'
         for words, (x, y) in {"start": CrossingCfg.start, "goal": CrossingCfg.goal}.items()
     )
     frame = '<rect width="320" height="160" fill="none" stroke="#adb5bd"/>'

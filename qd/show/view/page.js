@@ -44,12 +44,16 @@ window.faultline = (() => {
     #faultline button, #faultline select { font: inherit; padding: 3px 8px; border-radius: 4px; cursor: pointer;
       border: 1px solid #adb5bd; background: var(--mantine-color-default, #fff); color: inherit; }
     #faultline .off { opacity: .45; pointer-events: none; }
+    @media (max-width: 575px) { #faultline .words { white-space: normal; } }
     @media (min-width: 576px) { #faultline { grid-template-areas: "play track track time" "words words tools tools";
       grid-template-columns: auto 1fr auto auto; } #faultline .tools [data-do=episode] { flex: 0 1 17em; } }
     [data-floating-window]:has(.faultline-channel), .mantine-Tabs-root:has(.faultline-channel) { display: none; }
     .mantine-Paper-root[style*="position: fixed"] { width: 100vw !important; max-height: 48dvh !important; }
     .mantine-Paper-root[style*="position: fixed"] [style*="width: 20em"] { width: 100vw !important; }
     body:not(.unfolded) .mantine-Paper-root[style*="position: fixed"] { max-height: 3.5em !important; overflow: hidden; }
+    body:not(.unfolded) .mantine-Paper-root[style*="position: fixed"]::after { content: "▲ elites, rates, film";
+      position: absolute; top: 1.1em; left: 0; right: 0; text-align: center; font-size: 13px; pointer-events: none; }
+    text.place { paint-order: stroke; stroke: var(--mantine-color-body, #fff); stroke-width: 3px; }
     circle[data-elite]:hover { stroke: #000; }
     [data-elite] { cursor: pointer; padding: 2px 6px; border-radius: 3px; }
     .faultline-list { max-height: 30dvh; overflow-y: auto; margin-top: 4px; }

@@ -189,7 +189,9 @@ class CrossingPanel:
         if self._curves is None:
             series = [uplot.Series(label=label_of(n), stroke=look_of(n).color, width=2.0) for n in self._penalties]
             with self._curves_place:
-                self._curves = self._gui.add_uplot(data, (uplot.Series(label="time [s]"), *series), height=170)
+                self._curves = self._gui.add_uplot(
+                    data, (uplot.Series(label="time [s]"), *series), height=170, padding=(12, 12, 0, 0)
+                )
         self._curves.data = data
         self.stretch_curves(crossing.duration_s)
 

@@ -36,7 +36,7 @@ class Crossing:
     duration_s: float
     """Simulated time up to the end [s]."""
     ending: str
-    """Outcome in words, and whether the robot has fallen."""
+    """Outcome in words, when it came, and whether the robot has fallen."""
     positions: NDArray[np.float64]
     """Origins of the bodies, world [m], shape (F, num_bodies, 3)."""
     quaternions: NDArray[np.float64]
@@ -75,7 +75,7 @@ def crossing_of(
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
         return None
-    qpos = recording.qpos(0, replica)
+    qpos, duration_s = recording.qpos(0, replica), float(recording.duration_s[0, replica])
     positions, quaternions = skeleton.body_poses(qpos)
     newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
     size = np.linalg.norm(newtons, axis=-1)
@@ -87,8 +87,8 @@ def crossing_of(
     columns = [recording.penalty_names.index(name) for name in penalties]
     return Crossing(
         dt=recording.dt,
-        duration_s=float(recording.duration_s[0, replica]),
-        ending=ending_words(recording, replica),
+        duration_s=duration_s,
+        ending=ending_words(recording, replica, after=f" after {duration_s:.1f} s"),
         positions=positions,
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
@@ -100,10 +100,10 @@ def crossing_of(
     )
 
 
-def ending_words(recording: Recording, replica: int) -> str:
+def ending_words(recording: Recording, replica: int, after: str = "") -> str:
     """How an episode of one terrain ended, and whether the robot had fallen then."""
     fallen = " · fallen" if recording.fallen[0, replica] else ""
-    return ending_of(recording.outcome[0, replica]).words + fallen
+    return ending_of(recording.outcome[0, replica]).words + after + fallen
 
 
 def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:

@@ -346,11 +346,11 @@ class Tab:
             words = self._note if self.ghost.name is None else f"Ghost, {self.ghost.name}: {words or 'is recorded'}"
             if ghost is not None:
                 name = f"{self.ghost.name}{f' in episode {beside + 1}' * (beside != replica)}"
-                words = f"Ghost, {name}: {ghost.ending} after {ghost.duration_s:.1f} s"
+                words = f"Ghost, {name}: {ghost.ending}"
             self.clock.duration_s = max(crossing.duration_s, 0.0 if ghost is None else ghost.duration_s)
             self.clock.seek(self.clock.time_s)
             self.panel.stretch_curves(self.clock.duration_s)
-            status = f"{crossing.ending} after {crossing.duration_s:.1f} s{f' · {words}' * bool(words)}"
+            status = f"{crossing.ending}{f' · {words}' * bool(words)}"
             self.bar.show({"duration": self.clock.duration_s, "status": escape(status)})
             self._show_frame()
 

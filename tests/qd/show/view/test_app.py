@@ -19,7 +19,7 @@ from qd.show.view.show import find_show
 from qd.show.view.tab import Tab
 from sim.recording.file import read_recording
 from tests.builders import free_port
-from tests.qd.show.view.visitor import Visitor, serve
+from tests.qd.show.view.visitor import HEIGHT, WIDTH, Visitor, serve
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ class Shown:
     def come(self, query="") -> Tab:
         """The tab of another visitor, whose address says so."""
         before = set(self.app.tabs)
-        self.visitors.append(Visitor(self.app.page.get_port(), query))
+        self.visitors.append(Visitor(self.app.page.get_port(), [query, WIDTH, HEIGHT]))
         wait_until(lambda: self.app.do_tasks(wait_s=0.1) or set(self.app.tabs) - before)
         return self.app.tabs[(set(self.app.tabs) - before).pop()]
 
@@ -153,6 +153,19 @@ def test_what_a_visitor_does_on_the_bar_is_done(shown):
     for name, value in (("seek", "far"), ("seek", float("inf")), ("resize", 3), ("episode", None), ("nothing", 1)):
         shown.do((tab.act, name, value))  # what makes no sense is left out
     assert tab.clock.time_s == 3.0 and tab.window == (390, 844)
+
+
+def test_a_visitor_who_does_not_say_the_size_of_a_window_has_no_tab_yet(shown):
+    visitor = Visitor(shown.app.page.get_port(), hello=None)
+    shown.visitors.append(visitor)
+    wait_until(lambda: visitor.scripts)
+    for value in (5, ["?elite=0"], ["", "wide", 900], ["", None, 900], ["", float("inf"), 900], {}):
+        visitor.act(hello=value)
+        shown.app.do_tasks(wait_s=0.2)
+    assert len(shown.app.tabs) == 1
+    visitor.act(hello=["?elite=7", 390, 844])
+    wait_until(lambda: shown.app.do_tasks(wait_s=0.1) or len(shown.app.tabs) == 2)
+    assert (list(shown.app.tabs.values())[1].selection.picked, shown.tab.selection.picked) == (7, 0)
 
 
 def test_what_one_tab_does_no_other_tab_sees(shown):

@@ -42,7 +42,7 @@ def recording():
 def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     names = recording.penalty_names[::-1]
     crossing = crossing_of(recording, 0, skeleton, names, [2.0] * len(names))
-    assert (crossing.num_frames, crossing.ending) == (FRAMES, "base collision · fallen")
+    assert (crossing.num_frames, crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
     np.testing.assert_allclose(crossing.times_s, 0.02 * np.arange(FRAMES))
     np.testing.assert_allclose(crossing.positions[3, 0], [2.3, 4.0, 0.0], atol=1e-6)
     # penalty j sums j + 1 a frame; shown in the order asked for, divided by 2
@@ -62,7 +62,7 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
 
 
 def test_an_episode_that_broke_at_once_has_nothing_to_show(skeleton, recording):
-    assert crossing_of(recording, 1, skeleton, (), ()).ending == "out of time"
+    assert crossing_of(recording, 1, skeleton, (), ()).ending == "out of time after 0.1 s"
     assert crossing_of(recording, 2, skeleton, (), ()) is None
 
 

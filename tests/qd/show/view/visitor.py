@@ -43,12 +43,12 @@ def serve(*flags: str) -> Iterator[tuple[str, str]]:
 
 
 class Visitor:
-    """One tab without a browser; what its address says is what it was made with."""
+    """One tab without a browser; at first it says ``hello``: what its address asks for, and its window's size."""
 
-    def __init__(self, port: int, query: str = "") -> None:
+    def __init__(self, port: int, hello: object) -> None:
         protocol = f"viser-v{viser.__version__}"
         self._socket = connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None, compression=None)
-        self._query, self._channel = query, ""
+        self._hello, self._channel = hello, ""
         self.scripts: list[str] = []
         """What the page had it run."""
         self.notes: list[str] = []
@@ -90,7 +90,7 @@ class Visitor:
         if message["type"] == "RunJavascriptMessage":
             self.scripts.append(message["source"])
             if "hello" in message["source"]:
-                self.act(hello=[self._query, WIDTH, HEIGHT])
+                self.act(hello=self._hello)
         elif message["type"] == "NotificationShowMessage":
             self.notes.append(message["props"]["body"])
         elif message["type"] == "GuiTextMessage":
