@@ -297,8 +297,10 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
         controllers = controllers_of(self.policies, robot)
-        names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"} and self.archive is not None
+        names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"}
         if compared:
+            if self.archive is None:
+                raise ValueError("old and new are compared on elites: give --archive RUN, or other names for tables")
             if names or self.independent:
                 raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
             names, controllers = (COMPARED,), {name: controllers[name] for name in ("old", "new")}

@@ -5,7 +5,7 @@ controller crosses it, at the search's settings and with contact resolved. A fau
 certificate is not known to be passable.
 """
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from itertools import compress
 from typing import Any
 
@@ -94,6 +94,17 @@ def count_faults(archive: Archive) -> int | None:
     return numbers["faults_panel"] if numbers["faults"] is None else numbers["faults"]
 
 
+def certifier_of(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
+    """Name of the certifier that crosses an elite most often, of all or of some; None if none has a certificate."""
+    faults = archive.faults
+    if faults is None or not archive.certified[number]:
+        return None
+    rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
+    rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
+    names = [name for name, rate in rate_of.items() if rate > 0.0 and (among is None or name in among)]
+    return max(names, key=rate_of.__getitem__, default=None)
+
+
 def any_of(names: Sequence[str]) -> str:
     """Names in words: ``a, b or c``."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
@@ -102,7 +113,7 @@ def any_of(names: Sequence[str]) -> str:
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
     faults = archive.faults or FaultCounts.none_of(len(archive))
-    kinds = [("With contact resolved", faults.resolved_outcomes[number])]
+    kinds = [("With contact resolved (steps of 1 ms)", faults.resolved_outcomes[number])]
     for column, name in enumerate(faults.certifiers):
         kinds.append((name, faults.certifier_outcomes[number, column]))
         kinds.append((f"{name} with contact resolved", faults.certifier_resolved_outcomes[number, column]))

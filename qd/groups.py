@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from kernels.episode import Outcome
 from qd.archive import Archive
 from qd.causes import HALF_WIDTH, UNCLEAR, causes_at, commonest_words
 from qd.faults import count_faults
@@ -52,6 +53,20 @@ def verdicts_of(archive: Archive) -> NDArray[np.int64]:
 def verdict_of(archive: Archive, number: int) -> str:
     """The verdict on one elite in a word."""
     return VERDICTS[int(verdicts_of(archive)[number])]
+
+
+_WAYS = {
+    Outcome.GOAL: "crosses it",
+    Outcome.BASE_COLLISION: "hits the ground",
+    Outcome.TIME_OUT: "gets stuck",
+    Outcome.OUT: "leaves the terrain",
+    Outcome.INVALID: "breaks the simulation",
+}
+
+
+def way_to_end(outcome: int, fallen: bool) -> str:
+    """How an episode ended, as one says of a robot: ``topples`` of one that fell and did not arrive."""
+    return "topples" if fallen and outcome not in (Outcome.GOAL, Outcome.INVALID) else _WAYS[Outcome(outcome)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,14 +123,13 @@ class Elites:
 
     def ending(self, row: int) -> tuple[str, str]:
         """How most robots that fail an elite end, in words, and the name of the rate that counts them."""
-        if self.collision_rate[row] >= self.other_rate[row]:
-            most_fall = 2 * self.fallen_rate[row] > self.collision_rate[row]
-            return "topples" if most_fall else "hits the ground", "collision_rate"
-        if 2 * self.fallen_rate[row] > 1.0:  # it lies on its legs, and no touch of the base ends the episode
-            return "topples", "fallen_rate"
-        place, limits = self.end_position[row], (CrossingCfg.lower, CrossingCfg.upper)
-        is_out = (place <= limits[0]).any() or (place >= limits[1]).any()
-        return "leaves the terrain" if is_out else "gets stuck", "other_rate"
+        collided, place = self.collision_rate[row], self.end_position[row]
+        is_out = (place <= CrossingCfg.lower).any() or (place >= CrossingCfg.upper).any()
+        outcome, rate = Outcome.OUT if is_out else Outcome.TIME_OUT, "other_rate"
+        if collided >= self.other_rate[row]:
+            outcome, rate = Outcome.BASE_COLLISION, "collision_rate"
+        fallen = 2 * self.fallen_rate[row] > (collided if outcome == Outcome.BASE_COLLISION else 1.0)
+        return way_to_end(outcome, fallen), "fallen_rate" if fallen else rate
 
     def by_severity(self) -> NDArray[np.int64]:
         """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
@@ -277,15 +291,21 @@ def summary_of(ranking: Ranking, archive: Archive) -> str:
     """What a search says of the controller, in one plain sentence."""
     elites, by_cause = ranking.elites, ranking.by_cause()
     failing = int(elites.failing.sum())
-    terrains = f"{len(elites):,} terrain{'s' * (len(elites) != 1)}"
-    if not failing:
-        return f"The robot crosses {'all ' * (len(elites) > 1)}{terrains}"
-    words = [f"{failing:,} of {terrains} {'stops' if failing == 1 else 'stop'} the robot"]
-    commonest = next(iter(by_cause))
+    if len(elites) == 1:
+        words = ["The only terrain stops the robot" if failing else "The robot crosses the only terrain"]
+    elif not failing:
+        words = [f"The robot crosses all {len(elites):,} terrains"]
+    else:
+        words = [f"{failing:,} of {len(elites):,} terrains {'stops' if failing == 1 else 'stop'} the robot"]
+    commonest = next(iter(by_cause), UNCLEAR)
     if commonest != UNCLEAR:
-        words.append(commonest_words(commonest))
-    if archive.faults is not None and archive.faults.certifiers:
-        faults = count_faults(archive)
-        count = int(archive.certified.sum()) if faults is None else faults
-        words.append(f"another controller of this robot crosses {f'{count:,}' if count else 'none of them'}")
+        words.append(commonest_words(commonest) if failing > 1 else f"cause: {commonest}")
+    if failing and archive.faults is not None and archive.faults.certifiers:
+        faults, crosses = count_faults(archive), "another controller of this robot crosses"
+        if faults is None:
+            words.append(f"{crosses} {int(archive.certified.sum()) or 'none'} of them")
+        elif faults == 0:
+            words.append("none is known to be a fault")
+        else:
+            words.append(f"1 is a fault: {crosses} it" if faults == 1 else f"{faults:,} are faults: {crosses} them")
     return "; ".join(words)

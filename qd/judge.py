@@ -269,7 +269,8 @@ def judge(
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if "others" in stages:
         check_certifiers(certifiers, search, compute.device)
-    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crossings:
+    calls = sum(2 * len(certifiers) if stage == "others" else 1 for stage in stages)
+    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crossings:
 
         def cross_fresh(terrains: NDArray, seeds: NDArray) -> RolloutResult:
             return crossings.cross(

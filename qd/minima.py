@@ -46,7 +46,7 @@ class MinimalTerrains:
         rate = value_words(entry["goal_rate"], entry["goal_interval"], ".0%")
         words = f"{len(entry['bumps'])} of {entry['of']} parts; goal reached {rate} when they were found"
         if entry["cause"]:
-            words += f"; the cause is a {entry['cause']['kind']}"
+            words += f"; cause: {entry['cause']['kind']}"
         return words + (f"; margin {100 * entry['margin_m']:.1f} cm" if entry["margin_m"] is not None else "")
 
 

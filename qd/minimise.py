@@ -11,7 +11,7 @@ import numpy as np
 from qd.archive import OUTCOMES, Archive, goal_rates
 from qd.causes import effects_of
 from qd.faults import judgement, rate_of
-from qd.groups import verdict_of
+from qd.groups import elites_of, verdict_of
 from qd.judge import CROSSINGS_FOLDER, certifiers_of, certify, check_certifiers, confirm, find_search
 from qd.minima import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
 from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
@@ -110,7 +110,9 @@ def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[
         return failing
     numbers = chosen_elites(elite, len(archive), run)
     if crossed := [number for number in numbers if number not in failing]:
-        raise ValueError(f"elite must name failing elites of {run}, got {', '.join(map(str, crossed))}")
+        worst = [number for number in elites_of(archive).by_severity().tolist() if number in failing]
+        known = f"{len(failing)} fail, the worst are {', '.join(map(str, worst[:5]))}" if worst else "none fails"
+        raise ValueError(f"elite must name failing elites of {run}, got {', '.join(map(str, crossed))}: {known}")
     return numbers
 
 

@@ -76,7 +76,7 @@ def cross_sets(
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))
-    with Crossings(robot, compute, cache=cache) as crossings:
+    with Crossings(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crossings:
         for controller, policy in controllers.items():
             for name, terrains in sets.items():
                 label = f"{controller} on {name}" + (f" ({how})" if how != "searched" else "")

@@ -57,6 +57,7 @@ def find_run(
         raise FileNotFoundError(
             f"no archive of {robot.name} under {places}: search one with `faultline archive`, or name a run"
         )
+    print(f"Run: {runs[0]}", flush=True)
     return runs[0]
 
 

@@ -165,7 +165,7 @@ class Export(ControllerFlags, EliteFlags):
         if self.from_pack is not None:
             if (self.run, self.space, self.minimal) != (None, None, None):
                 raise ValueError("a pack has its own terrains: leave --run, --space and --minimal out")
-            source = source_of_pack(self.from_pack, self.elite, self.robot)
+            source = source_of_pack(self.from_pack, self.elite or "0", self.robot)
         else:
             opened_run = open_run(self.robot, self.run, space=self.space)
             source = source_of_archive(opened_run, self.elite, self.minimal)
@@ -236,8 +236,6 @@ class View(RobotFlag, EliteFlags):
     open the page at home.
     """
 
-    elite: str = ""
-    """Number of the elite to show first; the first of the list if left out."""
     policies: tuple[str, ...] = ()
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
     C-G=runs/tuned/policy.pt; if none is given, the one the archive was made with, and those of the robot's panel that

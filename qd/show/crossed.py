@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
+from qd.groups import way_to_end
 from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
@@ -23,8 +24,6 @@ class Ending(NamedTuple):
     """A way to end, in words and in looks that the colour-blind tell apart."""
 
     words: str
-    way: str = ""
-    """As one says of a robot: ``gets stuck``."""
     color: str = "#5a5a5a"
     """As ``#rrggbb`` (Okabe and Ito's)."""
     marker: str = ""
@@ -34,10 +33,10 @@ class Ending(NamedTuple):
 
 
 ENDINGS = {
-    Outcome.GOAL: Ending("reached the goal", "crosses it", "#009e73", "o", "-"),
-    Outcome.BASE_COLLISION: Ending("base collision", "hits the ground", "#d55e00", "X", "--"),
-    Outcome.TIME_OUT: Ending("out of time", "gets stuck", "#0072b2", "s", "-."),
-    Outcome.OUT: Ending("left the terrain", "leaves the terrain", "#cc79a7", "^", ":"),
+    Outcome.GOAL: Ending("reached the goal", "#009e73", "o", "-"),
+    Outcome.BASE_COLLISION: Ending("base collision", "#d55e00", "X", "--"),
+    Outcome.TIME_OUT: Ending("out of time", "#0072b2", "s", "-."),
+    Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
 }
 """How a valid episode may end, the good way first."""
 ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
@@ -47,11 +46,6 @@ ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
 def ending_of(outcome: int) -> Ending:
     """How an episode of an outcome ended, a valid one or not."""
     return ENDINGS.get(Outcome(outcome), Ending("invalid: the simulation broke"))
-
-
-def way_to_end(outcome: int, fallen: bool) -> str:
-    """How an episode ended, as one says of a robot: ``topples``."""
-    return "topples" if fallen and outcome == Outcome.BASE_COLLISION else ending_of(outcome).way
 
 
 class Rate(NamedTuple):
@@ -110,6 +104,13 @@ def crossed_of(recording: Recording) -> Crossed:
 _STUCK = 0.3  # a robot that gets stuck is stuck once it is so near to where it ends [m]
 
 
+def leans(recording: Recording, episode: int) -> NDArray[np.bool_]:
+    """At which frames of an episode of one terrain the base leans by more than 60 degrees, shape (frames,)."""
+    quaternion = recording.base_quaternion[0, episode, : recording.num_frames[0, episode]].astype(np.float64)
+    cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
+    return cosine < np.cos(np.deg2rad(FALLEN_TILT_DEG))
+
+
 def moment_of_failure(recording: Recording, episode: int) -> float:
     """When an episode of one terrain went wrong [s]: at its base collision, or at a fall before that.
 
@@ -119,9 +120,7 @@ def moment_of_failure(recording: Recording, episode: int) -> float:
     last = max(int(recording.num_frames[0, episode]) - 1, 0)
     outcome, frame = recording.outcome[0, episode], last
     if outcome in (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT):
-        quaternion = recording.base_quaternion[0, episode, : last + 1].astype(np.float64)
-        cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
-        upright = np.flatnonzero(cosine >= np.cos(np.deg2rad(FALLEN_TILT_DEG)))
+        upright = np.flatnonzero(~leans(recording, episode))
         fall = int(upright[-1]) + 1 if len(upright) else 0
         if fall <= last:
             frame = fall
@@ -157,13 +156,14 @@ _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}  # of robots, as their maker
 
 def title_of(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
-    outcome = recording.outcome[0]
-    valid = outcome != Outcome.INVALID
-    most = typical_outcome(outcome)
-    ended = outcome == most
-    way = way_to_end(most, recording.fallen[0, ended].mean() > 0.5) if valid.any() else "no valid episode"
     who = _NAMES.get(recording.robot, recording.robot) + (f" with {controller}" if controller else "")
-    return f"{who}, {recording.labels[0]}: {way}, {ended.sum()} of {valid.sum()}"
+    outcome, most = recording.outcome[0], typical_outcome(recording.outcome[0])
+    valid, ended, fallen = outcome != Outcome.INVALID, outcome == most, recording.fallen[0]
+    if not valid.any():
+        return f"{who}, {recording.labels[0]}: no valid episode"
+    fall = most != Outcome.GOAL and fallen[ended].mean() > 0.5
+    count = (fallen & valid if fall else ended).sum()
+    return f"{who}, {recording.labels[0]}: {way_to_end(most, fall)}, {count} of {valid.sum()}"
 
 
 def draw_crossing(crossed: Crossed, title: str) -> Figure:

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, goal_rates, read_archive
+from qd.archive import Archive, read_archive
 from qd.causes import UNCLEAR
+from qd.faults import certifier_of
 from qd.fitness import FitnessCfg
 from qd.groups import rank
 from qd.judge import CERTIFIERS_FOLDER, panel_of
@@ -111,12 +112,7 @@ class OpenedRun:
 
     def certifier(self, number: int) -> str | None:
         """Name of the one of :meth:`certifiers` that crosses an elite most often; None if none has a certificate."""
-        faults = self.archive.faults
-        if faults is None or not self.archive.certified[number]:
-            return None
-        rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
-        rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
-        return max((name for name in self.certifiers() if rate_of[name] > 0.0), key=rate_of.__getitem__, default=None)
+        return certifier_of(self.archive, number, self.certifiers())
 
     def minima(self) -> MinimalTerrains:
         """The minimal terrains of its elites."""
@@ -125,10 +121,15 @@ class OpenedRun:
             raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
         return minima
 
-    def terrains(self, elite: str = "0", minimal: str | None = None) -> list[Terrain]:
-        """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``."""
+    def terrains(self, elite: str = "", minimal: str | None = None) -> list[Terrain]:
+        """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
+
+        Without a number it is the worst elite.
+        """
         if minimal is None:
-            numbers = chosen_elites(elite, len(self.archive), self.path)
+            if not elite and len(self.archive):
+                elite = str(rank(self.archive, self.space, read_minimal(self.folder, self.archive)).worst(1)[0])
+            numbers = chosen_elites(elite or "0", len(self.archive), self.path)
             return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}{self._why(n)}") for n in numbers]
         minima = self.minima()
         return [
@@ -145,7 +146,7 @@ class OpenedRun:
         (cause,) = rank(self.archive, self.space, minima, numbers=[number]).causes
         return f" ({cause})" if cause not in ("", UNCLEAR) else ""
 
-    def terrain(self, elite: str = "0", minimal: str | None = None) -> Terrain:
+    def terrain(self, elite: str = "", minimal: str | None = None) -> Terrain:
         """The terrain that a command line names, where only one makes sense."""
         terrains = self.terrains(elite, minimal)
         if len(terrains) != 1:
@@ -158,9 +159,7 @@ def open_run(named: str | None, run: Path | None = None, *, space: str | None = 
 
     Robot and terrain space are as the command line names them; without a robot it is that of the run.
     """
-    if run is None:
-        run = find_run(get_robot(named or "anymal"))
-        print(f"Run: {run}", flush=True)
+    run = find_run(get_robot(named or "anymal"), run)
     archive = read_archive(run)
     robot = robot_of(archive.named(), named, run)
     check_space(archive, space)

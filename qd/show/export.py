@@ -46,7 +46,7 @@ class Source:
     """Where they come from."""
 
 
-def source_of_archive(opened_run: OpenedRun, elite: str = "0", minimal: str | None = None) -> Source:
+def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | None = None) -> Source:
     """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
     archive, space, robot = opened_run.archive, opened_run.space, opened_run.robot
     terrains = opened_run.terrains(elite, minimal)

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from kernels.episode import Outcome
+from qd.groups import way_to_end
 from qd.judge import panel_of
 from qd.run.progress import share_bar
-from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode, way_to_end
+from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode
 from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
 from sim.crossing import CrossingCfg
 from sim.maps.picture import LENGTH, height_colors
 from sim.mujoco_c.model import surface_heights
-from sim.policy.spec import label_suffix, spec_of
+from sim.policy.spec import SHIPPED, label_suffix, spec_of
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Ghost, Renderer, open_context
 from sim.recording.scene import OTHER_CONTROLLER
@@ -275,6 +276,8 @@ def film_source(
     ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file.
     """
     robot, run = source.robot, source.opened_run
+    if not cfg.gif and out is not None and out.suffix == ".gif":
+        raise ValueError(f"{out} is to be a GIF: give --gif too")
     files = source.files(".gif" if cfg.gif else ".mp4", out)
     replicas = source.wanted[0].replicas
     if cfg.episode is not None and cfg.episode >= replicas:
@@ -282,8 +285,13 @@ def film_source(
     open_context(64, 64).free()
     others: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
-        policy = {**panel_of(robot), **(run.certifiers() if run else {})}.get(beside, spec_of(beside, robot))
-        check_policy(policy, robot, device)
+        others_known = panel_of(robot) | (run.certifiers() if run else {})
+        policy = others_known.get(beside, spec_of(beside, robot))
+        try:
+            check_policy(policy, robot, device)
+        except ValueError as error:
+            names = ", ".join([*others_known, SHIPPED])
+            raise ValueError(f"beside must be {names} or a controller as --policy takes it: {error}") from error
     recordings = source.record(device)
     if beside is not None:
         others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]

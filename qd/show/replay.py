@@ -1,6 +1,7 @@
 """Terrains again: elites of a run, or a map of one's own; their numbers and their figures."""
 
 import hashlib
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -80,7 +81,7 @@ class Source:
 
 
 def source_of_run(
-    opened_run: OpenedRun, elite: str = "0", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
+    opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
 ) -> Source:
     """Elites of a run or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
 
@@ -199,27 +200,40 @@ def describe(source: Source, k: int, recording: Recording) -> str:
     columns: list[tuple[str, Archive | Evaluation, int]] = [("now", now, 0)]
     if run is not None:
         n, whole = source.terrains[k].number, "whole, " if source.terrains[k].minimal else ""
-        stored = {"as found": run.archive, "corrected": run.archive.fresh}
+        stored = {"as found": run.archive, "fresh": run.archive.fresh}
         columns[:0] = [(f"{whole}{label}", values, n) for label, values in stored.items() if values is not None]
-    rows = {"": [f"{label} ({values.episodes[row]} episodes)" for label, values, row in columns]}
+    rows = {"": [label for label, _, _ in columns]}
+    rows["episodes"] = [str(values.episodes[row]) for _, values, row in columns]
     for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
         counted = [(getattr(values, rate)[row], _valid_episodes(values, row)) for _, values, row in columns]
-        rows[label] = [rate_words(round(share * count) if count else 0, count) for share, count in counted]
+        words = [rate_words(round(share * count) if count else 0, count, short=True) for share, count in counted]
+        rows[label] = [text.replace("% to ", "-").replace(" to ", "-") for text in words]
     for p, (name, scale) in enumerate(zip(names, scales, strict=True)):
-        rows[f"{label_of(name)} [{look_of(name).unit}]"] = [
-            f"{scale * values.penalty_mean[row, p]:.2f} +- {scale * values.penalty_std[row, p]:.2f} "
-            f"({values.ratios[row, p]:.0%} of all)"
+        rows[label_of(name)] = [
+            f"{_brief(scale * values.penalty_mean[row, p])}±{_brief(scale * values.penalty_std[row, p])}, "
+            f"{values.ratios[row, p]:.0%}"
             for _, values, row in columns
         ]
     if run is not None:
         rows["fitness"] = [f"{values.fitness[row]:.2f}" for _, values, row in columns]
-    lines = [f"  {label:36}" + "".join(f"{value:>30}" for value in row).rstrip() for label, row in rows.items()]
-    lines.append("  Rates have 95 % intervals (Wilson). A robot that stands still has no base collision either.")
+    widest = max(map(len, rows))
+    width = max(len(text) for row in rows.values() for text in row)
+    lines = [f"{label:{widest}}" + "".join(f"  {text:>{width}}" for text in row) for label, row in rows.items()]
+    units = ", ".join(f"{label_of(name)} [{look_of(name).unit}]" for name in names)
+    lines += [
+        "Rates have 95 % intervals (Wilson). A robot that stands still has no base collision either.",
+        f"Below them are raw penalties, mean±standard deviation over episodes, and the share of all. Units: {units}.",
+    ]
     if reasons := invalid_reasons(recording.result()):
-        lines.append(f"  {sum(reasons.values())} invalid episodes are left out: {reason_words(reasons)}.")
+        lines.append(f"{sum(reasons.values())} invalid episodes are left out: {reason_words(reasons)}.")
     if run is not None:
-        lines += [f"  {line}" for line in _about_elite(run, source.terrains[k], source.by, now)]
-    return "\n".join([title_of(recording, source.by), *lines])
+        lines += _about_elite(run, source.terrains[k], source.by, now)
+    how: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "    ", "break_on_hyphens": False}
+    return "\n".join([title_of(recording, source.by), *(textwrap.fill(line, 80, **how) for line in lines)])
+
+
+def _brief(value: float) -> str:
+    return f"{value:.2f}" if abs(value) < 100 else f"{value:.0f}"
 
 
 def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> list[str]:
@@ -235,7 +249,7 @@ def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> 
     return [
         f"Of {run.path}: one of {len(archive):,} elites, found in iteration {archive.iteration[n]}, with ratios in "
         f"{archive.cells.describe(int(archive.cell[n]))}. Its terrain:",
-        *(f"  {line}" for line in run.space.describe(terrain.genes).splitlines()),
+        *(f"- {line}" for line in run.space.describe(terrain.genes).splitlines()),
         *[known, *elite_words(archive, n)],
     ]
 

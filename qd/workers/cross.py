@@ -156,7 +156,7 @@ def _row_keys(terrains: NDArray[Any], seeds: NDArray[Any]) -> list[bytes]:
 class Crossings:
     """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
 
-    Crossings that are done are stored in the folder ``cache``, if there is one.
+    Crossings that are done are stored in the folder ``cache``, if there is one. ``calls``, if known, count in the bars.
     """
 
     def __init__(
@@ -165,10 +165,12 @@ class Crossings:
         compute: Compute,
         *,
         cache: Path | None = None,
+        calls: int | None = None,
     ) -> None:
         self.robot, self.compute = get_robot(robot), compute
         self._cache = None if cache is None else Cache(cache)
         self._stored: dict[str, _Stored] = {}
+        self._call, self._calls = 0, calls
         self._stack = ExitStack()
         self._opened: tuple[EvaluatorCfg, Pipeline] | None = None
 
@@ -221,6 +223,8 @@ class Crossings:
         """
         if seeds.shape != (len(terrains),):
             raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")
+        self._call += 1
+        label = f"{self._call} of {self._calls}: {label}" if self._calls else label
         cfg = EvaluatorCfg(
             robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)), num_replicas=replicas, space=space,
             reward=reward, penalties_from_s=penalties_from_s, resolved=how == "resolved", **vars(self.compute),

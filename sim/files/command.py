@@ -82,9 +82,9 @@ class EliteFlags(SpaceFlag):
 
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
-    elite: str = "0"
-    """Numbers of the elites, from 0, by falling fitness: one, several as in --elite "0 3", or all. replay and view take
-    one."""
+    elite: str = ""
+    """Numbers of the elites, from 0, by falling fitness: one, several as in --elite "0 3", or all; view takes one. If
+    left out, the worst, which stands first in the viewer."""
     minimal: str | None = None
     """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
     --elite has them; all are those that have one."""

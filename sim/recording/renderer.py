@@ -58,6 +58,8 @@ def open_context(width: int, height: int) -> Any:
     """A current OpenGL context without a screen: EGL on Linux, or what MUJOCO_GL names; free it with ``free()``."""
     usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
     name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
+    if name not in ("egl", "osmesa", "glfw", "cgl"):
+        raise ValueError(f"MUJOCO_GL must be egl, osmesa or glfw for pictures, got '{name}': leave it unset")
     try:
         context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
         context.make_current()

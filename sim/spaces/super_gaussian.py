@@ -66,7 +66,7 @@ def _in_words(bump: NDArray[np.float64]) -> str:
     kind = "bump" if height >= 0.0 else "hollow"
     return (
         f"{kind} of {abs(height):.2f} m at ({x:.1f}, {y:.1f}) m, half widths {sigma_x:.1f} m and {sigma_y:.1f} m, "
-        f"turned by {np.rad2deg(theta):.0f} degrees"
+        f"turned by {90 - (90 - round(np.rad2deg(theta))) % 180} degrees"  # half a turn changes nothing
     )
 
 

@@ -126,10 +126,19 @@ def test_causes_are_by_number_and_the_unclear_last():
     ranking, archive = ranked()
     by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
     assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
-    words = "5 of 6 terrains stop the robot; ridges are the commonest cause; another controller of this robot crosses 1"
-    assert summary_of(ranking, archive) == words
+    words, crosses = (
+        "5 of 6 terrains stop the robot; ridges are the commonest cause",
+        "another controller of this robot",
+    )
+    assert summary_of(ranking, archive) == f"{words}; 1 is a fault: {crosses} crosses it"
+    assert archive.faults is not None
+    unresolved = dataclasses.replace(archive.faults, resolved_outcomes=np.zeros((6, 4), np.int64))
+    judged = dataclasses.replace(archive, faults=unresolved)
+    assert summary_of(ranking, judged) == f"{words}; {crosses} crosses 1 of them"
     alone = dataclasses.replace(archive, faults=None, fresh=None)
     assert summary_of(rank(alone, SUPER_GAUSSIAN), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
+    one = alone.rows(np.array([0]))
+    assert summary_of(rank(one, SUPER_GAUSSIAN), one) == "The only terrain stops the robot"
     crossed = dataclasses.replace(alone, goal_rate=np.ones(6))
     assert summary_of(rank(crossed, SUPER_GAUSSIAN), crossed) == "The robot crosses all 6 terrains"
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,13 @@ def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, *
 
 def numbers_in(path):
     return json.loads((path / "archive.json").read_text())
+
+
+def test_bars_say_how_many_are_to_come(path, monkeypatch):
+    bars = []
+    monkeypatch.setattr("qd.workers.cross.share_bar", lambda text: nullcontext(bars.append(text)))
+    judged(path)
+    assert bars == ["1 of 3: contact resolved", "2 of 3: C-G", "3 of 3: C-G, contact resolved"]
 
 
 def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive
+from qd.groups import elites_of
 from qd.minimise import minimise, read_minimal
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
@@ -97,8 +98,9 @@ def test_what_cannot_be_minimised_is_refused_before_anything_is_crossed(path, ma
     nobody, fine = Robots(bump_stops, stop_after=0), np.flatnonzero(~read_archive(path).failing)[:1].tolist()
     with pytest.raises(ValueError, match="fresh"):
         minimised(made / "found", elites, nobody)
-    for numbers in (fine, [999]):
-        with pytest.raises(ValueError, match=f"elite .*{numbers[0]}"):
+    worst = elites_of(read_archive(path)).by_severity()[0]
+    for numbers, named in ((fine, f"worst are {worst},"), ([999], "")):
+        with pytest.raises(ValueError, match=f"elite .*{numbers[0]}.*{named}"):
             minimised(path, numbers, nobody)
     with pytest.raises(ValueError, match="certifier same"):
         minimised(path, elites, nobody, judged=True, certifiers={"same": str(get_robot("anymal").policy_file)})

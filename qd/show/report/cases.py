@@ -110,7 +110,7 @@ def _rates(ranking: Ranking, archive: Archive, row: int, crossed: Crossed) -> Ta
         tries: Rate(elites.hits("goal_rate", row), int(elites.counted[row])),
     }
     faults = archive.faults or FaultCounts.none_of(len(archive))
-    counts = {"finer contact": faults.resolved_outcomes[number]}
+    counts = {"finer contact, steps of 1 ms": faults.resolved_outcomes[number]}
     for column, name in enumerate(faults.certifiers):
         counts[name] = faults.certifier_outcomes[number, column]
         counts[f"{name}, finer contact"] = faults.certifier_resolved_outcomes[number, column]

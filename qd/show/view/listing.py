@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import OUTCOMES, Archive
-from qd.faults import elite_words
+from qd.faults import certifier_of, elite_words
 from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank, summary_of
 from qd.minimise import MinimalTerrains
 from qd.show.crossed import ARRIVED, FAILED, Crossed
@@ -89,15 +89,15 @@ class Listing:
         )
 
     def columns(self, number: int) -> Sequence[Column]:
-        """What is known of the whole terrain: fresh episodes, contact resolved, and the best certifier."""
+        """What is known of the whole terrain: fresh episodes, finer contact, and the best certifier."""
         elites, faults = self.elites, self.archive.faults
         count = int(elites.counted[number])
         head = "fresh" if elites.fresh[number] else "as found"
         columns = [(head, count, {name: elites.hits(name, number) for name in RATES})]
         if faults is not None:
-            counts = {"resolved": faults.resolved_outcomes[number]}
-            crossed = zip(faults.certifiers, faults.certifier_outcomes[number], strict=True)
-            counts |= dict(sorted(crossed, key=lambda pair: -int(pair[1][0]))[:1])
+            counts = {"finer contact": faults.resolved_outcomes[number]}
+            if name := certifier_of(self.archive, number):
+                counts[name] = faults.certifier_outcomes[number, faults.certifiers.index(name)]
             columns += [(head, *_counts_of(outcomes)) for head, outcomes in counts.items() if outcomes.any()]
         return columns
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 
 from kernels.episode import Outcome
-from qd.show.crossed import ending_of, moment_of_failure
-from sim.crossing import FALLEN_TILT_DEG
+from qd.show.crossed import ending_of, leans, moment_of_failure
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
@@ -113,11 +112,10 @@ def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
     at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
     """
     frames = int(recording.num_frames[0, replica])
-    up = rotated(recording.base_quaternion[0, replica, :frames], np.array([0.0, 0.0, 1.0]))[:, 2]
     events = {
         "first stumble": _grows(recording, replica, "stumble"),
         "first collision": _collides(recording, replica),
-        "fall": up < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
+        "fall": leans(recording, replica),
     }
     marks = [Mark(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
     if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():

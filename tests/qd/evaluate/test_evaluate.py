@@ -112,6 +112,7 @@ def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
         (["--pack", "anymal", "--policies", "a=shipped"], "--pack"),
         (["--fail-under", "0.9"], "--fail-under"),
         (["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--sets", "hard_random"], "--sets"),
+        (["--policies", "old=shipped", "new=C-G.pt"], "--archive"),  # else it would exit with 0 whatever was broken
     ],
 )
 def test_errors_come_before_any_work_in_one_line(archive, flags, field, monkeypatch, capsys):

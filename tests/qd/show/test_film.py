@@ -78,7 +78,8 @@ def test_the_title_names_the_commonest_ending(recording):
 
     hit, never = Outcome.BASE_COLLISION, [False] * 5
     assert title([LATE, Outcome.GOAL, LATE, LATE, hit], never) == "ANYmal C, elite 313: gets stuck, 3 of 5"
-    assert title([hit, hit, hit, LATE, Outcome.INVALID], [True, True, False, False, True]).endswith("topples, 3 of 4")
+    assert title([hit, hit, hit, LATE, Outcome.INVALID], [True, True, False, False, True]).endswith("topples, 2 of 4")
+    assert title([LATE, LATE, LATE, hit, hit], [True, True, False, True, False]).endswith("topples, 3 of 5")
     assert title([hit, hit, hit, LATE, LATE], [True, False, False, True, True]).endswith("hits the ground, 3 of 5")
     assert title_of(replace(recording, robot="dog", labels=("a hill",)), "C-G").startswith("dog with C-G, a hill: ")
 
@@ -208,8 +209,8 @@ def test_films_of_elites_and_of_a_map(run, capsys):
         ("--elite 3", "elite 3"),
         ("--episode 20", "episode"),
         ("--run runs/anymal-small-0 --terrain a.npz", "--terrain"),
-        ("--beside nobody.pt", "nobody.pt"),
-        ("--out film.gif", "out"),
+        ("--beside nobody.pt", "C-G, S, shipped"),
+        ("--out film.gif", "--gif"),
     ],
 )
 def test_mistakes_are_refused_before_anything_is_crossed(run, capsys, flags, named):

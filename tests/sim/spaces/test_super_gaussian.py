@@ -62,6 +62,8 @@ def test_a_bump_in_words():
     genes = np.array([0.5, 0.0, -1.0, 1.0, 0.0, 0.0, 0.5, -1.0])
     words = SuperGaussian(num_bumps=1).describe(genes)
     assert words == "hollow of 0.25 m at (9.0, 4.0) m, half widths 0.5 m and 3.0 m, turned by 90 degrees"
+    genes[6] = -1.0  # half a turn changes nothing
+    assert SuperGaussian(num_bumps=1).describe(genes).endswith("turned by 0 degrees")
     assert len(SUPER_GAUSSIAN.parts(np.tile(genes, 8))) == 8
 
 

@@ -44,9 +44,10 @@ def test_faults_come_before_certified_confirmed_and_other_failing_elites():
 def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
     listing = listing_of(judged_archive(), SUPER_GAUSSIAN)
     fresh, resolved, certifier = listing.columns(0)
+    assert all(len(listing.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
     assert fresh[:2] == ("fresh", 40) and fresh[2]["goal_rate"] == 0
     # 9 at the goal, 6 base collisions and 5 others with contact resolved; S crosses it 10 times, C-G 9
-    assert resolved == ("resolved", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
+    assert resolved == ("finer contact", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
     assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
     recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
     recorded = column_of("here", crossed_of(recording))
