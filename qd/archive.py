@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from qd.descriptors import Cells
 from qd.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
-from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.rates import MAX_INVALID_SHARE
 
 ARCHIVE_FILE = "archive.npz"
@@ -292,12 +292,10 @@ def _as_field(name: str, array: NDArray[Any]) -> Any:
 
 def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
     """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
-    sizes = {"2": 2, "4": len(OUTCOMES), "P": arrays["penalties"].size, "N": arrays["fitness"].size}
-    sizes |= {"G": arrays["genes"].shape[-1], "C": arrays["certifiers"].size if "certifiers" in arrays else 0}
+    sizes = {"2": 2, "4": len(OUTCOMES)}
+    dimensions = {name: _SHAPES.get(name.removeprefix(_PREFIX), "N") for name in arrays}
+    check_shapes(arrays, {name: [sizes.get(size, size) for size in shape] for name, shape in dimensions.items()})
     for name, array in arrays.items():
-        expected = tuple(sizes[letter] for letter in _SHAPES.get(name.removeprefix(_PREFIX), "N"))
-        if array.shape != expected:
-            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
         is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties", "cause")
         if array.dtype.kind not in ("U" if is_text else "bif"):
             raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")

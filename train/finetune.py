@@ -14,8 +14,7 @@ from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, s
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
-from sim.policy.loaders import load_policy
-from sim.policy.mlp import MlpPolicy
+from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash
 from sim.robots.robot import RobotCfg
@@ -77,9 +76,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
         policy = training.run(run.export)
-    actor = load_policy(policy, robot, "cpu")
-    assert isinstance(actor, MlpPolicy)
-    export_onnx(actor, policy.with_suffix(".onnx"))
+    export_onnx(load_checkpoint(policy, robot), policy.with_suffix(".onnx"))
     return policy
 
 

@@ -17,8 +17,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Invalidity, Outcome
-from kernels.penalties import PENALTIES
 from qd.run.progress import share_bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, parse_workers
 from qd.workers.invalid import report_invalid
@@ -27,7 +25,7 @@ from sim.files.atomic import write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
-from sim.mujoco_c.crossing import PlainCrossings, cross_terrains
+from sim.mujoco_c.crossing import cross_terrains
 from sim.policy.spec import controller_hash, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -304,7 +302,7 @@ class Crossings:
     def _cross_in_mujoco_c(
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, PlainCrossings]]()
+        processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, RolloutResult]]()
         with share_bar(label) as progress:
             crossings = cross_terrains(
                 self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
@@ -315,7 +313,7 @@ class Crossings:
                 done.append(crossed)
                 if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
                     numbers, episodes = zip(*done, strict=True)
-                    yield missing[list(numbers)], _as_result(episodes, self.robot.penalties)
+                    yield missing[list(numbers)], join_results(episodes, join=1)
                     done.clear()
 
 
@@ -369,17 +367,4 @@ def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutRe
         outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
         duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
         reward=np.zeros(shape) if cfg.reward else None,
-    )  # fmt: skip
-
-
-def _as_result(terrains: Sequence[PlainCrossings], penalty_names: tuple[str, ...]) -> RolloutResult:
-    """Episodes in MuJoCo C, a record a terrain, as a rollout's result."""
-    outcome = np.array([terrain.outcome for terrain in terrains])
-    columns = [PENALTIES.index(name) for name in penalty_names]
-    return RolloutResult(
-        penalties=np.array([terrain.penalties for terrain in terrains])[..., columns], penalty_names=penalty_names,
-        outcome=outcome, invalidity=np.where(outcome == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),
-        fallen=np.zeros(outcome.shape, bool),
-        duration_s=np.array([terrain.duration_s for terrain in terrains]).astype(np.float32),
-        final_position=np.full((*outcome.shape, 3), np.nan, np.float32),
     )  # fmt: skip

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,7 +19,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome, make_episodes
+from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import BASE, PENALTIES
 from kernels.queue import make_queue, make_ready, turn_over
@@ -42,6 +42,7 @@ from sim.mujoco_c.model import (
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
 from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
 from sim.spaces.base import TerrainSpace
 
 _mj: Any = mujoco  # its types are not written down
@@ -49,18 +50,6 @@ _WARNINGS = [
     getattr(_mj.mjtWarning, f"mjWARN_{name}")
     for name in ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlainCrossings:
-    """Results of crossings of one terrain, one row an episode."""
-
-    outcome: NDArray[np.uint8]
-    """:class:`kernels.episode.Outcome`, shape (num_episodes,)."""
-    penalties: Array
-    """Raw penalty sums times the physics step, NaN where invalid; shape (num_episodes, num_penalties)."""
-    duration_s: Array
-    """Simulated time up to the end [s], shape (num_episodes,)."""
 
 
 @lru_cache(maxsize=8)
@@ -153,8 +142,10 @@ def cross(
     *,
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
-) -> PlainCrossings:
+) -> RolloutResult:
     """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
+
+    It tells neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
 
     Args:
         robot: Robot settings.
@@ -204,7 +195,15 @@ def cross(
         penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
         sums[running] += robot.physics_dt * penalties
     sums[outcome == Outcome.INVALID] = np.nan
-    return PlainCrossings(outcome=outcome.astype(np.uint8), penalties=sums, duration_s=steps * robot.physics_dt)
+    return RolloutResult(
+        penalties=sums[None][..., [PENALTIES.index(name) for name in robot.penalties]],
+        penalty_names=robot.penalties,
+        outcome=outcome[None].astype(np.uint8),
+        invalidity=np.where(outcome[None] == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),
+        fallen=np.zeros((1, count), bool),
+        duration_s=(steps[None] * robot.physics_dt).astype(np.float32),
+        final_position=np.full((1, count, 3), np.nan, np.float32),
+    )
 
 
 _CHUNK = 25  # episodes at a time: enough for the policy's batch, few enough to share out
@@ -227,7 +226,7 @@ def _start_worker(robot: RobotCfg, policy: str, parent: int) -> None:
 
 def _cross_chunk(
     heights: NDArray[np.float32], ground: GroundMaps | None, starts: Starts, time_constant_s: float | None
-) -> PlainCrossings:
+) -> RolloutResult:
     robot, policy = _worker["robot"], _worker["policy"]
     return cross(robot, policy, heights, starts, time_constant_s=time_constant_s, ground=ground)
 
@@ -243,7 +242,7 @@ def cross_terrains(
     processes: int,
     resolved: bool,
     device: str = "cpu",
-) -> Iterator[tuple[int, PlainCrossings]]:
+) -> Iterator[tuple[int, RolloutResult]]:
     """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
 
     Args:
@@ -265,7 +264,7 @@ def cross_terrains(
     robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
     heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
     with _process_pool(robot, policy, processes) as pool:
-        chunks: list[list[Future[PlainCrossings]]] = []
+        chunks: list[list[Future[RolloutResult]]] = []
         for number, (grid, seed) in enumerate(zip(heights, seeds, strict=True)):
             starts = draw_starts(robot, grid, int(seed), num_episodes, device)
             patches = None if ground is None else ground[number : number + 1]
@@ -297,6 +296,7 @@ def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[Proc
         pool.shutdown(cancel_futures=True)
 
 
-def _join(parts: Sequence[PlainCrossings]) -> PlainCrossings:
-    names = vars(parts[0])
-    return PlainCrossings(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def _join(parts: Sequence[RolloutResult]) -> RolloutResult:
+    names = [name for name, value in vars(parts[0]).items() if isinstance(value, np.ndarray)]
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names}
+    return replace(parts[0], **joined)

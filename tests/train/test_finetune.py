@@ -235,6 +235,10 @@ def test_which_elites_are_trained_on(places, searched):
         assert marks[True] == train & marks[False]
     elites = elites_of(ROBOT, cfg_of(places, archive=archive, only="failing"))
     assert elites.goal_rate is not None and set(elites.goal_rate) == {0.1}
+    made = make_archive(10)
+    write_archive(places / "crossed.npz", replace(made, fresh=replace(fresh_values(made), goal_rate=np.ones(10))))
+    with pytest.raises(ValueError, match="elites to train on"):
+        elites_of(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
 
 
 def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, searched):

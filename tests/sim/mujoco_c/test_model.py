@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from kernels.episode import Outcome
-from kernels.penalties import PENALTIES
+from kernels.episode import Invalidity, Outcome
 from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import (
@@ -141,8 +140,10 @@ def test_what_ends_a_crossing(robot):
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
     policy = load_policy(robot.policy_file, robot, "cpu")
     result = cross(robot, policy, FLAT, starts, CrossingCfg(max_duration_s=0.1))
-    assert result.outcome.tolist() == [Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]
-    assert np.isnan(result.penalties[3]).all() and np.isfinite(result.penalties[:3]).all()
+    assert result.outcome.tolist() == [[Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]]
+    assert result.invalidity.tolist() == [[0, 0, 0, Invalidity.STATE]]
+    assert result.penalty_names == robot.penalties
+    assert np.isnan(result.penalties[0, 3]).all() and np.isfinite(result.penalties[0, :3]).all()
     np.testing.assert_allclose(result.duration_s, 0.005)
 
 
@@ -159,9 +160,9 @@ def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
         heights = FLAT + np.float32(0.2 * number)
         starts = draw_starts(cassie, heights, 3 + number, 26, "cpu")
         expected = cross(cassie, stand, heights, starts[25:])
-        assert result.outcome.shape == (26,) and result.penalties.shape == (26, len(PENALTIES))
-        np.testing.assert_array_equal(result.duration_s[25:], expected.duration_s)
-        np.testing.assert_array_equal(result.penalties[25:], expected.penalties)
+        assert result.outcome.shape == (1, 26) and result.penalties.shape == (1, 26, len(cassie.penalties))
+        np.testing.assert_array_equal(result.duration_s[:, 25:], expected.duration_s)
+        np.testing.assert_array_equal(result.penalties[:, 25:], expected.penalties)
 
 
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
