@@ -185,7 +185,7 @@ class CrossingPanel:
         if crossing is None:
             return
         chosen = np.unique(np.linspace(0, crossing.num_frames - 1, _CURVE_POINTS).astype(int))
-        data = (crossing.times_s[chosen], *crossing.penalties[chosen].T)
+        data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
         if self._curves is None:
             series = [uplot.Series(label=label_of(n), stroke=look_of(n).color, width=2.0) for n in self._penalties]
             with self._curves_place:

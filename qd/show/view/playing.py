@@ -58,11 +58,6 @@ class Crossing:
         """F."""
         return len(self.positions)
 
-    @property
-    def times_s(self) -> NDArray[np.float64]:
-        """Time of each frame [s], shape (F,)."""
-        return self.dt * np.arange(self.num_frames, dtype=np.float64)
-
 
 def crossing_of(
     recording: Recording, replica: int, skeleton: Skeleton, penalties: Sequence[str], scales: Sequence[float]

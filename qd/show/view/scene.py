@@ -8,15 +8,7 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import (
-    Color,
-    Part,
-    arrow_mesh,
-    arrow_pose,
-    in_bytes,
-    in_linear_light,
-    terrain_mesh,
-)
+from qd.show.view.meshes import Color, Part, arrow_mesh, arrow_pose, in_bytes, in_linear_light, terrain_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
@@ -131,36 +123,25 @@ class Scene:
         self._followed = None
         for handle in (*self.forces, self._command):
             handle.visible = False
-        self._drop_paths()
-
-    def _drop_paths(self) -> None:
-        for handle in self.paths:
-            handle.remove()
-        self.paths = []
+        self.set_paths(())
 
     def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], Color]]) -> None:
         """Show the way of the base in every episode as points [m] and colour, thin."""
-        self._drop_paths()
+        for handle in self.paths:
+            handle.remove()
+        self.paths = []
         ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
         colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
         if paths:
-            look: Any = {
-                "colors": in_linear_light(np.concatenate(colors)),
-                "thickness": _PATH_WIDTH,
-                "thickness_units": "screen",
-            }
-            add = self._client.scene.add_line_segments
-            self.paths = [add("/paths", np.concatenate(ends), visible=False, **look)]
-        self._show_paths()
-
-    def _show_paths(self) -> None:
-        for handle in self.paths:
-            handle.visible = not self.follow  # near the robot, paths would hide it
+            look: Any = {"thickness": _PATH_WIDTH, "thickness_units": "screen", "visible": not self.follow}
+            points, light = np.concatenate(ends), in_linear_light(np.concatenate(colors))
+            self.paths = [self._client.scene.add_line_segments("/paths", points, colors=light, **look)]
 
     def set_follow(self, follow: bool) -> None:
         """Go near the robot and along with it from now on, or stay."""
         self.follow = follow
-        self._show_paths()
+        for handle in self.paths:
+            handle.visible = not follow  # near the robot, paths would hide it
         if follow and self._followed is not None:
             self._go_near(self._followed)
 

@@ -17,12 +17,6 @@ def test_what_an_address_says_comes_back(address):
     assert read_address("?" + address.query()) == (address, [])
 
 
-def test_an_address_can_be_written_by_hand():
-    address, refused = read_address("?elite=12&controller=C-G&t=8.4")
-    assert (address, refused) == (Address(elite=12, controller="C-G", time_s=8.4), [])
-    assert address.query() == "elite=12&controller=C-G&t=8.4"
-
-
 def test_what_means_nothing_is_said_and_left_out():
     address, refused = read_address(
         "elite=twelve&episode=1.5&t=nan&initialCameraPosition=1,2&initialCameraLookAt=1,2,3"

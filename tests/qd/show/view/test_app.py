@@ -172,11 +172,7 @@ def test_what_one_tab_does_no_other_tab_sees(shown):
     first, second = shown.tab, shown.come("?elite=171&t=3")
     assert first.selection.picked == 0 and second.selection.picked == 171
     before = second.list.list.content
-    shown.do(
-        (first.choose_replica, 16),
-        (first.seek, 2.0),
-        (first.set_follow, True),
-    )
+    shown.do((first.choose_replica, 16), (first.seek, 2.0), (first.set_follow, True))
     first.selection.choose(order="goal_rate")
     first.list.show()
     assert first.playing and not second.playing and not second.scene.follow
@@ -190,14 +186,10 @@ def test_what_one_tab_does_no_other_tab_sees(shown):
 
 
 def test_a_link_opens_what_it_was_copied_from(shown):
-    shown.do(
-        (shown.tab.choose_replica, 16),
-        (shown.tab.choose_controller, "other"),
-        (shown.tab.seek, 1.25),
-        (shown.tab.set_follow, True),
-    )
-    shown.tab.show_address()
-    query = shown.tab.query
+    tab = shown.tab
+    shown.do((tab.choose_replica, 16), (tab.choose_controller, "other"), (tab.seek, 1.25), (tab.set_follow, True))
+    tab.show_address()
+    query = tab.query
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
     second = shown.come(f"?{query}")
     assert (second.controller, second.replica, second.clock.time_s) == ("other", 16, 1.25)
@@ -239,11 +231,7 @@ def test_playing_and_dragging_move_the_robot(shown):
     shown.do((tab.seek, 5.0), (tab.play, True))
     assert tab.scene.bodies[0].position[0] > before[0] + 1.0
     assert tab.bar.shown["time"] >= 5.0 and tab.bar.shown["playing"]
-    shown.do(
-        (tab.play, False),
-        (tab.set_speed, 0.25),
-        (tab.set_follow, True),
-    )
+    shown.do((tab.play, False), (tab.set_speed, 0.25), (tab.set_follow, True))
     assert not tab.clock.playing and tab.clock.speed == 0.25
     assert not any(path.visible for path in tab.scene.paths)  # they would hide the robot
     arrows = tab.robot.crossing.forces  # 1 mm is 1 N

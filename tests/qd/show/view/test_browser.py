@@ -4,15 +4,7 @@ import re
 
 import pytest
 
-from tests.qd.show.view.browser import (
-    BROWSER,
-    LIMIT_MS,
-    open_chromium,
-    said,
-    until_it_plays,
-    wait_for,
-    wait_until,
-)
+from tests.qd.show.view.browser import BROWSER, LIMIT_MS, open_chromium, said, until_it_plays, wait_for, wait_until
 from tests.qd.show.view.visitor import serve
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from qd.archive import write_archive
-from qd.run.directory import RESULTS
 from qd.show.view.app import check_port
 from qd.show.view.show import find_show
 from sim.files.records import robot_digest
@@ -23,12 +22,9 @@ def copied(tmp_path, run):
     return Path(shutil.copytree(run, tmp_path / "run"))
 
 
-def test_the_published_archive_is_shown_where_there_is_no_run(tmp_path, monkeypatch, anymal, published):
-    (tmp_path / "results").symlink_to(published)
-    monkeypatch.chdir(tmp_path)
-    show = find_show()
-    assert show.opened_run.path == RESULTS / "anymal" / "archive"
-    assert show.controllers["searched controller"] == str(anymal.policy_file)
+def test_the_controller_of_the_search_comes_first_and_certifiers_follow(anymal, run):
+    controllers = find_show(run).controllers
+    assert next(iter(controllers.items())) == ("searched controller", str(anymal.policy_file)) and "C-G" in controllers
 
 
 def test_terrains_are_shown_when_the_controller_of_the_search_is_code(copied):
