@@ -303,7 +303,7 @@ def summary_of(ranking: Ranking, archive: Archive) -> str:
     if failing and archive.faults is not None and archive.faults.certifiers:
         faults, crosses = count_faults(archive), "another controller of this robot crosses"
         if faults is None:
-            words.append(f"{crosses} {int(archive.certified.sum()) or 'none'} of them")
+            words.append(f"{crosses} {archive.certified.sum() or 'none'} of them")
         elif faults == 0:
             words.append("none is known to be a fault")
         else:

@@ -146,13 +146,6 @@ class OpenedRun:
         (cause,) = rank(self.archive, self.space, minima, numbers=[number]).causes
         return f" ({cause})" if cause not in ("", UNCLEAR) else ""
 
-    def terrain(self, elite: str = "", minimal: str | None = None) -> Terrain:
-        """The terrain that a command line names, where only one makes sense."""
-        terrains = self.terrains(elite, minimal)
-        if len(terrains) != 1:
-            raise ValueError(f"one elite must be named here, got '{elite if minimal is None else minimal}'")
-        return terrains[0]
-
 
 def open_run(named: str | None, run: Path | None = None, *, space: str | None = None) -> OpenedRun:
     """The archive of a run directory or file; without one the robot's newest under runs/, else its published one.

@@ -210,7 +210,7 @@ def describe(source: Source, k: int, recording: Recording) -> str:
         rows[label] = [text.replace("% to ", "-").replace(" to ", "-") for text in words]
     for p, (name, scale) in enumerate(zip(names, scales, strict=True)):
         rows[label_of(name)] = [
-            f"{_brief(scale * values.penalty_mean[row, p])}±{_brief(scale * values.penalty_std[row, p])}, "
+            f"{_spread(scale * values.penalty_mean[row, p], scale * values.penalty_std[row, p])}, "
             f"{values.ratios[row, p]:.0%}"
             for _, values, row in columns
         ]
@@ -232,8 +232,9 @@ def describe(source: Source, k: int, recording: Recording) -> str:
     return "\n".join([title_of(recording, source.by), *(textwrap.fill(line, 80, **how) for line in lines)])
 
 
-def _brief(value: float) -> str:
-    return f"{value:.2f}" if abs(value) < 100 else f"{value:.0f}"
+def _spread(mean: float, std: float) -> str:
+    digits = 2 if max(mean, std) < 100 else 0
+    return f"{mean:.{digits}f}±{std:.{digits}f}"
 
 
 def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> list[str]:

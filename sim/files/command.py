@@ -83,8 +83,8 @@ class EliteFlags(SpaceFlag):
     run: Path | None = None
     """Run directory; the newest of this robot under runs/, else its published archive."""
     elite: str = ""
-    """Numbers of the elites, from 0, by falling fitness: one, several as in --elite "0 3", or all; view takes one. If
-    left out, the worst, which stands first in the viewer."""
+    """Numbers of the elites, from 0, by falling fitness: one, several as in --elite "0 3", or all; view takes the
+    first. If left out, the worst, with which the viewer begins."""
     minimal: str | None = None
     """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
     --elite has them; all are those that have one."""

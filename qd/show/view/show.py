@@ -96,7 +96,7 @@ def find_show(
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
-    number = opened_run.terrain(elite).number if elite else None
+    number = opened_run.terrains(elite)[0].number if elite else None
     minima = read_minimal(opened_run.folder, opened_run.archive) if minimal is None else opened_run.minima()
     if minima is not None and minimal is not None:
         number = minima.chosen(minimal, opened_run.path)[0]

@@ -193,8 +193,6 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     for elite in ("3", "-1", "x"):
         with pytest.raises(ValueError, match="elite"):
             opened_run.terrains(elite)
-    with pytest.raises(ValueError, match="elite"):
-        opened_run.terrain("all")
     with pytest.raises(FileNotFoundError, match="minimal"):
         opened_run.terrains("0", "all")
     with pytest.raises(ValueError, match="cassie"):
