@@ -40,7 +40,7 @@ def main() -> None:
                 page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=ratio)
                 page.goto(address, timeout=LIMIT_MS)
                 until_it_plays(page)
-                wait_for(page, "document.querySelector('#faultline .words').textContent.includes('Ghost')")
+                wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
                 page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
                 page.keyboard.press("Space")
                 take(page, file)
