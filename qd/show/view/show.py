@@ -96,7 +96,10 @@ def find_show(
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
-    number = opened_run.terrains(elite)[0].number if elite else None
+    numbers = [terrain.number for terrain in opened_run.terrains(elite)] if elite else [None]
+    if len(numbers) > 1:
+        raise ValueError(f"elite must name one that the viewer opens, got '{elite}'")
+    (number,) = numbers
     minima = read_minimal(opened_run.folder, opened_run.archive) if minimal is None else opened_run.minima()
     if minima is not None and minimal is not None:
         number = minima.chosen(minimal, opened_run.path)[0]
