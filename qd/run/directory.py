@@ -159,7 +159,8 @@ class RunDirectory:
         try:
             return from_settings(config["settings"], config["iterations"])
         except ValueError as error:
-            raise ValueError(f"{self.path / CONFIG_FILE}: {error}; {_REMEDY}") from None
+            of = f"{self.path / CONFIG_FILE}: {error}"
+            raise ValueError(f"{of}: another version wrote it, or it is damaged; {_REMEDY}") from None
 
     def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
         """Writes what the run is asked to do from now on, after ``done`` iterations.

@@ -277,7 +277,7 @@ def film_source(
     """
     robot, run = source.robot, source.opened_run
     if not cfg.gif and out is not None and out.suffix == ".gif":
-        raise ValueError(f"{out} is to be a GIF: give --gif too")
+        raise ValueError(f"{out} is a GIF by its name: give --gif too")
     files = source.files(".gif" if cfg.gif else ".mp4", out)
     replicas = source.wanted[0].replicas
     if cfg.episode is not None and cfg.episode >= replicas:

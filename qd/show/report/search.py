@@ -192,4 +192,5 @@ def _shape_words(cause: Mapping[str, Any] | None) -> str:
     if not height:
         return cause["kind"]
     steep = f", {cause['slope_deg']:.0f} degrees steep" if "slope_deg" in cause else ""
-    return f"{cause['kind']}, {abs(height):.2f} m {'high' if height > 0 else 'deep'}{steep}"
+    deep = any(word in cause["kind"] for word in ("drop", "hollow", "ditch", "trench"))
+    return f"{cause['kind']}, {abs(height):.2f} m {'deep' if deep else 'high'}{steep}"

@@ -98,7 +98,7 @@ def find_show(
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
     numbers = [terrain.number for terrain in opened_run.terrains(elite)] if elite else [None]
     if len(numbers) > 1:
-        raise ValueError(f"elite must name one that the viewer opens, got '{elite}'")
+        raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite}'")
     (number,) = numbers
     minima = read_minimal(opened_run.folder, opened_run.archive) if minimal is None else opened_run.minima()
     if minima is not None and minimal is not None:
