@@ -15,7 +15,8 @@ from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
 from sim.bank import TerrainBank
 from sim.crossing import GROUND_FRICTION, SolverCfg
-from sim.robots.model import build_robot, geom_names
+from sim.robots.compiled import robot_spec
+from sim.robots.model import builder_of, geom_names
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.solver import dynamics_of, use_own_solver
@@ -73,17 +74,18 @@ class Simulation:
         self.bank = bank
         self.device = bank.device
         self.num_envs = len(terrain_of_env)
-        builder = build_robot(robot)
+        of_file = robot_spec(robot).compile()
+        builder = builder_of(of_file)
         with wp.ScopedDevice(self.device):
             self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
             self._build_model(builder)
             self._randomise_model(friction, added_base_mass)
-            self._build_solver(cfg or SolverCfg())
+            self._build_solver(cfg or SolverCfg(), impratio=float(of_file.opt.impratio))
             self._build_contact(builder)
             self._build_views()
 
     def _build_model(self, builder: newton.ModelBuilder) -> None:
-        scene = newton.ModelBuilder()
+        scene = newton.ModelBuilder(gravity=builder.gravity)
         newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
         scene.rigid_gap = 0.0
         scene.default_shape_cfg.mu = GROUND_FRICTION
@@ -113,7 +115,7 @@ class Simulation:
             model.body_mass.assign(mass)
             model.body_inv_mass.assign(1.0 / mass)
 
-    def _build_solver(self, cfg: SolverCfg) -> None:
+    def _build_solver(self, cfg: SolverCfg, *, impratio: float) -> None:
         # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
@@ -124,6 +126,7 @@ class Simulation:
             ls_iterations=cfg.ls_iterations,
             cone="elliptic",
             integrator="implicitfast",
+            impratio=impratio,
             use_mujoco_contacts=False,
             kinematic_switchable_roots=False,
         )

@@ -15,7 +15,7 @@ import faultline
 from qd.workers.evaluator import Compute
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
-from sim.robots.model import build_robot, effort_limits
+from sim.robots.compiled import robot_spec
 from tests import docs as pages
 from tests.docs import PAGES, ROOT, code_of, text_of
 from tests.qd.stand_in import open_stand_in
@@ -64,7 +64,8 @@ def test_the_robots_of_the_page_are_read(tmp_path):
     for text in (text for text in code_of("docs/robots.md", "python") if "ROBOT =" in text):
         (tmp_path / text.split("\n")[0].removeprefix("# mine/")).write_text(text)
     (tmp_path / "dog.urdf").write_text(urdf())
-    assert effort_limits(build_robot(get_robot(str(tmp_path / "dog_urdf.py")))) == [30.0] * 8
+    model = robot_spec(get_robot(str(tmp_path / "dog_urdf.py"))).compile()
+    assert model.actuator_forcerange[:, 1].tolist() == [30.0] * 8
     for file in ("a1.py", "anymal_b.py"):
         robot = runpy.run_path(str(tmp_path / file))["ROBOT"]
         assert len({*robot.joint_names}) == 12 and len({*robot.foot_geoms}) == 4 and len({*robot.limb_geoms}) == 8

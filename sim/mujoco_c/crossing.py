@@ -41,6 +41,7 @@ from sim.mujoco_c.model import (
 )
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
+from sim.robots.compiled import robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.base import TerrainSpace
@@ -55,9 +56,7 @@ _WARNINGS = [
 @lru_cache(maxsize=8)
 def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
     """Mass centre of the base in its frame [m]."""
-    from sim.robots.model import build_robot  # Newton takes seconds to load
-
-    x, y, z = build_robot(robot).body_com[0]
+    x, y, z = robot_spec(robot).compile().body_ipos[1]
     return float(x), float(y), float(z)
 
 

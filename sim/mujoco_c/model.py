@@ -6,7 +6,6 @@ quaternion is wxyz, the base's linear velocity that of its origin in the world f
 frame.
 """
 
-import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
@@ -19,13 +18,13 @@ from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
 from sim.maps.hfield import Margins, as_hfield
+from sim.robots.compiled import robot_spec
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
-_MEMORY = "4M"
-_OF_THE_FILE = ("stiffness", "damping", "effort_limit", "armature", "friction", "contact_time_constant_s")
+_MEMORY = 4 << 20  # bytes
 _mj: Any = mujoco  # its types are not written down
 
 Array = NDArray[np.float64]
@@ -85,26 +84,22 @@ def crossing_model(
         time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
         ground: Friction and softness of this one terrain.
     """
-    root = _root_of(robot)
-    ET.SubElement(root, "size", memory=_MEMORY)
-    option = root.find("option")
-    option = ET.SubElement(root, "option") if option is None else option
-    option.set("timestep", str(robot.physics_dt))
-    option.set("iterations", "100")
-    option.set("ls_iterations", "50")
-    ET.SubElement(option, "flag", autoreset="disable")  # or a state that blows up would begin anew unseen
-    if root.find("worldbody") is None:
-        raise ValueError(f"robot '{robot.name}': {robot.model_file} has no <worldbody>")
+    spec = robot_spec(robot)
+    spec.memory = _MEMORY
+    option = spec.option
+    option.timestep, option.iterations, option.ls_iterations = robot.physics_dt, 100, 50
+    option.integrator, option.cone = _mj.mjtIntegrator.mjINT_IMPLICITFAST, _mj.mjtCone.mjCONE_ELLIPTIC
+    option.disableflags = _mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     patches = [] if ground is None else _patches_of(ground)
-    data = _add_patches(root, heights, patches) if patches else _add_field(root, heights, 0)
-    sensors = ET.SubElement(root, "sensor")
+    data = _add_patches(spec, heights, patches) if patches else _add_field(spec, heights, 0)
     for name in robot.geom_names:
-        ET.SubElement(sensors, "contact", geom1=name, data="force", reduce="netforce")
-    model = _mj.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+        spec.add_sensor(
+            name=name, type=_mj.mjtSensor.mjSENS_CONTACT, objtype=_mj.mjtObj.mjOBJ_GEOM, objname=name,
+            intprm=[1 << _mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
+        )  # fmt: skip
+    model = spec.compile()
     model.hfield_data[:] = data
     of_ground = np.flatnonzero([model.geom(k).name.startswith(_GROUND) for k in range(model.ngeom)])
-    model.geom_conaffinity[:] = 0  # a robot does not touch itself
-    model.geom_conaffinity[of_ground] = 1
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
     if patches:
@@ -129,29 +124,26 @@ _DEPTH = 2.0  # of a level patch [m]
 
 
 def _add_field(
-    root: ET.Element, heights: NDArray[np.floating], number: int, low: tuple[float, float] = (0.0, 0.0),
+    spec: Any, heights: NDArray[np.floating], number: int, low: tuple[float, float] = (0.0, 0.0),
     margin: int | Margins = _MARGIN_NODES,
 ) -> Array:  # fmt: skip
     """Adds a heightfield whose first node stands at ``low`` [m]; returns its data."""
     field, name = as_hfield(heights, margin=margin), f"{_GROUND}-{number}" if number else _GROUND
-    rows, columns = map(str, field.data.shape)
-    size = " ".join(map(repr, field.size))
-    assets = root.find("asset")
-    assets = ET.SubElement(root, "asset") if assets is None else assets
-    ET.SubElement(assets, "hfield", name=name, nrow=rows, ncol=columns, size=size)
+    rows, columns = field.data.shape
+    spec.add_hfield(name=name, nrow=rows, ncol=columns, size=field.size, userdata=field.data.ravel())
     x, y, z = field.position
-    geom = {"type": "hfield", "hfield": name, "quat": " ".join(map(repr, field.quaternion))}
-    _add_geom(root, name, (x + low[0], y + low[1], z), geom)
+    _add_geom(spec, name, (x + low[0], y + low[1], z), type=_mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
+              quat=field.quaternion)  # fmt: skip
     return field.data.ravel()
 
 
-def _add_geom(root: ET.Element, name: str, position: tuple[float, float, float], looks: dict[str, str]) -> None:
+def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **looks: Any) -> None:
     # The robot's geoms collide with nothing by themselves (conaffinity 0); the ground must offer itself.
-    # solmix 0: the stiffness of a contact is the robot's.
-    geom = {"name": name, "friction": str(GROUND_FRICTION), "pos": " ".join(map(repr, position)), **looks}
-    world = root.find("worldbody")
-    assert world is not None
-    ET.SubElement(world, "geom", geom | {"conaffinity": "1", "solmix": "0"})
+    # solmix 0: the stiffness of a contact is the robot's. All is said, or defaults of the robot's file would hold.
+    spec.worldbody.add_geom(
+        name=name, pos=position, contype=0, conaffinity=1, condim=3, friction=(GROUND_FRICTION, 0.005, 0.0001),
+        margin=0.0, gap=0.0, priority=0, solmix=0.0, **looks,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +180,7 @@ def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
     return _MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)
 
 
-def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[_Patch]) -> Array:
+def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> Array:
     """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these."""
     data = [np.zeros(0)]
     for number, patch in enumerate(patches):
@@ -197,7 +189,7 @@ def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[
             if patch.time_constant_s:
                 raise ValueError(_NO_SOFTNESS)
             low = SPACING * patch.cols.start, SPACING * patch.rows.start
-            data.append(_add_field(root, part, number, low, patch.margin))
+            data.append(_add_field(spec, part, number, low, patch.margin))
             continue
         (y, half_y), (x, half_x) = (
             (
@@ -206,9 +198,8 @@ def _add_patches(root: ET.Element, heights: NDArray[np.floating], patches: list[
             )
             for nodes, (low, high) in zip((patch.rows, patch.cols), patch.margin, strict=True)
         )
-        box = {"type": "box", "size": f"{half_x!r} {half_y!r} {_DEPTH / 2}"}
-        name = f"{_GROUND}-{number}" if number else _GROUND
-        _add_geom(root, name, (x, y, float(part[0, 0]) - _DEPTH / 2), box)
+        name, size = f"{_GROUND}-{number}" if number else _GROUND, (half_x, half_y, _DEPTH / 2)
+        _add_geom(spec, name, (x, y, float(part[0, 0]) - _DEPTH / 2), type=_mj.mjtGeom.mjGEOM_BOX, size=size)
     return np.concatenate(data)
 
 
@@ -231,24 +222,6 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
     model.geom_solimp[geoms[soft]] = impedance, impedance, 0.001, 1.0, 0.5
     model.geom_priority[geoms] = 1
-
-
-def _root_of(robot: RobotCfg) -> ET.Element:
-    """The XML of a robot's MJCF, its meshes found from anywhere."""
-    root = ET.parse(robot.model_file).getroot()
-    given = [name for name in _OF_THE_FILE if getattr(robot, name) is not None]
-    included = root.find(".//include")
-    if root.tag != "mujoco" or given or included is not None:
-        got = "a URDF" if root.tag != "mujoco" else "an include" if not given else f"{', '.join(given)} in the settings"
-        raise ValueError(
-            f"robot '{robot.name}': plain MuJoCo reads {robot.model_file} alone, expected an MJCF of one file with "
-            f"position actuators, got {got}: write such a file for it"
-        )
-    compiler = root.find("compiler")
-    compiler = ET.SubElement(root, "compiler") if compiler is None else compiler
-    folder = compiler.get("meshdir", compiler.get("assetdir", ""))
-    compiler.set("meshdir", str(robot.model_file.absolute().parent / folder))
-    return root
 
 
 def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:

@@ -13,7 +13,8 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import problems
 from sim.policy.spec import run_file
-from sim.robots.model import read_robot
+from sim.robots.compiled import read_robot_spec
+from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes, start_height
 from sim.robots.robot import RobotCfg
@@ -36,21 +37,23 @@ def load_robot(path: Path) -> RobotCfg:
     if "model_file" not in wrong:
         robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
         with wp.ScopedDevice(host_device()):
-            builder, of_model = read_robot(robot, wrong)
+            spec, of_model = read_robot_spec(robot, wrong)
             mistakes += of_model
-            try:
-                make_probes(builder)
-            except ValueError as error:
-                mistakes.append(str(error))
-            if not mistakes and not robot.default_base_height:
-                robot = replace(robot, default_base_height=start_height(robot, builder))
+            if spec is not None and not of_model:
+                builder = builder_of(spec.compile())
+                try:
+                    make_probes(builder)
+                except ValueError as error:
+                    mistakes.append(str(error))
+                if not mistakes and not robot.default_base_height:
+                    robot = replace(robot, default_base_height=start_height(robot, builder))
     if mistakes:
         raise ValueError(f"{path}: {'; '.join(mistakes)}")
     return robot
 
 
 def settings_problems(robot: RobotCfg) -> list[str]:
-    """What is wrong with settings by themselves, one line each; :func:`read_robot` compares them with the model."""
+    """What is wrong with settings by themselves, one line each; :func:`sim.robots.compiled.read_robot_spec` compares them with the model."""
     mistakes = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
 

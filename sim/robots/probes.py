@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from kernels.contact import Probes
 from sim.crossing import CrossingCfg
 from sim.device import host_device
-from sim.robots.model import geom_names, leaf_name
+from sim.robots.model import geom_names
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
@@ -308,7 +308,7 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
                 newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k]), builder.shape_source[k]
             )
         except ValueError as error:
-            problems.append(f"geom {leaf_name(builder.shape_label[k])}: {error}")
+            problems.append(f"geom {builder.shape_label[k]}: {error}")
             continue
         for strip in strips:
             centres.append([wp.transform_point(pose, vec3(*centre)) for centre in strip.centres])

@@ -3,7 +3,6 @@
 For showing a robot, not for simulating one: forward kinematics and geometry are those of MuJoCo C.
 """
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.model_files import read_model_files
+from sim.robots.compiled import robot_spec as _compiled_spec
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -35,23 +34,13 @@ def robot_spec(robot: RobotCfg) -> Any:
     those of its own that touch nothing, else all it has.
     """
     try:
-        files = read_model_files(robot.model_file)
-        spec = _urdf_spec(robot) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
-    except Exception as error:  # MuJoCo's own type has no name
-        raise _not_shown(robot.model_file, error) from None
-    joints = tuple(joint.name for joint in spec.joints if joint.type != _mj.mjtJoint.mjJNT_FREE)
-    if joints != robot.joint_names or len(spec.joints) != len(joints) + 1:
-        raise ValueError(
-            f"robot '{robot.name}': {robot.model_file} has joints {', '.join(joints)} for MuJoCo, expected a free base "
-            f"and {', '.join(robot.joint_names)}"
-        )
+        spec = _compiled_spec(robot, visuals=True)
+        spec.copy().compile()
+    except ValueError:  # such as a mesh of too many faces, which only shows
+        spec = _compiled_spec(robot)
     looks = _read_look(robot)
     for body in spec.bodies[1:]:
         touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        for number, geom in enumerate(touching):
-            if files.is_urdf:
-                geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
-            geom.name = geom.name or f"{body.name}_geom_{number}"
         _dress(body, touching, looks.pop(body.name, []), robot)
     if looks:
         raise ValueError(
@@ -132,24 +121,6 @@ def _read_look(robot: RobotCfg) -> dict[str, list[dict[str, Any]]]:
         shape = {name: getattr(model, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
         looks.setdefault(model.body(model.geom_bodyid[k]).name, []).append(shape)
     return looks
-
-
-def _urdf_spec(robot: RobotCfg) -> Any:
-    """With what it shows of its links, unless MuJoCo cannot read that."""
-    try:
-        spec = _imported_urdf(read_model_files(robot.model_file, visuals=True).root)
-        spec.copy().compile()
-    except Exception:  # such as a mesh of too many faces; MuJoCo's own type has no name
-        return _imported_urdf(read_model_files(robot.model_file).root)
-    return spec
-
-
-def _imported_urdf(root: ET.Element) -> Any:
-    extension = ET.SubElement(root, "mujoco")
-    ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false")
-    spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-    spec.worldbody.first_body().add_freejoint()
-    return spec
 
 
 class Skeleton:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim.bank import TerrainBank
 from sim.crossing import CAPACITY_OVERFLOWS
-from sim.robots.model import build_robot, effort_limits, geom_names, leaf_name
+from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
@@ -148,27 +148,43 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArra
 
 
 def describe_model(robot: RobotCfg) -> str:
-    """Joints and geoms of a robot as they were read, and numbers that look like other units."""
+    """Joints and geoms of a robot as the solver holds them, and numbers that look like other units."""
     builder: Any = build_robot(robot)
+    sim = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
+    model: Any = sim.solver.mj_model
     lines = [
         f"{robot.name}: {robot.model_file}",
-        f"  {sum(builder.body_mass):.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
+        f"  {model.body_subtreemass[0]:.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
         f"{robot.observation_size} observations",
-        f"  {'joint':22}{'default':>9}{'range [rad]':>18}{'kp':>8}{'kd':>7}{'effort':>9}{'armature':>10}",
+        f"  {'joint':22}{'default':>9}{'range [rad]':>18}{'kp':>8}{'kd':>7}{'effort':>9}{'armature':>10}{'damping':>9}"
+        f"{'friction':>9}",
     ]
-    rows = zip(robot.joint_names, robot.default_joint_pos, *(
-        getattr(builder, f"joint_{name}")[6:]
-        for name in ("limit_lower", "limit_upper", "target_ke", "target_kd", "armature")
-    ), effort_limits(builder), strict=True)  # fmt: skip
-    for name, angle, low, high, kp, kd, armature, effort in rows:
-        most = f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
-        span = f"{low:.2f} to {high:.2f}" if high - low < _FREE else "free"
-        lines.append(f"  {name:22}{angle:9.3f}{span:>18}{kp:8g}{kd:7g}{most:>9}{armature:10.3g}")
-    lines.append(f"  {'geom':22}{'role':>9}  {'body':18}friction")
-    for name, body, friction in zip(geom_names(builder), builder.shape_body, builder.shape_material_mu, strict=True):
-        roles = (("base", robot.base_geoms), ("foot", robot.foot_geoms), ("limb", robot.limb_geoms))
-        role = next((kind for kind, names in roles if name in names), "-")
-        lines.append(f"  {name:22}{role:>9}  {leaf_name(builder.body_label[body]):18}{friction:g}")
+    drive_of = {int(joint): k for k, (joint, _) in enumerate(model.actuator_trnid)}
+    for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True), start=1):
+        drive, (low, high), dof = drive_of.get(k), model.jnt_range[k], int(model.jnt_dofadr[k])
+        kp, kd, effort = 0.0, 0.0, float(model.jnt_actfrcrange[k, 1])
+        if drive is not None:
+            kp, kd = model.actuator_gainprm[drive, 0], -model.actuator_biasprm[drive, 2]
+            effort = min(effort, model.actuator_forcerange[drive, 1] if model.actuator_forcelimited[drive] else np.inf)
+        most = "follows" if drive is None else f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
+        span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[k] else "free"
+        lines.append(
+            f"  {name:22} {angle:8.3f} {span:>17} {kp:7g} {kd:6g} {most:>8} {model.dof_armature[dof]:9.3g} "
+            f"{model.dof_damping[dof]:8g} {model.dof_frictionloss[dof]:8g}"
+        )
+    lines.append(
+        f"  {'geom':22} {'role':>8}  {'body':18} {'shape':10} {'size [m]':20} {'friction':>8}  time constant [s]"
+    )
+    roles = (("base", robot.base_geoms), ("foot", robot.foot_geoms), ("limb", robot.limb_geoms))
+    geoms = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
+    for k, name in enumerate(geom_names(builder)):
+        geom, kind = int(geoms[k]), newton.GeoType(builder.shape_type[k]).name.lower()
+        role = next((role for role, names in roles if name in names), "-")
+        size = " ".join(f"{length:.3g}" for length in model.geom_size[geom] if length)
+        lines.append(
+            f"  {name:22} {role:>8}  {builder.body_label[builder.shape_body[k]]:18} {kind:10} {size:20} "
+            f"{model.geom_friction[geom, 0]:8g}  {model.geom_solref[geom, 0]:g}"
+        )
     lines += [f"Warning: {text}" for text in unit_warnings(robot, builder)]
     return "\n".join(lines)
 
@@ -182,7 +198,7 @@ def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
     if not _MASSES[0] <= masses.sum() <= _MASSES[1]:
         warnings.append(f"it weighs {masses.sum():.3g} kg: are masses in the model in kilograms?")
     spread = np.sqrt([np.linalg.eigvalsh(np.reshape(inertia, (3, 3)))[-1] for inertia in builder.body_inertia] / masses)
-    far = [f"{leaf_name(builder.body_label[k])} ({spread[k]:.3g} m)" for k in np.flatnonzero(spread > reach)]
+    far = [f"{builder.body_label[k]} ({spread[k]:.3g} m)" for k in np.flatnonzero(spread > reach)]
     if far:
         warnings.append(
             f"the radius of gyration of {', '.join(far)} is more than the robot's {reach:.3g} m: "

@@ -1,0 +1,371 @@
+"""A robot's file as MuJoCo compiles it, in the one form that simulations and pictures are made of.
+
+Of each joint there is at most one position actuator, of the joint's name; every geom that touches anything touches the
+ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.files.command import with_traceback
+from sim.robots.model_files import joints_without_effort, read_model_files
+from sim.robots.robot import RobotCfg
+
+_mj: Any = mujoco  # its types are not written down
+_JOINT, _TRN, _BIAS = _mj.mjtJoint, _mj.mjtTrn.mjTRN_JOINT, _mj.mjtBias
+_URDF_FRICTION = 1.0
+_URDF_TIME_CONSTANT_S = 0.01
+_SLACK = 1e-3  # files round [rad]
+_LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
+_UNITS = {
+    "default_joint_pos": "angles",
+    "stiffness": "gains [N m/rad]",
+    "damping": "gains [N m s/rad]",
+    "effort_limit": "limits [N m]",
+    "armature": "inertias [kg m^2]",
+}
+_NEEDED = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper", "gravity", "clampctrl",
+           "actuation", "refsafe")  # fmt: skip
+
+
+def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
+    """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
+
+    Args:
+        robot: Robot settings; what they say of gains, torque limits, armature and contact counts.
+        visuals: Whether a URDF keeps what it shows of its links.
+    """
+    spec, problems = read_robot_spec(robot, visuals=visuals)
+    if problems:
+        raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
+    return spec
+
+
+def read_robot_spec(robot: RobotCfg, wrong: Collection[str] = (), *, visuals: bool = False) -> tuple[Any, list[str]]:
+    """The same, with what is wrong, one line each; fields of the settings in ``wrong`` are not compared with it."""
+    try:
+        files = read_model_files(robot.model_file, visuals=visuals)
+    except ValueError as error:
+        return None, [str(error)]
+    if files.problems:
+        return None, list(files.problems)
+    try:
+        spec = _of_urdf(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
+        strange = _keep_robot(spec)
+        spec.fuse_static()
+        model = spec.compile()
+    except Exception as error:  # MuJoCo's own type has no name
+        reason = " ".join(str(error).split())
+        return None, [with_traceback(error, f"{robot.model_file} cannot be read by MuJoCo: {reason}")]
+    drives = _Drives(spec, model)
+    strange += drives.problems
+    problems = _structure_problems(model)
+    if strange:
+        problems.append(f"{', '.join(strange)} cannot be simulated: take it out, or write it otherwise")
+    problems = [f"{robot.model_file}: {problem}" for problem in problems]
+    if problems:
+        return spec, problems
+    if "joint_names" not in wrong:
+        problems += _joint_name_problems(model, robot)
+        if not problems:
+            weak = joints_without_effort(files.root) if files.is_urdf and robot.effort_limit is None else []
+            problems += _joint_value_problems(model, robot, weak, wrong)
+            if {"stiffness", "damping"}.isdisjoint(wrong) and not problems:
+                problems += _drive_problems(drives, model, robot)
+    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
+    problems += _geom_problems(spec, [name for role in roles for name in getattr(robot, role)], robot)
+    if not problems and not wrong:
+        _set_drives(spec, drives, model, robot)
+        _set_contact(spec, robot)
+    return spec, problems
+
+
+def joint_names(model: Any) -> tuple[str, ...]:
+    """Names of a compiled robot's joints without that of its base."""
+    return tuple(model.joint(k).name for k in range(1, model.njnt))
+
+
+def touching_geoms(spec: Any) -> list[Any]:
+    """Geoms that touch the ground, body by body."""
+    return [geom for body in spec.bodies for geom in body.geoms if geom.contype or geom.conaffinity]
+
+
+def _of_urdf(root: ET.Element) -> Any:
+    """A URDF with a free base, its contact by the page on robots; what is fixed to a link adds its mass to it.
+
+    MuJoCo alone welds the first link to the world, and refuses inertias of fixed links that are those of no body.
+    """
+    extension = ET.SubElement(root, "mujoco")
+    ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false",
+                  inertiafromgeom="false")  # fmt: skip
+    spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    for body in spec.bodies:
+        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(touching):
+            geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
+            geom.friction[0], geom.solref = _URDF_FRICTION, (_URDF_TIME_CONSTANT_S, 1.0)
+    for first in spec.worldbody.bodies:
+        first.add_freejoint()
+        _sum_masses(first)
+    return spec
+
+
+def _sum_masses(body: Any) -> list[Any]:
+    """Gives a body what is fixed to it: its mass, and where its own and theirs are in it, [kg], [m], [kg m^2]."""
+    axes = _matrix(body.iquat)
+    inertia = axes @ np.diag(body.inertia) @ axes.T
+    if not np.isnan(body.fullinertia[0]):
+        inertia = body.fullinertia[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+    parts = [(float(body.mass), np.array(body.ipos), inertia)] if body.mass > 0.0 else []
+    for child in body.bodies:
+        of_child, turn = _sum_masses(child), _matrix(child.quat)
+        if not child.joints:
+            parts += [(mass, child.pos + turn @ at, turn @ own @ turn.T) for mass, at, own in of_child]
+            child.mass, child.inertia, child.fullinertia = 0.0, np.zeros(3), np.full(6, np.nan)
+    if body.joints and parts:
+        mass = sum(part for part, _, _ in parts)
+        centre = sum(part * at for part, at, _ in parts) / mass
+        whole = sum(inertia + part * _of_point(at - centre) for part, at, inertia in parts)
+        body.explicitinertial, body.mass, body.ipos, body.iquat = True, mass, centre, (1.0, 0.0, 0.0, 0.0)
+        body.fullinertia = whole[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return parts
+
+
+def _of_point(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inertia about the origin of a unit mass [m^2]."""
+    return at @ at * np.eye(3) - np.outer(at, at)
+
+
+def _matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.zeros(9)
+    _mj.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
+    return matrix.reshape(3, 3)
+
+
+def _keep_robot(spec: Any) -> list[str]:
+    """Leaves what simulations take of a file, under names; returns what they cannot take, by its place."""
+    flags = [
+        name for name in _NEEDED if spec.option.disableflags & getattr(_mj.mjtDisableBit, f"mjDSBL_{name.upper()}")
+    ]
+    medium = [name for name in ("density", "viscosity", "wind", "o_margin") if np.any(getattr(spec.option, name))]
+    gravity = spec.option.gravity.copy()
+    problems = [f'<flag {name}="disable"> in <option>' for name in flags] + [f"<option {name}>" for name in medium]
+    if gravity[0] or gravity[1] or not gravity[2] < 0.0:
+        problems.append(f"<option gravity> that does not point down, {gravity}")
+    for equality in spec.equalities:
+        follows = equality.type == _mj.mjtEq.mjEQ_JOINT and equality.name2 and not np.any(equality.data[2:5])
+        if not (follows and equality.active):
+            kind = _mj.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
+            problems.append(f"<equality> {kind} ({equality.info})")
+    problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
+    problems += [f"a flexible body ({flex.info})" for flex in spec.flexes]
+    for body in spec.bodies:
+        moving = [joint for joint in body.joints]
+        problems += [f"a ball joint ({joint.info})" for joint in moving if joint.type == _JOINT.mjJNT_BALL]
+        problems += [f"<joint ref> ({joint.info})" for joint in moving if joint.ref]
+        problems += [f"<body {name}> ({body.info})" for name in ("gravcomp", "mocap") if getattr(body, name)]
+        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        for number, geom in enumerate(touching):
+            geom.name = geom.name or f"{body.name}_geom_{number}"
+            geom.contype, geom.conaffinity = 1, 0
+            problems += [f"<geom {name}> of {geom.name} ({geom.info})" for name in ("margin", "gap", "adhesion")
+                         if getattr(geom, name)]  # fmt: skip
+    for part in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs):
+        spec.delete(part)
+    impratio = spec.option.impratio
+    spec.option = _mj.MjSpec().option
+    spec.option.gravity, spec.option.impratio = gravity, impratio
+    return problems
+
+
+def _structure_problems(model: Any) -> list[str]:
+    """What is no robot of single joints on a free base."""
+    if not model.njnt or model.jnt_type[0] != _JOINT.mjJNT_FREE or model.jnt_bodyid[0] != 1:
+        return ["the first body must move freely: give it a <freejoint/>"]
+    alone = np.flatnonzero(model.body_jntnum != 1)[1:]
+    crowded = [model.joint(k).name for k in range(1, model.njnt)
+               if model.jnt_type[k] == _JOINT.mjJNT_FREE or model.jnt_bodyid[k] in alone]  # fmt: skip
+    if crowded:
+        return [f"every joint must be a hinge or slide on a body of its own, unlike that of {', '.join(crowded)}"]
+    fixed = [model.geom(k).name for k in range(model.ngeom) if model.geom_bodyid[k] == 0 and model.geom_contype[k]]
+    if fixed:
+        return [f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out"]
+    poses = np.hstack([model.body_pos, model.body_quat, model.body_ipos])[1:]
+    lost = [model.body(1 + k).name for k in np.flatnonzero(~np.isfinite(poses).all(axis=1))]
+    if lost:
+        return [f"position and rotation must be numbers, unlike those of {', '.join(lost)}"]
+    slight = [model.body(k).name for k in range(1, model.nbody)
+              if model.body_inertia[k].min() < _LEAST_GYRATION**2 * model.body_mass[k]]  # fmt: skip
+    if slight:
+        return [f"inertia of {', '.join(slight)} is that of a point: give it that of a body [kg m^2]"]
+    return []
+
+
+def _joint_name_problems(model: Any, robot: RobotCfg) -> list[str]:
+    joints = joint_names(model)
+    problems = _unknown("joint", robot.joint_names, joints, robot)
+    if not problems and joints != robot.joint_names:
+        problems.append(f"joint_names must follow the file's order {joints}, got {robot.joint_names}")
+    return problems
+
+
+def _unknown(kind: str, wanted: Sequence[str], present: Sequence[str], robot: RobotCfg) -> list[str]:
+    missing = [name for name in wanted if name not in present]
+    if not missing:
+        return []
+    return [f"no {kind} named {', '.join(missing)} in {robot.model_file}: the file has {', '.join(present)}"]
+
+
+def _geom_problems(spec: Any, wanted: Sequence[str], robot: RobotCfg) -> list[str]:
+    sites = {site.name for site in spec.sites} - {geom.name for geom in touching_geoms(spec)}
+    visual = {geom.name for geom in spec.geoms if not geom.contype} - {""}
+    problems = []
+    for kind, names in (("a site", sites), ("a geom that touches nothing", visual)):
+        got = [name for name in wanted if name in names]
+        problems += [f"{', '.join(got)} is {kind} in {robot.model_file}: name geoms that touch the ground"] * bool(got)
+    known = [name for name in wanted if name not in sites | visual]
+    return problems + _unknown("geom", known, [geom.name for geom in touching_geoms(spec)], robot)
+
+
+def _joint_value_problems(model: Any, robot: RobotCfg, weak: Sequence[str], wrong: Collection[str]) -> list[str]:
+    """What is wrong with the settings that have a value for each joint; of joints ``weak`` a URDF has no torque."""
+    count, problems = len(robot.joint_names), []
+    values = {name: getattr(robot, name) for name in _UNITS if name not in wrong}
+    short = {name: len(given) for name, given in values.items() if given is not None and len(given) != count}
+    for name, got in short.items():
+        problems.append(f"{name} needs {count} {_UNITS[name]}, got {got}")
+    numbers = {"armature": model.dof_armature, "damping": model.dof_damping, "frictionloss": model.dof_frictionloss}
+    for name, of_file in numbers.items():
+        beyond = [f"{joint} ({value:g})" for joint, value in zip(robot.joint_names, of_file[6:], strict=True)
+                  if not value >= 0.0]  # fmt: skip
+        problems += [f"{name} must be a number, 0 or more, got {', '.join(beyond)}"] * bool(beyond)
+    if "default_joint_pos" in values and "default_joint_pos" not in short:
+        problems += _range_problems(model, robot)
+    if weak:
+        problems.append(f"no <limit effort> above 0 for {', '.join(weak)}: give it, or effort_limit in the settings")
+    return problems
+
+
+def _range_problems(model: Any, robot: RobotCfg) -> list[str]:
+    """Default angles that the joints cannot take."""
+    ranges = zip(robot.joint_names, robot.default_joint_pos, model.jnt_limited[1:], model.jnt_range[1:], strict=True)
+    beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, limited, (low, high) in ranges
+              if limited and not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
+    degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in robot.default_joint_pos) else ""
+    return [f"default_joint_pos is outside of the file's range for {', '.join(beyond)}{degrees}"] if beyond else []
+
+
+class _Drives:
+    """What the actuators of a compiled file do to each joint, and what no position actuator can do."""
+
+    def __init__(self, spec: Any, model: Any) -> None:
+        joints, count = joint_names(model), model.njnt - 1
+        self.stiffness, self.damping, self.effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
+        self.control, self.problems = np.full((count, 2), np.nan), list[str]()
+        limited = model.jnt_actfrclimited[1:].astype(bool)
+        self.effort[limited] = [self._least(span, f"actuatorfrcrange of {name}") for name, span in
+                                zip(np.array(joints)[limited], model.jnt_actfrcrange[1:][limited], strict=True)]  # fmt: skip
+        taken: list[int] = []
+        for k, actuator in enumerate(spec.actuators):
+            joint, where = int(model.actuator_trnid[k, 0]) - 1, f"on {actuator.target} ({actuator.info})"
+            kind = self._kind(model, k)
+            if model.actuator_trntype[k] != _TRN or joint < 0:
+                self.problems.append(f"an actuator that moves no joint {where}")
+            elif kind not in ("position", "motor"):
+                self.problems.append(f"{kind} {where}")
+            elif joint in taken:
+                self.problems.append(f"a second actuator {where}")
+            elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
+                self.problems.append(f"a gear other than 1 on a position actuator {where}")
+            else:
+                taken.append(joint)
+                self._add(model, k, joint, kind, where)
+
+    def _add(self, model: Any, k: int, joint: int, kind: str, where: str) -> None:
+        gear = abs(float(model.actuator_gear[k, 0]))
+        if model.actuator_forcelimited[k]:
+            most = gear * self._least(model.actuator_forcerange[k], f"forcerange {where}")
+            self.effort[joint] = min(self.effort[joint], most)
+        if kind == "position":
+            self.stiffness[joint], self.damping[joint] = model.actuator_gainprm[k, 0], -model.actuator_biasprm[k, 2]
+        if model.actuator_ctrllimited[k] and kind == "position":
+            self.control[joint] = model.actuator_ctrlrange[k]
+        elif model.actuator_ctrllimited[k]:
+            most = (
+                gear
+                * abs(model.actuator_gainprm[k, 0])
+                * self._least(model.actuator_ctrlrange[k], f"ctrlrange {where}")
+            )
+            self.effort[joint] = min(self.effort[joint], most)
+
+    def _least(self, span: NDArray[np.float64], what: str) -> float:
+        if span[0] != -span[1]:
+            self.problems.append(f"{what} that is not the same both ways, {span[0]:g} to {span[1]:g}")
+        return float(span[1])
+
+    def _kind(self, model: Any, k: int) -> str:
+        gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
+        simple = model.actuator_gaintype[k] == _mj.mjtGain.mjGAIN_FIXED and not model.actuator_dyntype[k]
+        if simple and model.actuator_biastype[k] == _BIAS.mjBIAS_NONE and not gain[1:].any():
+            return "motor"
+        if model.actuator_dyntype[k]:
+            return "an actuator with a timeconst or other dynamics"
+        if simple and model.actuator_biastype[k] == _BIAS.mjBIAS_AFFINE and not bias[0]:
+            if gain[0] > 0.0 and bias[1] == -gain[0]:
+                return "position"
+            if not bias[1] and bias[2] == -gain[0]:
+                return "a <velocity> drive, as of wheels,"
+        return "an actuator that is neither <position> nor <motor>"
+
+
+def _drive_problems(drives: _Drives, model: Any, robot: RobotCfg) -> list[str]:
+    """What the joints lack, gains of the settings counted in; joints that follow another one need none."""
+    follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
+    gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
+    limp = [name for k, name in enumerate(robot.joint_names) if not gains[k] > 0.0 and k not in follow]
+    if limp:
+        return [f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"]
+    return []
+
+
+def _set_drives(spec: Any, drives: _Drives, model: Any, robot: RobotCfg) -> None:
+    """One position actuator a joint, in the joints' order, with the gains of the settings if they have some."""
+    for actuator in spec.actuators:
+        spec.delete(actuator)
+    follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
+    for k, name in enumerate(robot.joint_names):
+        joint = spec.joint(name)
+        if robot.armature is not None:
+            joint.armature = robot.armature[k]
+        effort = min(drives.effort[k], np.inf if robot.effort_limit is None else robot.effort_limit[k])
+        stiffness = drives.stiffness[k] if robot.stiffness is None else robot.stiffness[k]
+        damping = drives.damping[k] if robot.damping is None else robot.damping[k]
+        if k in follow:
+            continue
+        limits: dict[str, Any] = {
+            "forcelimited": np.isfinite(effort),
+            "ctrllimited": not np.isnan(drives.control[k, 0]),
+        }
+        if limits["forcelimited"]:
+            limits["forcerange"] = (-effort, effort)
+        if limits["ctrllimited"]:
+            limits["ctrlrange"] = drives.control[k]
+        spec.add_actuator(
+            name=name, target=name, trntype=_TRN, gear=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+            gaintype=_mj.mjtGain.mjGAIN_FIXED, gainprm=(stiffness, *(0.0,) * 9), dyntype=_mj.mjtDyn.mjDYN_NONE,
+            biastype=_BIAS.mjBIAS_AFFINE, biasprm=(0.0, -stiffness, -damping, *(0.0,) * 7), **limits,
+        )  # fmt: skip
+
+
+def _set_contact(spec: Any, robot: RobotCfg) -> None:
+    """Friction and contact time constant of the settings."""
+    for geom in touching_geoms(spec):
+        if robot.friction is not None:
+            geom.friction[0] = robot.friction
+        if robot.contact_time_constant_s is not None:
+            geom.solref = robot.contact_time_constant_s, 1.0
