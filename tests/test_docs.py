@@ -14,8 +14,8 @@ import tyro
 import faultline
 from qd.workers.evaluator import Compute
 from sim.policy.loaders import load_policy
-from sim.robots.find import get_robot
 from sim.robots.compiled import robot_spec
+from sim.robots.find import get_robot
 from tests import docs as pages
 from tests.docs import PAGES, ROOT, code_of, text_of
 from tests.qd.stand_in import open_stand_in

@@ -11,8 +11,8 @@ import pytest
 import warp as wp
 
 from sim.files.records import robot_digest
-from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.compiled import robot_spec
+from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.model import build_robot, geom_names
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
@@ -64,6 +64,7 @@ MESH = "<asset></asset>"
 MORE = "collision_bit=False,"
 LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
 FIRST_MASS = '<mass value="0.8"/>'
+ROD = '<connect body1="FL_toe" body2="FR_toe" anchor="0 0 0"/>'
 MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what, and the part that the error names
     ("py", 'name="dog"', 'name="anymal"', "name"),
     ("py", 'name="dog"', 'name="a dog"', "name"),
@@ -79,7 +80,6 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("py", "(0.6, -1.2) * 4", "(0.6, 1.2) * 4", "FL_knee"),
     ("py", '"vel_y", "collision"', '"vel_z"', "penalties"),
     ("py", MORE, f"{MORE} stiffness=(60.0,) * 8,", "damping"),
-    ("py", MORE, MORE + GAINS, "stiffness"),  # the file has position actuators
     ("py", MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
     ("xml", FIRST_DRIVE, "", "FL_hip"),
     ("xml", FREE, "", "first body"),
@@ -98,6 +98,12 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", "</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>', "FL_hip"),
     ("xml", FIRST_DRIVE, '<general joint="FL_hip" biastype="affine" gainprm="60" biasprm="1 -60"/>', "<position>"),
     ("xml", "0.03 0.2 0.2", "0 0 0", "inertia"),
+    ("xml", "0.03 0.2 0.2", "0.03 0.2 0.9", "inertia"),
+    ("xml", "0.03 0.2 0.2", "1e-12 1e-12 1e-12", "a point"),
+    ("xml", 'friction="0.8"', 'friction="0.8" margin="0.02"', "<geom margin> of trunk (line"),
+    ("xml", "</mujoco>", '<option gravity="0 0 0"/></mujoco>', "<option gravity>"),
+    ("xml", "</mujoco>", '<option><flag contact="disable"/></option></mujoco>', "<flag contact"),
+    ("xml", "</mujoco>", f"<equality>{ROD}</equality></mujoco>", "<equality> connect (line"),
     ("xml", 'pos="0.2 0.12 0"', 'pos="0.2 nan 0"', "position"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),

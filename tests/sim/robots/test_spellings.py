@@ -1,0 +1,221 @@
+"""One robot in the many spellings of MJCF and URDF: the simulation moves it as MuJoCo C moves the file."""
+
+import re
+
+import mujoco
+import numpy as np
+import pytest
+
+from sim.robots.compiled import robot_spec
+from sim.robots.find import get_robot
+from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, mjcf, urdf, write_dog
+from tests.sim.plain_mujoco import on_plane, to_c
+from tests.sim.scenes import FLAT, simulate
+
+OFF, SECONDS, DT, HEIGHT = 0.3, 0.4, 0.005, 5.0
+PLAIN = mjcf()
+
+
+def swap(*pairs):
+    text = PLAIN
+    for old, new in pairs:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def drives(drive):
+    return mjcf(drive=drive)
+
+
+def saved():
+    """What MuJoCo itself writes of the file: ``<position>`` is ``<general>``."""
+    spec = mujoco.MjSpec.from_string(PLAIN)
+    spec.compile()
+    return spec.to_xml()
+
+
+def backwards():
+    """Drives in another order than the joints, each with gains of its own."""
+    lines = [DRIVE.format(name).replace('kp="60"', f'kp="{40 + 5 * k}"') for k, name in enumerate(JOINTS)]
+    return mjcf(drive="{0}").replace("".join(JOINTS), "".join(reversed(lines)))
+
+
+def in_frames():
+    legs = re.search(r'<body name="FL_thigh".*</body>\s*(?=<body name="FR_thigh")', PLAIN, re.S)
+    return PLAIN.replace(legs[0], f'<frame pos="0.01 0 0" euler="0 0.1 0">{legs[0]}</frame>')
+
+
+SPELLINGS = {
+    "plain": PLAIN,
+    "defaults that are called main": swap(("<default>\n", '<default class="main">\n')),
+    "defaults of drives": swap(("</default>", '<position kp="60" kv="2" forcerange="-30 30"/></default>'),
+                               (' kp="60" kv="2" forcerange="-30 30"/>', "/>")),
+    "settotalmass": swap(('autolimits="true"', 'autolimits="true" settotalmass="24"')),
+    "springdamper": swap(('armature="0.01"', 'armature="0.01" springdamper="0.2 1"')),
+    "springs and friction": swap(('armature="0.01"', 'armature="0.01" stiffness="9" springref="0.2" damping="0.7" '
+                                                     'frictionloss="0.4"')),
+    "frames": in_frames(),
+    "gravity of the moon": swap(("<default>\n", '<option gravity="0 0 -1.62"/><default>\n')),
+    "saved by MuJoCo": saved(),
+    "dampratio": drives('<position name="{0}" joint="{0}" kp="60" dampratio="0.8" forcerange="-30 30"/>'),
+    "forcelimited false": drives('<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-3 3" '
+                                 'forcelimited="false"/>'),
+    "weak drives": drives('<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-3 3"/>'),
+    "ranges of targets": drives('<position name="{0}" joint="{0}" kp="60" kv="2" ctrlrange="-1.25 0.65"/>'),
+    "drives backwards": backwards(),
+    "degrees": swap(('angle="radian"', 'angle="degree"'), ('range="-1.5 2.5"', 'range="-86 143"'),
+                    ('range="-2.6 -0.1"', 'range="-149 -5.7"')),
+    "another solver": swap(("<default>\n", '<option cone="pyramidal" integrator="RK4" timestep="0.01" tolerance="1"/>'
+                                           "<default>\n")),
+    "sensors, keys and flags": swap(("</mujoco>", '<sensor><gyro site="imu"/></sensor><keyframe><key/></keyframe>'
+                                                  '<option><flag energy="enable"/></option></mujoco>'),
+                                    ('<geom name="trunk"', '<site name="imu"/><geom name="trunk"')),
+}  # fmt: skip
+
+
+def in_mujoco(file, target):
+    """Joint angles [rad] of a file in free flight for a while, from the default pose at rest; and its mass [kg]."""
+    spec = mujoco.MjSpec.from_file(str(file))
+    option = spec.option
+    option.timestep, option.integrator, option.tolerance = DT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-8
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    start = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *target(0.0)])
+    data.qpos[:] = to_c(start)
+    for name, angle in zip(JOINTS, target(OFF), strict=True):
+        data.ctrl[model.actuator(name).id] = angle
+    for _ in range(round(SECONDS / DT)):
+        mujoco.mj_step(model, data)
+    return data.qpos[[int(model.joint(name).qposadr[0]) for name in JOINTS]], float(model.body_subtreemass[0])
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.parametrize("text", SPELLINGS.values(), ids=SPELLINGS)
+def test_a_file_flies_as_in_mujoco(tmp_path, device, text):
+    file = write_dog(tmp_path, model=text)
+    robot = get_robot(str(file))
+    assert robot.joint_names == JOINTS
+
+    def target(off):
+        return np.array(robot.default_joint_pos) + off
+
+    expected, mass = in_mujoco(file.with_suffix(".xml"), target)
+    sim = simulate(robot, FLAT[None], device)
+    assert sim.model.body_mass.numpy().sum() == pytest.approx(mass, rel=1e-6)
+    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *target(0.0)], np.float32)[None]
+    sim.joint_q.assign(q)
+    q[0, 7:] = target(OFF)
+    sim.targets.assign(q)
+    for _ in range(round(SECONDS / DT)):
+        sim.physics_step()
+    np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], expected, atol=1e-3)
+
+
+FREE_GAINS = GAINS.replace("effort_limit=(30.0,) * 8,", "")
+MOTORS = {  # drives, torque limit of the settings [N m], what holds
+    "forcerange": ('<motor name="{0}" joint="{0}" forcerange="-5 5"/>', None, 5.0),
+    "ctrlrange": ('<motor name="{0}" joint="{0}" ctrlrange="-5 5"/>', None, 5.0),
+    "gear and ctrlrange": ('<motor name="{0}" joint="{0}" gear="2.5" ctrlrange="-2 2"/>', None, 5.0),
+    "gear and forcerange": ('<motor name="{0}" joint="{0}" gear="2.5" forcerange="-2 2"/>', None, 5.0),
+    "settings above": ('<motor name="{0}" joint="{0}" forcerange="-5 5"/>', 20.0, 5.0),
+    "settings below": ('<motor name="{0}" joint="{0}" forcerange="-20 20"/>', 5.0, 5.0),
+    "nothing": ("", None, 66.0),
+    "drives that settings replace": ('<position name="{0}" joint="{0}" kp="9" forcerange="-5 5"/>', None, 5.0),
+}
+
+
+@pytest.mark.parametrize(("drive", "effort", "expected"), MOTORS.values(), ids=MOTORS)
+def test_the_smallest_torque_limit_holds(tmp_path, device, drive, effort, expected):
+    more = FREE_GAINS if effort is None else GAINS.replace("30.0", str(effort))
+    robot = get_robot(str(write_dog(tmp_path, model=mjcf(drive=drive), more=more)))
+    sim = simulate(robot, FLAT[None], device)
+    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)[None]
+    sim.joint_q.assign(q)
+    q[0, 7:] += 1.1  # 66 N m by a gain of 60
+    sim.targets.assign(q)
+    sim.physics_step()
+    np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:], expected, rtol=1e-5)
+
+
+def test_a_joint_limit_of_torque_holds_too(tmp_path, device):
+    text = swap(('range="-1.5 2.5"', 'range="-1.5 2.5" actuatorfrcrange="-5 5"'), ('range="-2.6 -0.1"',
+                'range="-2.6 -0.1" actuatorfrcrange="-7 7"'))  # fmt: skip
+    sim = simulate(get_robot(str(write_dog(tmp_path, model=text))), FLAT[None], device)
+    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *sim.robot.default_joint_pos], np.float32)[None]
+    sim.joint_q.assign(q)
+    q[0, 7:] += 1.1
+    sim.targets.assign(q)
+    sim.physics_step()
+    np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:], [5.0, 7.0] * 4, rtol=1e-5)
+
+
+CONTACTS = {
+    "plain": {},
+    "conaffinity alone": {"model": swap(('contype="1" conaffinity="0"', 'contype="0" conaffinity="1"'))},
+    "condim 1": {"model": swap(('solref="0.01 1"', 'solref="0.01 1" condim="1"'))},
+    "solref of one number": {"model": swap(('solref="0.01 1"', 'solref="0.01"'))},
+    "impratio": {"model": swap(("<default>\n", '<option impratio="10"/><default>\n'))},
+    "no option but a cone": {"model": swap(("<default>\n", '<option cone="pyramidal"/><default>\n'))},
+    "friction of the settings": {"more": "\n    friction=0.4,"},
+    "gains of the settings": {"model": mjcf(drive=""), "more": GAINS},
+    "urdf": KINDS["urdf"],
+}
+
+
+@pytest.mark.parametrize("kind", CONTACTS.values(), ids=CONTACTS)
+def test_a_push_moves_it_on_the_ground_as_in_mujoco(tmp_path, device, kind):
+    robot = get_robot(str(write_dog(tmp_path, **kind)))
+    start = np.array([8.0, 4.0, robot.default_base_height, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)
+    model = on_plane(robot)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:2] = to_c(start), (0.5, 1.0)
+    for name, angle in zip(JOINTS, robot.default_joint_pos, strict=True):
+        data.ctrl[model.actuator(name).id] = angle
+    sim = simulate(robot, FLAT[None], device)
+    sim.joint_q.assign(start[None])
+    sim.targets.assign(start[None])
+    sim.joint_qd.assign(np.array([[0.5, 1.0, *[0.0] * 12]], np.float32))
+    for _ in range(round(SECONDS / DT)):
+        mujoco.mj_step(model, data)
+        sim.physics_step()
+    assert np.hypot(*(data.qpos[:2] - start[:2])) > 0.02
+    np.testing.assert_allclose(sim.joint_q.numpy()[0, :3], data.qpos[:3], atol=5e-3)
+    np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], data.qpos[7:], atol=0.02)
+
+
+def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
+    text, knee = urdf(), '<joint name="FL_knee" type="revolute">'
+    assert knee in text
+    text = text.replace(knee, f'{knee}<mimic joint="FL_hip" multiplier="-2.0" offset="0.1"/>')
+    robot = get_robot(str(write_dog(tmp_path, **KINDS["urdf"] | {"model": text})))
+    sim = simulate(robot, FLAT[None], device)
+    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)[None]
+    q[0, 8] = -2.0 * q[0, 7] + 0.1
+    sim.joint_q.assign(q)
+    q[0, 7:9] = 0.8, 2.0  # what the follower is told counts for nothing
+    sim.targets.assign(q)
+    for _ in range(round(SECONDS / DT)):
+        sim.physics_step()
+    hip, knee = sim.joint_q.numpy()[0, 7:9]
+    assert hip == pytest.approx(0.8, abs=0.1) and knee == pytest.approx(-2.0 * hip + 0.1, abs=0.03)
+
+
+def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
+    # A camera whose inertia is that of no body by itself, 1 m ahead of the trunk.
+    camera = (
+        '<link name="camera"><inertial><mass value="0.5"/><inertia ixx="0.00001" iyy="0.00001" izz="0.0001" ixy="0" '
+        'ixz="0" iyz="0"/></inertial></link><joint name="mount" type="fixed"><parent link="trunk"/>'
+        '<child link="camera"/><origin xyz="1 0 0"/></joint></robot>'
+    )
+    without, with_camera = (
+        robot_spec(get_robot(str(write_dog(tmp_path / name, **KINDS["urdf"] | {"model": text})))).compile()
+        for name, text in (("plain", urdf()), ("camera", urdf().replace("</robot>", camera)))
+    )
+    mass = without.body_mass[1]
+    assert with_camera.nbody == without.nbody and with_camera.body_mass[1] == pytest.approx(mass + 0.5)
+    assert with_camera.body_ipos[1, 0] == pytest.approx(0.5 / (mass + 0.5))
+    # Steiner about the vertical: both about their common centre.
+    yaw = without.body_inertia[1].max() + 0.0001 + mass * 0.5 / (mass + 0.5)
+    assert with_camera.body_inertia[1].max() == pytest.approx(yaw, rel=1e-6)
