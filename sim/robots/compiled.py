@@ -21,6 +21,7 @@ _JOINT, _TRN, _BIAS = _mj.mjtJoint, _mj.mjtTrn.mjTRN_JOINT, _mj.mjtBias
 _URDF_FRICTION = 1.0
 _URDF_TIME_CONSTANT_S = 0.01
 _SLACK = 1e-3  # files round [rad]
+_SKEW = 0.01  # share by which a principal axis may miss a joint's
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
 _UNITS = {
     "default_joint_pos": "angles",
@@ -130,10 +131,28 @@ def _sum_masses(body: Any) -> list[Any]:
     if body.joints and parts:
         mass = sum(part for part, _, _ in parts)
         centre = sum(part * at for part, at, _ in parts) / mass
-        whole = sum(inertia + part * _of_point(at - centre) for part, at, inertia in parts)
+        whole = np.sum([own + part * _of_point(at - centre) for part, at, own in parts], axis=0)
+        if body.joints[0].type == _JOINT.mjJNT_HINGE:
+            whole = _without_rotor(whole, body.joints[0])
         body.explicitinertial, body.mass, body.ipos, body.iquat = True, mass, centre, (1.0, 0.0, 0.0, 0.0)
         body.fullinertia = whole[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return parts
+
+
+def _without_rotor(inertia: NDArray[np.float64], joint: Any) -> NDArray[np.float64]:
+    """An inertia without what it has about the joint's axis beyond any body's: a rotor's, the joint's armature.
+
+    The largest principal inertia of a body is at most the sum of the others. Some URDFs add that of the motor, behind
+    its gears, to that of the link.
+    """
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    about = float(axis @ inertia @ axis)
+    excess = 2.0 * about - float(np.trace(inertia))
+    if excess <= 0.0 or np.linalg.norm(inertia @ axis - about * axis) > _SKEW * about:
+        return inertia
+    excess += _SKEW * (about - excess)  # the axis is a principal one but for rounding
+    joint.armature += excess
+    return inertia - excess * np.outer(axis, axis)
 
 
 def _of_point(at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -267,9 +286,8 @@ class _Drives:
         joints, count = joint_names(model), model.njnt - 1
         self.stiffness, self.damping, self.effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
         self.control, self.problems = np.full((count, 2), np.nan), list[str]()
-        limited = model.jnt_actfrclimited[1:].astype(bool)
-        self.effort[limited] = [self._least(span, f"actuatorfrcrange of {name}") for name, span in
-                                zip(np.array(joints)[limited], model.jnt_actfrcrange[1:][limited], strict=True)]  # fmt: skip
+        for k in np.flatnonzero(model.jnt_actfrclimited[1:]):
+            self.effort[k] = self._least(model.jnt_actfrcrange[1 + k], f"actuatorfrcrange of {joints[k]}")
         taken: list[int] = []
         for k, actuator in enumerate(spec.actuators):
             joint, where = int(model.actuator_trnid[k, 0]) - 1, f"on {actuator.target} ({actuator.info})"

@@ -114,8 +114,8 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
             yield f"{name} must be of type {', '.join(_MOVING)} or fixed, got '{kind}'"
         limit = joint.find("limit")
         lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
-        if kind in _MOVING[:2] and lacking:
-            missing = "<limit>" if limit is None else " and ".join(lacking)
+        if kind in _MOVING[:2] and (limit is None or len(lacking) == 1):  # of a limit without both it moves freely
+            missing = "<limit>" if limit is None else lacking[0]
             yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
 
 

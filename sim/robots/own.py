@@ -53,7 +53,7 @@ def load_robot(path: Path) -> RobotCfg:
 
 
 def settings_problems(robot: RobotCfg) -> list[str]:
-    """What is wrong with settings by themselves, one line each; :func:`sim.robots.compiled.read_robot_spec` compares them with the model."""
+    """What is wrong with settings by themselves, one line each."""
     mistakes = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
 

@@ -219,3 +219,17 @@ def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
     # Steiner about the vertical: both about their common centre.
     yaw = without.body_inertia[1].max() + 0.0001 + mass * 0.5 / (mass + 0.5)
     assert with_camera.body_inertia[1].max() == pytest.approx(yaw, rel=1e-6)
+
+
+def test_a_motors_inertia_in_a_link_of_a_urdf_is_the_joints_armature(tmp_path):
+    text, plain = urdf(), robot_spec(get_robot(str(write_dog(tmp_path / "plain", **KINDS["urdf"])))).compile()
+    shank = re.search(r'<link name="FL_shank">.*?<inertia [^>]*/>', text, re.S)[0]
+    own = re.search(r'iyy="([^"]*)"', shank)[1]
+    more = text.replace(shank, shank.replace(f'iyy="{own}"', f'iyy="{float(own) + 0.02}"'))
+    kind = KINDS["urdf"] | {"model": more, "more": GAINS.replace("armature=(0.01,) * 8,", "")}
+    model = robot_spec(get_robot(str(write_dog(tmp_path / "more", **kind)))).compile()
+    dof = int(model.joint("FL_knee").dofadr[0])
+    body = int(model.jnt_bodyid[model.joint("FL_knee").id])
+    turned = [m.body_inertia[body].sum() + m.dof_armature[dof] for m in (plain, model)]
+    assert 0.019 < model.dof_armature[dof] < 0.02 + 1e-4
+    assert turned[1] == pytest.approx(turned[0] - plain.dof_armature[dof] + 0.02, rel=1e-6)
