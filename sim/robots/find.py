@@ -78,6 +78,13 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
     return tuple(float(scales[name]) for name in robot.penalties)
 
 
+def fitting_space(robot: RobotCfg) -> str | None:
+    """The terrain space that the robot's scales were measured on, whose height fits it; None of a shipped robot."""
+    if robot.settings_file is None or not robot.scales_file.exists():
+        return None
+    return read_json(robot.scales_file).get("space")
+
+
 def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
     """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
 

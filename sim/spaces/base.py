@@ -13,6 +13,15 @@ DEFAULT_SIGMA0 = 2.0
 """So wide a start asks for terrains at the genes' limits, which are the hard ones of most spaces."""
 
 
+MOST_HEIGHT = 0.25
+"""Heights of the shipped spaces are for robots half a metre high: Table I's w [m]."""
+
+
+def name_at(base: str, height: float) -> str:
+    """How a space of another height is called: ``course@0.06``."""
+    return base if height == MOST_HEIGHT else f"{base}@{height:g}"
+
+
 class TerrainSpace(Protocol):
     """What a search needs of its terrains."""
 

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, SPACING, Kind
+from kernels.heightfield import scale_heights
 from sim.device import host_device
-from sim.spaces.base import Seed, TerrainSpace, clipped
+from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
 
 _KIND, _LENGTH = GENES.index("kind"), GENES.index("length")
 _SIZE = _FIRST_PARAMETER = GENES.index("size")
@@ -25,16 +26,24 @@ class Course(TerrainSpace):
     (:data:`kernels.course.PARAMETERS`). docs/terrains.md says which standards their ranges come from.
     """
 
-    name: ClassVar[str] = "course"
+    height: float = MOST_HEIGHT
+    """Of what the elements' sizes are meant for [m]: half of it halves all heights."""
     num_genes: ClassVar[int] = MAX_ELEMENTS * GENES_PER_ELEMENT
     """Six genes an element, in the order of :data:`kernels.course.GENES`, element after element."""
     sigma0: ClassVar[float] = 0.5
     """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
     genes_per_part: ClassVar[int] = GENES_PER_ELEMENT
 
+    @property
+    def name(self) -> str:
+        """``course``, with another height ``course@0.06``."""
+        return name_at("course", self.height)
+
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""
         course.rasterise(genes, spacing, heights_out)
+        if self.height != MOST_HEIGHT:
+            scale_heights(heights_out, self.height / MOST_HEIGHT)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Kinds drawn evenly, every parameter that makes an element hard at its hard end, the others uniform."""
@@ -58,7 +67,13 @@ class Course(TerrainSpace):
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each element in words, six of them."""
-        return tuple(map(_in_words, self.elements(np.asarray(genes)[None])[0]))
+        return tuple(map(_in_words, self._scaled_elements(genes)))
+
+    def _scaled_elements(self, genes: ArrayLike) -> NDArray[Any]:
+        """The elements of one row of genes with their heights as they are, also of ramps, whose size is the slope."""
+        (elements,) = self.elements(np.asarray(genes)[None])
+        elements["size"] *= self.height / MOST_HEIGHT
+        return elements
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes with flat ground as long as some elements in their place; the others stay where they are."""
@@ -90,10 +105,9 @@ class Course(TerrainSpace):
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Each element but flat ground in words, with where it begins and ends [m]."""
-        (elements,) = self.elements(np.asarray(genes)[None])
         return tuple(
             (_in_words(element), SPACING * element["first"], SPACING * (element["first"] + element["cells"]))
-            for element in elements
+            for element in self._scaled_elements(genes)
             if element["kind"] != Kind.FLAT
         )
 

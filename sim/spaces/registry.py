@@ -1,17 +1,22 @@
 """Terrain spaces by name: the shipped ones, and those of a user that the command line named."""
 
+import re
 import shlex
+from dataclasses import replace
 
 from sim.ground import joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
-from sim.spaces.base import TerrainSpace
-from sim.spaces.course import COURSE
+from sim.robots.find import fitting_space
+from sim.robots.robot import RobotCfg
+from sim.spaces.base import MOST_HEIGHT, TerrainSpace
+from sim.spaces.course import COURSE, Course
 from sim.spaces.ground import OnGround
 from sim.spaces.own import load_own
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN, SuperGaussian
 
 SPACES: dict[str, TerrainSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
 """Every shipped space by its name. Another one is one more class, and its place here."""
+_HEIGHT = re.compile(r"0?\.\d+")
 _loaded: list[TerrainSpace] = []
 """A user's own spaces that this process was told to run, the latest first."""
 
@@ -51,10 +56,34 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
         sha256: Hash of its code in the record, by which code that has moved is known.
     """
     base, kinds = split_name(name)
-    space = SPACES.get(base) or _find_loaded(base, sha256)
+    root, at, height = base.rpartition("@")
+    lower = at and root in SPACES and _HEIGHT.fullmatch(height)
+    space = at_height(SPACES[root], float(height)) if lower else SPACES.get(base) or _find_loaded(base, sha256)
     if kinds and space.ground:
         raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
     return OnGround(inner=space, ground=kinds) if kinds else space
+
+
+def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:
+    """A space at a height [m], or, without one, at the height that fits the robot; says so if that is not its own."""
+    if height is not None:
+        return at_height(space, height)
+    _, _, fits = split_name(fitting_space(robot) or "")[0].rpartition("@")
+    if not _HEIGHT.fullmatch(fits) or "@" in space.name or is_own(space.name):
+        return space
+    print(f"Heights up to {float(fits):g} m, as of the penalty scales of {robot.name} (--height says otherwise).")
+    return at_height(space, float(fits))
+
+
+def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
+    """A shipped space whose heights are those of a robot for which the highest bump is ``height`` [m]."""
+    if isinstance(space, OnGround):
+        return replace(space, inner=at_height(space.inner, height))
+    if not isinstance(space, SuperGaussian | Course):
+        raise ValueError(f"height is for shipped spaces, got {space.name}: a space of your own has its own heights")
+    if not 0.0 < height <= MOST_HEIGHT:
+        raise ValueError(f"height must lie above 0 and at most at {MOST_HEIGHT:g} m, got {height:g}")
+    return replace(space, height=height)
 
 
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:

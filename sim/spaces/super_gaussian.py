@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
+from kernels.heightfield import scale_heights
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
-from sim.spaces.base import Seed, TerrainSpace, clipped
+from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
 
 _HEIGHT = PARAMETERS.index("w")
 
@@ -18,14 +19,20 @@ _HEIGHT = PARAMETERS.index("w")
 class SuperGaussian(TerrainSpace):
     """Eq. 1, with genes rescaled by Table I."""
 
-    name: ClassVar[str] = "super_gaussian"
     any_spacing: ClassVar[bool] = True
     genes_per_part: ClassVar[int] = GENES_PER_BUMP
+    height: float = MOST_HEIGHT
+    """Largest height of a bump [m]: Table I's w; a smaller one lowers all terrains alike."""
     num_bumps: int = 8
 
     def __post_init__(self) -> None:
         if self.num_bumps < 1:
             raise ValueError(f"num_bumps must be at least 1, got {self.num_bumps}")
+
+    @property
+    def name(self) -> str:
+        """``super_gaussian``, with another height ``super_gaussian@0.06``."""
+        return name_at("super_gaussian", self.height)
 
     @property
     def num_genes(self) -> int:
@@ -35,6 +42,8 @@ class SuperGaussian(TerrainSpace):
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
         super_gaussian.rasterise(genes, spacing, heights_out)
+        if self.height != MOST_HEIGHT:
+            scale_heights(heights_out, self.height / MOST_HEIGHT)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Uniform genes, but every bump at its lowest or highest height: the paper's hard-random terrains."""
@@ -46,7 +55,9 @@ class SuperGaussian(TerrainSpace):
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each bump in words."""
         bumps = clipped(genes).reshape(self.num_bumps, GENES_PER_BUMP)
-        return tuple(map(_in_words, LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)))
+        values = LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)
+        values[:, _HEIGHT] *= self.height / MOST_HEIGHT
+        return tuple(map(_in_words, values))
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes with the heights of some bumps at zero."""

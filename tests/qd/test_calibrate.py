@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.calibrate import calibrate, measured
+from qd.calibrate import calibrate, fitting_height, measured
 from sim.files.records import identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
+from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.robots import Robots
@@ -108,3 +109,17 @@ def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are
 def test_mistakes_are_found_before_the_work(tmp_path, named, changes):
     with pytest.raises(ValueError, match=named):
         calibrated(tmp_path, robots(stop_after=0), **changes)
+
+
+@pytest.mark.parametrize(("crossed_up_to", "expected"), [(0.30, 0.25), (0.11, 0.1), (0.04, 0.04), (0.001, 0.02)])
+def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, expected):
+    asked = []
+
+    class Crosses:
+        def cross(self, policy, genes, seeds, *, space, replicas, label):
+            height = get_space(space).height
+            asked.append(height)
+            return failing(0.0 if height <= crossed_up_to else 0.5)(stand_in.evaluate(genes, seeds, replicas))
+
+    assert fitting_height(Crosses(), "policy.pt", SUPER_GAUSSIAN) == expected
+    assert asked[0] == 0.25 and len(asked) <= 5

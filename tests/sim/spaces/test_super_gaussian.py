@@ -71,3 +71,18 @@ def test_scaled_bumps_are_lower_everywhere():
     genes = 2 * SUPER_GAUSSIAN.hard_random(2, 5)  # beyond the limits, which are clipped
     np.testing.assert_allclose(heights_of(SUPER_GAUSSIAN.scaled(genes, 0.3)), 0.3 * heights_of(genes), atol=1e-6)
     np.testing.assert_array_equal(SUPER_GAUSSIAN.scaled(genes, 1.0), clipped(genes))
+
+
+@pytest.mark.parametrize("name", ["super_gaussian", "course"])
+def test_a_lower_space_is_the_same_terrain_with_all_heights_scaled(name):
+    space, lower = get_space(name), get_space(f"{name}@0.1")
+    genes = space.hard_random(3, 0)
+    np.testing.assert_allclose(heights_of(genes, lower), 0.4 * heights_of(genes, space), atol=1e-6)
+    assert lower.name == f"{name}@0.1" and get_space(f"{name}@0.1+friction").name == f"{name}@0.1+friction"
+    with pytest.raises(ValueError, match=r"at most at 0\.25 m, got 0\.3"):
+        get_space(f"{name}@0.3")
+
+
+def test_words_of_a_lower_space_are_its_heights():
+    genes = get_space("super_gaussian").hard_random(1, 0)[0]
+    assert "of 0.10 m at" in get_space("super_gaussian@0.1").describe(genes)
