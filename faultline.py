@@ -38,9 +38,8 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "finetune": Command("train.commands:Finetune", "train a controller further on terrains that broke it"),
         "harden": Command("train.commands:Harden", "rounds of search and training, until little breaks it"),
     },
-    "Bring a robot": {
-        "stand": Command("sim.commands:Stand", "look at a robot: its joints and geoms, whether it stands"),
-        "calibrate": Command("qd.commands:Calibrate", "measure the penalty scales of a robot"),
+    "Bring a robot or a controller": {
+        "check": Command("qd.commands:Check", "look at a robot and its controller: does it stand, and walk"),
     },
 }
 """What can be done, by what it is for; first the six that a newcomer needs."""

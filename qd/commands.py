@@ -201,39 +201,34 @@ class Minimise(_OnRun):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(ControllerFlags, WorkerFlags):
-    """Measure the penalty scales of a robot with a controller, on hard-random terrains.
+class Check(ControllerFlags, WorkerFlags):
+    """Look at a robot and its controller before anything is searched or trained.
 
-    It writes them beside the robot's own controller, or beside the settings file of a robot that is not shipped. Every
-    search reads them there. Crossings are kept, so the same command goes on after Ctrl-C.
+    It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
+    contacts and constraint rows it needs when it lies on rough ground; whether it walks on flat ground, here and in
+    MuJoCo C; at which height of terrain it crosses about 80 %; and which kerbs and stairs stop it. At the end it
+    measures the scales of the penalties, on hard-random terrains of that height, if there are none. The exit status is
+    1 if something must be mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
     """
 
-    terrains: PositiveInt = 1_000
-    """Hard-random terrains to begin with. As many again are drawn until 200 episodes have missed the goal, up to five
-    times as many. With fewer failing episodes even then, all episodes give the scales."""
-    space: str = "super_gaussian"
-    """Terrain space that they are drawn from: super_gaussian, course, or file.py:CLASS."""
+    seconds: Annotated[float, Meta(gt=0, le=60)] = 3.0
+    """How long it stands, and lies [s]."""
     seed: NonNegativeInt = 0
-    """Draws terrains and starts."""
+    """Draws poses, terrains and starts."""
+    anyway: bool = False
+    """Go on although it does not walk."""
     out: Path | None = None
-    """Where to write; sim/robots/<robot>.scales.json, or <name>.scales.json beside a settings file."""
+    """Measure the scales anew, and write them here."""
 
-    def execute(self) -> None:
-        """Measures the scales."""
-        from qd.calibrate import calibrate
+    def execute(self) -> int:
+        """Prints what was found; returns 1 if something has to be mended."""
+        from qd.check import check
         from qd.workers.evaluator import Compute
         from sim.robots.find import get_robot
-        from sim.spaces.registry import load_space
 
-        calibrate(
-            get_robot(self.robot),
-            self.policy,
-            compute=Compute.resolve(self.device, self.workers, self.num_envs),
-            terrains=self.terrains,
-            space=load_space(self.space),
-            seed=self.seed,
-            out=self.out,
-        )
+        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        flags = {"seconds": self.seconds, "seed": self.seed, "anyway": self.anyway, "out": self.out}
+        return 0 if check(get_robot(self.robot), self.policy, compute=compute, **flags) else 1
 
 
 @dataclass(frozen=True, kw_only=True)

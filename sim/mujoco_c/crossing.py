@@ -26,7 +26,7 @@ from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank, terrains_of
-from sim.crossing import CrossingCfg, SolverCfg, make_start_ranges
+from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
 from sim.crossing import resolved as with_contact_resolved
 from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
@@ -194,14 +194,15 @@ def cross(
         penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
         sums[running] += robot.physics_dt * penalties
     sums[outcome == Outcome.INVALID] = np.nan
+    upright = 1.0 - 2.0 * (episodes.qpos[:, 4] ** 2 + episodes.qpos[:, 5] ** 2)
     return RolloutResult(
         penalties=sums[None][..., [PENALTIES.index(name) for name in robot.penalties]],
         penalty_names=robot.penalties,
         outcome=outcome[None].astype(np.uint8),
         invalidity=np.where(outcome[None] == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),
-        fallen=np.zeros((1, count), bool),
+        fallen=upright[None] < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
         duration_s=(steps[None] * robot.physics_dt).astype(np.float32),
-        final_position=np.full((1, count, 3), np.nan, np.float32),
+        final_position=episodes.qpos[None, :, :3].astype(np.float32),
     )
 
 

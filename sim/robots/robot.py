@@ -129,7 +129,7 @@ class RobotCfg:
 
     @property
     def scales_file(self) -> Path:
-        """The penalty scales measured with that controller (``faultline calibrate``)."""
+        """The penalty scales measured with that controller (``faultline check``)."""
         return self.home / f"{self.name}.scales.json"
 
     @property

@@ -28,6 +28,7 @@ _RESTLESS = 0.1  # feet whose force changes by more than this share of the weigh
 _TURN = 2.0 * np.pi
 _FREE = 1e3  # a joint with a wider range has none [rad]
 _NO_EFFORT_LIMIT = 1e5  # more is no limit [N m]
+_SIZES_OF = {"sphere": 1, "capsule": 2, "cylinder": 2}
 _SIZES = (0.05, 5.0)  # farthest point of a robot from its base [m]
 _MASSES = (0.1, 1000.0)  # [kg]
 
@@ -180,7 +181,8 @@ def describe_model(robot: RobotCfg) -> str:
     for k, name in enumerate(geom_names(builder)):
         geom, kind = int(geoms[k]), newton.GeoType(builder.shape_type[k]).name.lower()
         role = next((role for role, names in roles if name in names), "-")
-        size = " ".join(f"{length:.3g}" for length in model.geom_size[geom] if length)
+        sizes = model.geom_size[geom][: _SIZES_OF.get(kind, 3)]
+        size = " ".join(f"{length:.3g}" for length in sizes)
         lines.append(
             f"  {name:22} {role:>8}  {builder.body_label[builder.shape_body[k]]:18} {kind:10} {size:20} "
             f"{model.geom_friction[geom, 0]:8g}  {model.geom_solref[geom, 0]:g}"

@@ -4,8 +4,6 @@ import dataclasses
 
 import pytest
 
-from sim.commands import Stand
-from sim.files.command import run_command
 from sim.robots.find import get_robot
 from sim.robots.stand import describe_model, describe_standing, stand
 from tests.sim.dogs import KINDS, LEGS, write_dog
@@ -57,11 +55,3 @@ def test_shipped_robots_are_in_the_right_units_and_grams_are_not(robot, tmp_path
     model = file.with_suffix(".xml")
     model.write_text(model.read_text().replace('mass="8"', 'mass="8000"'))
     assert "kilograms" in describe_model(get_robot(str(file)))
-
-
-def test_the_command_prints_both_and_fails_where_something_must_be_mended(tmp_path, capsys):
-    file = write_dog(tmp_path)
-    file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2"))
-    flags = ["--robot", str(file), "--device", "cpu", "--seconds", "0.5", "--drops", "1"]
-    assert run_command(Stand, flags, name="stand") == 1
-    assert "FL_hip" in (text := capsys.readouterr().out) and "default_base_height" in text

@@ -1,0 +1,142 @@
+"""Whether a robot and its controller are read rightly: it stands, walks alike in both simulators; what stops it."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qd.calibrate import calibrate, fitting_height
+from qd.evaluate.dose import measure_dose
+from qd.fitness import FAILING_GOAL_RATE
+from qd.run.directory import RUNS
+from qd.workers.cross import Crossings
+from qd.workers.evaluator import Compute, check_policy
+from qd.workers.invalid import invalid_reasons, reason_words
+from sim.crossing import CrossingCfg
+from sim.files.atomic import write_atomically
+from sim.mujoco_c.crossing import cross_terrains
+from sim.robots.robot import RobotCfg
+from sim.robots.stand import Standing, describe_model, describe_standing, stand
+from sim.rollout import RolloutResult
+from sim.spaces.dose import parse_doses
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS
+
+_WALKS = 8  # episodes on flat ground in each simulator
+_APART = 0.05  # share by which speeds may differ
+_MOST_ROWS = 2_000  # a robot that needs more constraint rows is refused
+_RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
+
+
+def check(
+    robot: RobotCfg, policy: str | None = None, *, compute: Compute, seconds: float = 3.0, seed: int = 0,
+    anyway: bool = False, out: Path | None = None,
+) -> bool:  # fmt: skip
+    """Prints what is read, whether it stands and walks, and what it gets over; measures scales if there are none.
+
+    Args:
+        robot: Robot settings.
+        policy: The controller; the robot's own if None.
+        compute: Where.
+        seconds: How long it stands, and lies [s].
+        seed: Draws poses, terrains and starts.
+        anyway: Whether to go on although it does not walk.
+        out: Where the scales of its penalties go; beside the robot if None, and then only if there are none.
+
+    Returns:
+        Whether it stands as it should and walks alike in both simulators.
+    """
+    print(describe_model(robot), flush=True)
+    robot, standing = _with_room(robot, compute.device, seconds, seed)
+    text, fine = describe_standing(robot, standing)
+    print(text, flush=True)
+    policy = policy or str(robot.policy_file)
+    if not Path(policy).exists() and policy == str(robot.policy_file):
+        print(f"Without a controller, expected at {policy} or named by --policy, this is all.")
+        return fine
+    check_policy(policy, robot, compute.device)
+    with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
+        walks = _walk(crossings, policy, seed)
+        if walks or anyway:
+            height = fitting_height(crossings, policy, SUPER_GAUSSIAN, seed=seed)
+    if walks or anyway:
+        doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
+        dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=seed)
+        stairs, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
+        print(f"Half get over a kerb {kerb}, stairs {stairs}; 80 % cross hard-random terrains at --height {height:g}.")
+        if out is not None or not robot.scales_file.exists():
+            calibrate(robot, policy, compute=compute, terrains=_terrains(compute), replicas=4, seed=seed, out=out)
+    return fine and walks
+
+
+def _terrains(compute: Compute) -> int:
+    """Hard-random terrains of the scales to begin with; at most five times as many are crossed."""
+    return 1_000 if compute.device.startswith("cuda") else 100
+
+
+def _with_room(robot: RobotCfg, device: str, seconds: float, seed: int) -> tuple[RobotCfg, Standing]:
+    """The robot with buffers in which the dropped ones fit, written into its settings where these are data."""
+    wanted = robot
+    while (standing := stand(wanted, device=device, seconds=seconds, seed=seed)).overflowed:
+        if wanted.njmax >= _MOST_ROWS:
+            raise ValueError(
+                f"robot '{robot.name}' needs more than {wanted.njmax} constraint rows, got no state without an "
+                "overflow: let fewer of its geoms touch the ground"
+            )
+        wanted = replace(wanted, njmax=2 * wanted.njmax, nconmax=2 * wanted.nconmax)
+    if wanted == robot:
+        return robot, standing
+    rows, contacts = 20 * -(-standing.rows // 16), max(robot.nconmax, int(np.ceil(1.5 * standing.contacts)))
+    wanted = replace(robot, njmax=max(robot.njmax, rows), nconmax=contacts)
+    print(f"Its buffers were too small: it needs njmax = {wanted.njmax} and nconmax = {wanted.nconmax}", end="")
+    file = robot.settings_file
+    if file is None or file.suffix != ".toml":
+        print(": write them into its settings.", flush=True)
+        return wanted, standing
+    text = re.sub(r"^(njmax|nconmax)\s*=.*\n", "", file.read_text(), flags=re.MULTILINE)
+    write_atomically(file, f"njmax = {wanted.njmax}\nnconmax = {wanted.nconmax}\n{text}".encode())
+    print(f", as {file} says now.", flush=True)
+    return wanted, standing
+
+
+def _walk(crossings: Crossings, policy: str, seed: int) -> bool:
+    """Lets it cross flat ground here and in MuJoCo C; prints speed, height and goal of both, and whether they agree."""
+    robot = crossings.robot
+    flat, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([seed], np.uint32)
+    here = crossings.cross(policy, flat, seeds, replicas=_WALKS, label="flat ground", invalid_ok=True)
+    ((_, there),) = cross_terrains(
+        robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
+    )
+    (speed, words), (other, other_words) = (_walked(result) for result in (here, there))
+    print(f"On flat ground at {CrossingCfg.speed:g} m/s: {words}. In MuJoCo C: {other_words}.", flush=True)
+    walks = here.reached_goal.mean() >= 0.5 and there.reached_goal.mean() >= 0.5
+    alike = abs(speed - other) <= _APART * max(speed, other)
+    if not walks:
+        print("It does not walk: look at the order of joints, default pose, scales, gains, and what it observes.")
+    elif not alike:
+        print(f"Its speeds differ by more than {_APART:.0%}: what holds in one simulator need not in the other.")
+    return walks and alike
+
+
+def _half_words(dose: dict[str, Any], element: str) -> str:
+    """Up to which rise half of the robots get over an obstacle: ``of 6 cm``."""
+    (half,) = (half["value"] for half in dose["half"] if half["element"] == element)
+    first = next(row["goal_rate"] for row in dose["dose"] if row["element"] == element)
+    if half is None:
+        over = first is not None and first >= FAILING_GOAL_RATE
+        return f"of over {100 * _RISES[-1]:.0f} cm" if over else f"of less than {100 * _RISES[0]:.0f} cm"
+    return f"of {100 * half:.0f} cm"
+
+
+def _walked(result: RolloutResult) -> tuple[float, str]:
+    """Mean speed of the valid episodes [m/s], and how they went in words."""
+    valid = ~result.invalid
+    if not valid.any():
+        return 0.0, f"no valid episode ({reason_words(invalid_reasons(result))})"
+    way = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
+    speed = float((way / result.duration_s[valid]).mean())
+    goal, count = int(result.reached_goal.sum()), int(valid.sum())
+    height = float(result.final_position[valid][:, 2].mean())
+    return speed, f"{goal} of {count} reach the goal, {speed:.3f} m/s, base {height:.3f} m high"
