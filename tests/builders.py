@@ -121,6 +121,7 @@ def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
 
 
 def save_checkpoint(path, state, **more):
-    """As rsl_rl's runner saves it."""
-    torch.save({"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None} | more, path)
+    """As rsl_rl's runner saves it, but that it says what is between its layers."""
+    content = {"actor_state_dict": state, "critic_state_dict": {}, "iter": 7, "infos": None, "activation": "elu"}
+    torch.save(content | more, path)
     return path

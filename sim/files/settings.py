@@ -61,12 +61,17 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
         match = _EXPECTED.fullmatch(str(error))
-        words = f"{match['field'] or 'it'} must be {_in_words(match['what'])}{match['got'] or ''}" if match else error
+        words = (
+            f"{match['field'] or 'it'} must be {_in_words(match['what'])}{match['got'] or ''}"
+            if match
+            else (str(error).replace("Object missing required field", "missing").replace("`", "'"))
+        )
         raise ValueError(f"{name}: {words}") from None
     unknown = list(_unknown(data, msgspec.to_builtins(settings, enc_hook=str)))
     if unknown:
         raise ValueError(f"{name} has no setting {', '.join(unknown)}")
-    check(settings)
+    if lines := problems(settings):
+        raise ValueError(f"{name}: {'; '.join(lines)}")
     return settings
 
 

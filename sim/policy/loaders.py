@@ -4,25 +4,29 @@ import functools
 import inspect
 import multiprocessing
 import os
+import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 import warp as wp
+import yaml
 
 from sim.files.atomic import check_zip, read_json
 from sim.files.records import robot_digest
-from sim.policy.mlp import MlpPolicy
-from sim.policy.runner import action_problem
-from sim.policy.spec import ControllerSpec, find_named, in_one_line
+from sim.policy.described import Described, read_controller
+from sim.policy.mlp import ACTIVATIONS, MlpPolicy, RnnPolicy
+from sim.policy.runner import Recurrent, action_problem, forget_all, with_rows_of_zeros
+from sim.policy.spec import ControllerSpec, agent_file, find_named, in_one_line, weights_file
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 
 _FORMATS = (
-    "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), module:callable or "
+    "a description (.toml), an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), "
+    "module:callable or "
     "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
     "is called with (robot, device)), or module:adapter@file (a function that is called with (controller, robot))"
 )
@@ -78,9 +82,9 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     file made to harm can crash. A warning says if the training record beside a file names another robot.
 
     Args:
-        spec: An rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or ``module:adapter@file``;
-            a Python file may stand for the module. An adapter is called with the file's controller, of whatever sizes,
-            and the robot, and returns a policy.
+        spec: A description, an rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or
+            ``module:adapter@file``; a Python file may stand for the module. An adapter is called with the file's
+            controller, of whatever sizes, and the robot, and returns a policy.
         robot: The robot it is to walk: fixes observation and action size.
         device: Warp device name.
     """
@@ -155,15 +159,46 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
             f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
             f"`{robot.train_command}`, or name another with --policy"
         )
+    if path.suffix == ".toml" and path.is_file():
+        return _load_described(path, robot, device)
+    return load_network(
+        path, device, (robot.observation_size, robot.num_joints) if fits else None, of=f"robot '{robot.name}'"
+    )
+
+
+def _load_described(path: Path, robot: RobotCfg, device: str) -> Described:
+    cfg = read_controller(path)
+    policy = Described(cfg, robot, str(path))
+    sizes, weights = (policy.observation_size, policy.num_actions), weights_file(path)
+    assert weights is not None
+    of = f"{path} ({policy.columns})"
+    network = load_network(weights, device, sizes, of=of, activation=cfg.activation)
+    _try_rows(network, sizes, device, str(weights), of, reason_of)
+    policy.use(network, torch.device(device))
+    return policy
+
+
+def load_network(
+    path: Path, device: str, sizes: tuple[int, int] | None, *, of: str, activation: str | None = None
+) -> Policy:
+    """The network of a file, which has a ``reset(rows)`` if it remembers.
+
+    Args:
+        path: An rsl_rl checkpoint, a TorchScript module or an ONNX file.
+        device: Torch device name.
+        sizes: Columns that it must take and actions that it must return; None takes what the file has, a TorchScript
+            module as it is.
+        of: Whose sizes they are, for errors.
+        activation: Between the layers of a checkpoint; None takes what its file or its training says.
+    """
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
     if path.suffix == ".py":
         raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
-    expected = (robot.observation_size, robot.num_joints)
     if path.suffix.lower() == ".onnx":
         from sim.policy.onnx import load_onnx  # onnxruntime takes long to load, and few controllers need it
 
-        return load_onnx(path, expected if fits else None, device)
+        return load_onnx(path, sizes, device)
     try:
         check_zip(path)
     except ValueError as error:
@@ -173,47 +208,183 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
             warnings.simplefilter("ignore")  # torch warns of TorchScript files
             content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        return _load_script(path, device, error)
-    state = content.get("actor_state_dict") if isinstance(content, dict) else None
-    if not isinstance(state, dict) or "mlp.0.weight" not in state:
-        got = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(
-            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', got {got}"
-        )
+        return _load_script(path, device, sizes, error)
+    state = _actor_state(content, path)
+    kind = RnnPolicy if any(key.startswith("rnn.") for key in state) else MlpPolicy
+    activation = activation or _activation_of(content, path)
     try:
-        policy = MlpPolicy(state)
-    except (KeyError, RuntimeError, AttributeError, TypeError, IndexError) as error:
+        policy = kind(state, activation)
+        got = policy.sizes
+    except (KeyError, RuntimeError, AttributeError, TypeError, IndexError, ValueError, ZeroDivisionError) as error:
         raise ValueError(f"policy '{path}' holds a damaged layer: {error}; save the checkpoint anew") from error
-    if fits and policy.sizes != expected:
+    if sizes is not None and got != sizes:
         raise ValueError(
-            f"policy '{path}' maps {policy.sizes[0]} observations to {policy.sizes[1]} actions, but robot "
-            f"'{robot.name}' has {expected[0]} observations and {expected[1]} joints: use a controller of this robot, "
-            "or an adapter"
+            f"policy '{path}' maps {got[0]} observations to {got[1]} actions, but {of} has {sizes[0]} observations "
+            f"and {sizes[1]} joints: give one that fits, or describe it (docs/controllers.md)"
         )
     return policy.to(device).eval()
 
 
-def _load_script(path: Path, device: str, reason: Exception) -> Policy:
+_NORMALISER = r"obs_normalizer\.(_mean|_var|_std|count)"
+_KNOWN = {
+    "actor_state_dict": rf"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|{_NORMALISER}|distribution\.(log_)?std_param",
+    "model_state_dict": rf"actor\.\d+\.(weight|bias)|memory_[ac]\.rnn\.\w+|actor_{_NORMALISER}|(log_)?std|critic.*",
+}
+"""What rsl_rl 5, and rsl_rl 1 to 4, keep of an actor and beside it."""
+_TODAYS = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
+
+
+def _actor_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
+    """The actor's tensors by rsl_rl 5's names."""
+    form = next((name for name in _KNOWN if isinstance(content, dict) and name in content), None)
+    state = content[form] if form else None
+    first = "mlp.0.weight" if form == "actor_state_dict" else "actor.0.weight"
+    if not isinstance(state, dict) or first not in state:
+        got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(
+            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', or "
+            f"'model_state_dict' with 'actor.0.weight', got {got}"
+        )
+    unknown = [str(key) for key in state if not re.fullmatch(_KNOWN[str(form)], str(key))]
+    if unknown:
+        raise ValueError(
+            f"policy '{path}' has more than a perceptron or a recurrent network: {', '.join(unknown)} in '{form}' are "
+            "not understood; export it as TorchScript or ONNX"
+        )
+    if form == "model_state_dict":
+        state = {new + key.removeprefix(old): value for old, new in _TODAYS.items() for key, value in state.items()
+                 if key.startswith(old)}  # fmt: skip
+        state |= {f"obs_normalizer.{key}": value for key, value in content.get("obs_norm_state_dict", {}).items()}
+    return state
+
+
+def _activation_of(content: dict[str, Any], path: Path) -> str:
+    """What is between a checkpoint's layers, by its file or by the agent.yaml of its training."""
+    own = str(content.get("format", "")).startswith("faultline") or (
+        "iter" in content and content.keys() <= {"actor_state_dict", "iter", "trained_on"}
+    )
+    said, agent = content.get("activation", "elu" if own else None), agent_file(path)
+    if said is None and agent is not None:
+        try:
+            settings = yaml.load(agent.read_text(encoding="utf-8"), _PlainYaml)
+            parts = [settings.get(name) or {} for name in ("actor", "policy")]
+            said = next((part["activation"] for part in parts if "activation" in part), None)
+        except (OSError, ValueError, AttributeError, TypeError, yaml.YAMLError) as error:
+            raise ValueError(f"{agent} cannot be read: {reason_of(error)}; put a copy of it back") from error
+    if said is None:
+        raise ValueError(
+            f"policy '{path}' does not say what is between its layers: put the agent.yaml of its training "
+            'beside it, or describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
+        )
+    if said not in ACTIVATIONS:
+        raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {said}")
+    return said
+
+
+class _PlainYaml(yaml.SafeLoader):
+    """Data alone; what Python would make of a tag is left out."""
+
+
+_PlainYaml.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
+
+
+class _Script(torch.nn.Module):
+    """A TorchScript module without memory, whatever ``reset()`` its exporter gave it."""
+
+    def __init__(self, module: Any) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        return self.module(with_rows_of_zeros(rows))[: len(rows)]
+
+
+class _RecurrentScript(Recurrent):
+    """A TorchScript module that remembers one robot in its buffers, with a row of them for each robot."""
+
+    def __init__(self, module: Any, initial: Mapping[str, torch.Tensor], axis: int) -> None:
+        super().__init__([*initial.values()], axis)
+        self.module = module
+        self._places = [name.split(".") for name in initial]
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        owners = [functools.reduce(getattr, place[:-1], self.module) for place in self._places]
+        for owner, place, value in zip(owners, self._places, state, strict=True):
+            setattr(owner, place[-1], value)
+        action = self.module(rows)
+        return action, [getattr(owner, place[-1]) for owner, place in zip(owners, self._places, strict=True)]
+
+
+def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
     try:
-        return torch.jit.load(str(path), map_location=device).eval()
+        module = torch.jit.load(str(path), map_location=device).eval()
     except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
             f"or holding code): {reason_of(reason)}; expected {_FORMATS}"
         ) from error
+    return module if sizes is None else _script_policy(module, path, device, sizes[0])
+
+
+@torch.inference_mode()
+def _script_policy(module: Any, path: Path, device: str, width: int) -> Policy:
+    """A TorchScript module with a ``reset(rows)`` if it remembers, and none if it does not.
+
+    What it remembers are the buffers that a call changes. They are made for one robot: as many rows of them must act
+    as one robot after the other does.
+    """
+    rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0)).to(device)  # steps, robots
+    begin = next((getattr(module, name) for name in ("reset", "reset_memory") if hasattr(module, name)), None)
+    if begin is not None:
+        begin()
+    before = {name: value.clone() for name, value in module.named_buffers()}
+    try:
+        once, again = (module(rows[0, :1]) for _ in range(2))
+    except RuntimeError:  # of another width: it is tried afterwards
+        return _Script(module)
+    initial = {name: before[name] for name, value in module.named_buffers() if not torch.equal(before[name], value)}
+    if not initial:
+        return module if begin is not None and not torch.equal(once, again) else _Script(module)
+
+    apart = []
+    for robot in range(rows.shape[1]):
+        for name, value in module.named_buffers():
+            value.copy_(before[name])
+        apart.append(torch.cat([module(step[robot : robot + 1]) for step in rows]))
+    for axis in (1, 0):
+        if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
+            free = _RecurrentScript(module, initial, axis).to(device)
+            try:
+                together = torch.stack([free(step) for step in rows], dim=1)
+            except RuntimeError:
+                continue
+            if torch.allclose(together, torch.stack(apart), rtol=1e-4, atol=1e-4):
+                return free
+    raise ValueError(
+        f"policy '{path}' remembers one robot alone, in {', '.join(initial)}, and rows of it do not act as one "
+        "robot does: give the checkpoint that it was exported from"
+    )
 
 
 def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None:
-    shape = (4, robot.observation_size)
+    reason = in_one_line if ControllerSpec.parse(spec).runs_code else reason_of
+    _try_rows(policy, (robot.observation_size, robot.num_joints), device, spec, f"robot '{robot.name}'", reason)
+
+
+def _try_rows(
+    policy: Any, sizes: tuple[int, int], device: str, spec: str, of: str, reason: Callable[[BaseException], str]
+) -> None:
+    """Asks a controller for actions of four robots that begin, of these observation and action sizes."""
+    shape = (4, sizes[0])
     try:
         with torch.inference_mode():
+            forget_all(policy, 4, device)
             action = policy(torch.zeros(shape, device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
-        reason = in_one_line(error) if ControllerSpec.parse(spec).runs_code else reason_of(error)
-        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of '{robot.name}': {reason}") from error
-    problem = action_problem(action, (4, robot.num_joints))
+        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {of}: {reason(error)}") from error
+    problem = action_problem(action, (4, sizes[1]))
     if problem is not None:
-        raise ValueError(f"policy '{spec}' must return {robot.num_joints} joints' actions for 4 robots, {problem}")
+        raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
 

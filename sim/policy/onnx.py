@@ -1,7 +1,7 @@
 """Controllers in ONNX files: data alone, from one file, run by onnxruntime; and checkpoints written as such files."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,74 +13,153 @@ from onnx import TensorProto, helper, numpy_helper
 
 from sim.files.atomic import prepare_output, write_atomically
 from sim.policy.mlp import MlpPolicy
+from sim.policy.runner import Recurrent
 
 _OPSET, _IR_VERSION = 17, 8  # of 2022: what runs on robots is rarely new
+_OPERATORS = {"elu": "Elu", "selu": "Selu", "relu": "Relu", "lrelu": "LeakyRelu", "tanh": "Tanh", "sigmoid": "Sigmoid",
+              "softplus": "Softplus", "identity": "Identity"}  # fmt: skip
+_ATTRIBUTES = {"elu": {"alpha": 1.0}, "lrelu": {"alpha": 0.01}}
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 
 
-class OnnxPolicy:
-    """A controller that onnxruntime runs: where the observations are if it can, else on the CPU, with copies."""
+class _Session:
+    """A graph run by onnxruntime: where the tensors are if it can, else on the CPU, with copies."""
 
-    def __init__(self, session: Any, sizes: tuple[int, int], device: torch.device) -> None:
-        """Of a session with one float32 input and one output, of these observation and action sizes, on its device."""
-        self.sizes = sizes
-        self.device = device
-        self._session = session
-        self._input, self._output = session.get_inputs()[0].name, session.get_outputs()[0].name
+    def __init__(self, data: bytes, device: torch.device) -> None:
+        self.session = _open_session(data, device)
+        self.device = (
+            device if device.type == "cpu" or self.session.get_providers()[0] == _CUDA else torch.device("cpu")
+        )
+
+    def run(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
+        """Outputs of these shapes of the graph's inputs, in its order, on their device."""
+        place = inputs[0].device
+        values = [value.detach().to(self.device, torch.float32).contiguous() for value in inputs]
+        outputs = [torch.empty(tuple(shape), device=self.device) for shape in shapes]
+        binding = self.session.io_binding()
+        for bind, ports, tensors in (
+            (binding.bind_input, self.session.get_inputs(), values),
+            (binding.bind_output, self.session.get_outputs(), outputs),
+        ):
+            for port, tensor in zip(ports, tensors, strict=True):
+                where = self.device.type, self.device.index or 0
+                bind(port.name, *where, np.float32, tuple(tensor.shape), tensor.data_ptr())
+        if self.device.type == "cuda":  # it has a stream of its own: ours must be done before, and it waits at its end
+            torch.cuda.current_stream(self.device).synchronize()
+        self.session.run_with_iobinding(binding)
+        return [output.to(place) for output in outputs]
+
+    def run_apart(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
+        """:meth:`run` with one robot at a time, of a graph that takes no more; states have robots along axis 1."""
+        axes = [1 if value.ndim == 3 else 0 for value in inputs]
+        outputs = [
+            self.run([value.narrow(axis, k, 1) for axis, value in zip(axes, inputs, strict=True)],
+                     [_resized(shape, 1) for shape in shapes])
+            for k in range(len(inputs[0]))
+        ]  # fmt: skip
+        return [torch.cat(parts, dim=1 if parts[0].ndim == 3 else 0) for parts in zip(*outputs, strict=True)]
+
+
+def _resized(shape: Sequence[int], count: int) -> list[int]:
+    """The shape of so many robots' rows, or states, which have layers first."""
+    return [shape[0], count, shape[2]] if len(shape) == 3 else [count, shape[1]]
+
+
+class OnnxPolicy:
+    """A controller that onnxruntime runs."""
+
+    def __init__(self, run: Callable[..., list[torch.Tensor]], sizes: tuple[int, int], device: torch.device) -> None:
+        """Of a graph of one float32 input and one output, of these observation and action sizes, on its device."""
+        self.sizes, self.device, self._run = sizes, device, run
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size)."""
-        rows = observation.detach().to(self.device, torch.float32).contiguous()
-        action = torch.empty((len(rows), self.sizes[1]), device=self.device)
-        binding = self._session.io_binding()
-        for bind, name, tensor in (
-            (binding.bind_input, self._input, rows),
-            (binding.bind_output, self._output, action),
-        ):
-            bind(name, self.device.type, self.device.index or 0, np.float32, tuple(tensor.shape), tensor.data_ptr())
-        if self.device.type == "cuda":  # it has a stream of its own: ours must be done before, and it waits at its end
-            torch.cuda.current_stream(self.device).synchronize()
-        self._session.run_with_iobinding(binding)
-        return action.to(observation.device)
+        return self._run([observation], [(len(observation), self.sizes[1])])[0]
 
 
-def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> OnnxPolicy:
+class _OnnxRecurrent(Recurrent):
+    """One that remembers: states ``h_in``, ``c_in`` of shape (layers, num_envs, size) go in and come out."""
+
+    graph_safe = False
+
+    def __init__(
+        self, run: Callable[..., list[torch.Tensor]], sizes: tuple[int, int], states: Sequence[Sequence[int]]
+    ) -> None:
+        super().__init__([torch.zeros(_resized(shape, 1)) for shape in states], 1)
+        self.sizes, self._run = sizes, run
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        action, *after = self._run([rows, *state], [(len(rows), self.sizes[1]), *(value.shape for value in state)])
+        return action, after
+
+
+def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxPolicy | _OnnxRecurrent":
     """Load a controller from an ONNX file.
 
     Nothing but that file is read and no code in it runs: weights beside it are refused, and onnxruntime knows only its
-    own operators. It is read by onnxruntime's C++, which a file made to harm can crash.
+    own operators. It is read by onnxruntime's C++, which a file made to harm can crash. A graph made for one robot is
+    changed into one for any number, if random rows of it come out as one after the other does; else it runs once a
+    robot.
 
     Args:
         path: The file; its graph takes observations (batch, observation_size) and gives actions (batch, num_joints),
-            both float32, for any batch.
+            both float32; one that remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
         sizes: Observation and action size of the robot; None takes whatever the file has.
         device: Torch device name; on CUDA the graph runs on the GPU if onnxruntime is built for it, else on the CPU.
     """
     where = torch.device(device)
     try:
         data = path.read_bytes()
-        _check_all_inside(data)
-        session = _open_session(data, where)
-        sizes = _checked_sizes(session, sizes)
+        model = _check_all_inside(data)
+        session = _Session(data, where)
+        sizes, states, one = _checked_sizes(session.session, sizes)
+        run = session.run
+        if one:
+            run = _set_free(model, session, sizes, states, where)
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
-    if where.type == "cuda" and session.get_providers()[0] != _CUDA:
+    if where != session.device:
         warnings.warn(
             f"policy '{path}' runs on the CPU, with copies to and from {device} every control step: this onnxruntime "
             "has no CUDA that works; install onnxruntime-gpu, or give the rsl_rl checkpoint",
             stacklevel=2,
         )
-        where = torch.device("cpu")
-    return OnnxPolicy(session, sizes, where)
+    if run == session.run_apart:
+        warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
+    return _OnnxRecurrent(run, sizes, states).to(where) if states else OnnxPolicy(run, sizes, session.device)
 
 
-def _check_all_inside(data: bytes) -> None:
+def _set_free(
+    model: Any, session: _Session, sizes: tuple[int, int], states: Sequence[Sequence[int]], device: torch.device
+) -> Callable[..., list[torch.Tensor]]:
+    """Runs the same graph for any batch, or one robot after the other where its operators know of one alone."""
+    constants = {tensor.name for tensor in model.graph.initializer}
+    for port in (*model.graph.input, *model.graph.output):
+        dims = port.type.tensor_type.shape.dim
+        if port.name not in constants:
+            dims[1 if len(dims) == 3 else 0].dim_param = "batch"
+    del model.graph.value_info[:]
+    generator = torch.Generator().manual_seed(0)
+    inputs = [torch.randn(_resized(shape, 5), generator=generator) for shape in ((1, sizes[0]), *states)]
+    shapes = [_resized(shape, 5) for shape in ((1, sizes[1]), *states)]
+    try:
+        free = _Session(model.SerializeToString(), device)
+        together, apart = free.run(inputs, shapes), session.run_apart(inputs, shapes)
+        same = all(torch.allclose(a, b, rtol=1e-4, atol=1e-4) for a, b in zip(together, apart, strict=True))
+    except Exception:  # onnxruntime's errors have no base
+        same = False
+    return free.run if same else session.run_apart
+
+
+def _check_all_inside(data: bytes) -> Any:
+    """The model, all of whose weights must be in the file."""
     model = onnx.ModelProto.FromString(data)
     if not model.graph.node:
         raise ValueError("it has no graph")
     outside = [tensor.name for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
     if outside:
         raise ValueError(f"it keeps {len(outside)} of its tensors in another file ('{outside[0]}' first)")
+    return model
 
 
 def _tensors(message: Any) -> Iterator[Any]:
@@ -108,24 +187,40 @@ def _open_session(data: bytes, device: torch.device) -> Any:
     return onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
 
 
-def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[int, int]:
-    """Widths of input and output; refuses a graph that is not one batch of float32 rows of these sizes to another."""
+def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
+    """Widths of observation and action, shapes of the states, and whether it takes one robot alone.
+
+    Refuses a graph that is not one batch of float32 rows of these sizes to another.
+    """
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    kept = [port.name.removesuffix("_in") for port in inputs[1:]]
+    if any(not port.name.endswith("_in") for port in inputs[1:]) or [p.name for p in outputs[1:]] != [
+        f"{name}_out" for name in kept
+    ]:
+        raise ValueError(
+            "it must have one input and one output, and if it remembers the states X_in and X_out after them, got "
+            f"{', '.join(port.name for port in inputs)} and {', '.join(port.name for port in outputs)}"
+        )
     widths: list[Any] = []
-    for kind, ports in (("input", session.get_inputs()), ("output", session.get_outputs())):
-        if len(ports) != 1:
-            raise ValueError(f"it must have one {kind}, got {len(ports)} (one that remembers: use module:callable)")
-        shape = list(ports[0].shape or [None, None])  # an output's may be unknown: it is tried afterwards
-        if ports[0].type != "tensor(float)" or len(shape) != 2:
-            raise ValueError(f"its {kind} must be float32 of shape (batch, size), got {ports[0].type} of shape {shape}")
-        if isinstance(shape[0], int):
-            raise ValueError(f"its {kind} must have a free batch size, got shape {shape}: make its first axis dynamic")
+    batches = []
+    for kind, port in (("input", inputs[0]), ("output", outputs[0])):
+        shape = list(port.shape or [None, None])  # an output's may be unknown: it is tried afterwards
+        if port.type != "tensor(float)" or len(shape) != 2:
+            raise ValueError(f"its {kind} must be float32 of shape (batch, size), got {port.type} of shape {shape}")
+        batches.append(shape[0])
         widths.append(shape[1])
+    states = [list(port.shape) for port in inputs[1:]]
+    if any(len(shape) != 3 or not isinstance(shape[0], int) or not isinstance(shape[2], int) for shape in states):
+        raise ValueError(f"its states must have shape (layers, batch, size), got {states}")
+    batches = [size for size in (*batches, *(shape[1] for shape in states)) if isinstance(size, int)]
+    if any(size != 1 for size in batches):
+        raise ValueError(f"its batch must be free, or of one robot, got {batches[0]}: make its first axis dynamic")
     if sizes is None and not all(isinstance(width, int) for width in widths):
         raise ValueError(f"its rows must have known widths, got {widths}")
     expected = sizes or (widths[0], widths[1])
     if any(isinstance(width, int) and width != size for width, size in zip(widths, expected, strict=True)):
         raise ValueError(f"expected {expected[0]} observations and {expected[1]} actions, got {widths}")
-    return expected
+    return expected, states, bool(batches)
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:
@@ -136,6 +231,8 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
     """
     if path.suffix.lower() != ".onnx":
         raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
+    if policy.activation not in _OPERATORS:
+        raise ValueError(f"ONNX of opset {_OPSET} has no {policy.activation}, only {', '.join(_OPERATORS)}")
     prepare_output(path)
     nodes: list[Any] = []
     weights: list[Any] = []
@@ -159,7 +256,7 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
             inputs = [value, weight(f"weight_{k}", layer.weight), weight(f"bias_{k}", layer.bias)]
             value = node("Gemm", inputs, name, transB=1)
         else:
-            value = node("Elu", [value], name, alpha=1.0)
+            value = node(_OPERATORS[policy.activation], [value], name, **_ATTRIBUTES.get(policy.activation, {}))
     ports = [
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])]
         for name, size in zip(("observation", "action"), policy.sizes, strict=True)

@@ -1,7 +1,7 @@
 """A controller in the loop: from the observation buffer to that of the actions, every control step."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -54,18 +54,68 @@ def memory_of(policy: Any) -> Memory:
     return Memory.BY_ROW
 
 
-def forget_all(policy: Any, num_envs: int) -> bool:
+def forget_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
     """Let a policy that remembers forget all its robots; returns whether it is one."""
     memory = memory_of(policy)
     if memory is Memory.BY_ROW:
-        policy.reset(torch.ones(num_envs, dtype=torch.bool))
+        policy.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
     elif memory is Memory.WHOLE:
         policy.reset()
     return memory is not Memory.NONE
 
 
+class Recurrent(torch.nn.Module):
+    """A network that remembers a state of each robot, of any number of robots, at fixed places of the device."""
+
+    graph_safe = True
+    """Whether steps, and a reset, may be captured as a CUDA graph."""
+
+    def __init__(self, initial: Sequence[torch.Tensor], axis: int) -> None:
+        """States at the start of an episode, with one robot along ``axis``."""
+        super().__init__()
+        self._axis, self._count = axis, len(initial)
+        self._states: dict[int, list[torch.Tensor]] = {}  # by the number of robots: a graph keeps their addresses
+        for k, state in enumerate(initial):
+            self.register_buffer(f"initial_{k}", state.detach().clone())
+
+    @property
+    def _initial(self) -> list[torch.Tensor]:
+        return [self.get_buffer(f"initial_{k}") for k in range(self._count)]
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Actions of the rows, shape (num_rows, size), and the state after them; it may change the state in place."""
+        raise NotImplementedError
+
+    def _state_of(self, count: int) -> list[torch.Tensor]:
+        if count not in self._states:
+            rows = count if self._initial[0].is_cuda else max(count, _LEAST_ROWS)
+            self._states[count] = [state.repeat_interleave(rows, dim=self._axis) for state in self._initial]
+        return self._states[count]
+
+    @torch.inference_mode()
+    def reset(self, rows: torch.Tensor) -> None:
+        """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
+        for initial, state in zip(self._initial, self._state_of(len(rows)), strict=True):
+            own = state.narrow(self._axis, 0, len(rows))
+            where = rows.reshape([-1 if axis == self._axis else 1 for axis in range(state.ndim)])
+            own.copy_(torch.where(where, initial, own))
+
+    @torch.inference_mode()
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints)."""
+        state = self._state_of(len(rows))
+        action, after = self.step(with_rows_of_zeros(rows), state)
+        for old, new in zip(state, after, strict=True):
+            old.copy_(new)
+        return action[: len(rows)]
+
+
 class PolicyRunner:
-    """Runs a policy between two Warp buffers: captured as a CUDA graph where it is a torch module without memory."""
+    """Runs a policy between two Warp buffers.
+
+    A torch module without memory is captured as a CUDA graph, and so is what says that it is ``graph_safe``: of fixed
+    shapes, with a ``reset(rows)`` that writes in place.
+    """
 
     def __init__(
         self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
@@ -85,8 +135,8 @@ class PolicyRunner:
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
-        if self._observation.is_cuda and self._plain:  # a graph would repeat its first memory for ever
-            self._graph = self._capture()
+        if self._observation.is_cuda and (self._plain or getattr(policy, "graph_safe", False)):
+            self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
 
     def reset(self) -> None:
         """Let a policy forget that can only forget all robots."""

@@ -6,6 +6,7 @@ import importlib.util
 import re
 import sys
 import sysconfig
+import tomllib
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -56,9 +57,9 @@ class ControllerSpec:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The Python file and the controller's file, as far as there are such."""
-        code = self.place if self.place is not None and self.place.endswith(".py") else None
-        return tuple(Path(file) for file in (code, self.file) if file is not None)
+        """The Python file, the controller's file and what that needs beside itself, as far as there are such."""
+        code = [Path(self.place)] if self.place is not None and self.place.endswith(".py") else []
+        return (*code, *([] if self.file is None else _with_companions(Path(self.file))))
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
@@ -66,6 +67,34 @@ class ControllerSpec:
         if place is not None and place.endswith(".py"):
             place = str(folder / Path(place).name)
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
+
+
+def _with_companions(file: Path) -> list[Path]:
+    """A controller's file, the weights that a description names, and the settings of the training that made them."""
+    if file.suffix == ".toml":
+        weights = weights_file(file)
+        return [file] if weights is None else [file, *_with_companions(weights)]
+    agent = agent_file(file)
+    return [file] if agent is None else [file, agent]
+
+
+def weights_file(path: Path) -> Path | None:
+    """File of the weights that a description names, if it can be read.
+
+    Of a description that was sent elsewhere they lie beside it, wherever they lay before.
+    """
+    try:
+        policy = tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
+        named, beside = path.parent / policy, path.parent / Path(policy).name
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return beside if not named.is_file() and beside.is_file() else named
+
+
+def agent_file(weights: Path) -> Path | None:
+    """The settings of the training that an rsl_rl checkpoint, .pt, lies beside, if they are there."""
+    places = (weights.parent / "agent.yaml", weights.parent / "params" / "agent.yaml")
+    return next((place for place in places if weights.suffix == ".pt" and place.is_file()), None)
 
 
 def spec_of(policy: str, robot: RobotCfg) -> str:
@@ -79,7 +108,7 @@ def name_of(policy: str | Path, robot: RobotCfg) -> str:
 
 
 def controller_hash(policy: str | Path) -> str | None:
-    """SHA-256 of a controller: of its file, or of the code's file, the controller's and the callable's name.
+    """SHA-256 of a controller: of its file, or of all its files and the callable's name.
 
     None if a file is missing, or a module has none. What code reads beside its own file is not in it.
     """
@@ -90,7 +119,7 @@ def controller_hash(policy: str | Path) -> str | None:
     if not all(file.is_file() for file in files):
         return None
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    if spec.place is None:
+    if spec.place is None and len(hashes) == 1:
         return hashes[0]
     return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
 
@@ -113,7 +142,9 @@ _NOT_THE_USERS = (
 
 def in_one_line(error: BaseException) -> str:
     """Kind of an error, the first line of what it says, and the innermost line of the user's own code."""
-    text = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+    lines = str(error).strip().splitlines()
+    first = -1 if lines and lines[0].startswith("The following operation failed") else 0  # TorchScript's trace
+    text = ": ".join([type(error).__name__, *lines[first:][:1]])
     frames = [
         frame
         for frame in traceback.extract_tb(error.__traceback__)
@@ -209,7 +240,7 @@ def certifier_hash(name: str, policy: str) -> str:
 
 def label_suffix(policy: str) -> str:
     """The ending of the names of files about a controller that is not the usual one, for example ``-C-G``."""
-    label = ControllerSpec.parse(policy).label.removesuffix(".pt").removesuffix(".onnx")
+    label = re.sub(r"\.(pt|onnx|toml)$", "", ControllerSpec.parse(policy).label)
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 
 

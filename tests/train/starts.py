@@ -25,7 +25,8 @@ def write_actor(path, *, hidden=(16, 8), critic=False, critic_hidden=None, **ext
             state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
         return state
 
-    content = {"actor_state_dict": {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}}
+    actor = {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}
+    content = {"actor_state_dict": actor, "activation": "elu"}
     if critic:
         content["critic_state_dict"] = layers(235, *(critic_hidden or hidden), 1)
     torch.save(content, path)

@@ -158,7 +158,7 @@ def test_what_no_critic_and_no_half_precision_can_hold(places):
 def test_a_normaliser_becomes_part_of_the_first_layer(places):
     normaliser = {"obs_normalizer._mean": torch.randn(1, 235), "obs_normalizer._std": torch.rand(1, 235) + 0.5}
     path = write_actor(places / "normalised.pt", **normaliser)
-    torch.save({"actor_state_dict": read_start(path, ROBOT).actor}, places / "folded.pt")
+    torch.save({"activation": "elu", "actor_state_dict": read_start(path, ROBOT).actor}, places / "folded.pt")
     rows = torch.randn(5, 235)
     expected = load_policy(path, ROBOT, "cpu")(rows)
     torch.testing.assert_close(load_policy(places / "folded.pt", ROBOT, "cpu")(rows), expected, atol=1e-5, rtol=1e-5)

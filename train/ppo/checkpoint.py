@@ -68,6 +68,11 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
             f"{path}; train one with `{robot.train_command}`, and leave --policy out"
         )
     content = read_weights(path)
+    if policy.activation != "elu" or "actor_state_dict" not in content:
+        raise ValueError(
+            f"a fine-tuning starts from an rsl_rl 5 checkpoint (actor_state_dict) with ELU between its layers, got "
+            f"{policy.activation} and {', '.join(content)}: {path}; give another controller"
+        )
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
     if policy.normalised:
         weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)

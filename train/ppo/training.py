@@ -248,7 +248,7 @@ def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> No
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
     actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.mean_actor_state().items()}
-    torch.save({"actor_state_dict": actor, "iter": learner.iteration, **marks}, buffer)
+    torch.save({"actor_state_dict": actor, "activation": "elu", "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))
 
