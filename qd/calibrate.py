@@ -104,7 +104,8 @@ def calibrate(
                 break
             print(f"{count} of {result.invalid.size} episodes did not reach the goal.", flush=True)
     origin = {**origin_of(compute.device, seed, compute.workers), **identity(robot, policy), "space": space.name}
-    report = {**origin, "crossing": asdict(CrossingCfg()), **measured(result)}
+    crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
+    report = {**origin, "crossing": crossing, **measured(result)}
     _print_scales(report)
     write_atomically(out, to_json(report))
     print(f"Written to {out}.")

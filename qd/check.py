@@ -17,6 +17,7 @@ from qd.workers.invalid import invalid_reasons, reason_words
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.mujoco_c.crossing import cross_terrains
+from sim.robots.own import describe_inferred
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, describe_standing, stand
 from sim.rollout import RolloutResult
@@ -48,7 +49,7 @@ def check(
     Returns:
         Whether it stands as it should and walks alike in both simulators.
     """
-    print(describe_model(robot), flush=True)
+    print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
     robot, standing = _with_room(robot, compute.device, seconds, seed)
     text, fine = describe_standing(robot, standing)
     print(text, flush=True)
@@ -110,7 +111,7 @@ def _walk(crossings: Crossings, policy: str, seed: int) -> bool:
         robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
     )
     (speed, words), (other, other_words) = (_walked(result) for result in (here, there))
-    print(f"On flat ground at {CrossingCfg.speed:g} m/s: {words}. In MuJoCo C: {other_words}.", flush=True)
+    print(f"On flat ground at {robot.speed:g} m/s: {words}. In MuJoCo C: {other_words}.", flush=True)
     walks = here.reached_goal.mean() >= 0.5 and there.reached_goal.mean() >= 0.5
     alike = abs(speed - other) <= _APART * max(speed, other)
     if not walks:

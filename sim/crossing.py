@@ -20,7 +20,10 @@ _RESOLVED_TIME_CONSTANT_S = 0.003
 
 @dataclass(frozen=True, kw_only=True)
 class CrossingCfg:
-    """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field)."""
+    """A crossing: start, goal, command and ends (the paper's task; the rest in the terms of the field).
+
+    Speed and longest duration are the robot's.
+    """
 
     start: tuple[float, float] = (2.0, 4.0)
     start_position_range: float = 0.1
@@ -29,13 +32,10 @@ class CrossingCfg:
     start_velocity_range: float = 0.2
     goal: tuple[float, float] = (14.0, 4.0)
     goal_radius: float = 0.5
-    speed: float = 0.75
-    """Commanded speed toward the goal [m/s]."""
     yaw_gain: float = 0.5
     max_yaw_rate: float = 1.0
     lower: tuple[float, float] = (-2.0, -2.0)
     upper: tuple[float, float] = (18.0, 10.0)
-    max_duration_s: float = 20.0
     penalties_from_s: float = 0.0
     """Penalties are summed from this time on."""
     base_force: float = 1.0
@@ -50,10 +50,11 @@ class CrossingCfg:
 def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Task:
     """The goal, command and ends of a crossing as a kernel argument; without ``to_goal`` the goal ends none."""
     task = Task()
-    for name in ("goal", "speed", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
+    for name in ("goal", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
         setattr(task, name, getattr(cfg, name))
+    task.speed = robot.speed
     task.goal_radius = cfg.goal_radius if to_goal else 0.0  # nobody is nearer than that
-    task.max_steps = round(cfg.max_duration_s / robot.physics_dt)
+    task.max_steps = round(robot.max_duration_s / robot.physics_dt)
     task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
     task.max_speed = robot.max_speed
     task.max_gravity_z = 2.0  # above that of any robot: tilt ends no crossing

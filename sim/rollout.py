@@ -193,7 +193,7 @@ class Rollout:
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes
         self._num_unreleased = 0  # episodes that were put in and no robot may take yet
-        self._steps_an_episode = round(self.cfg.max_duration_s / self.robot.control_dt)  # at most
+        self._steps_an_episode = round(self.robot.max_duration_s / self.robot.control_dt)  # at most
         self._step = 0  # control steps made so far
         self._began_at = 0  # the step at which all robots last began together
         self._taken_at, self._taken_s = 0, time.perf_counter()  # step and time of the last result

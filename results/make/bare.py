@@ -38,7 +38,7 @@ def record_segments(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.
     sim, segments = rollout.sim, []
     rollout.clear()
     rollout.put(terrains, seeds)
-    for step in range(round(rollout.cfg.max_duration_s / rollout.robot.control_dt)):
+    for step in range(round(rollout.robot.max_duration_s / rollout.robot.control_dt)):
         if step % SEGMENT_EVERY == 0:
             segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
         rollout.control_step()

@@ -35,7 +35,7 @@ class RobotFlag:
     """The option that says which robot."""
 
     robot: str | None = None
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); anymal if left out."""
+    """Which robot: anymal, cassie, or the file of another (mine/go2/robot.toml, my_robot.py); anymal if left out."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,10 +3,12 @@
 A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Floats must be finite.
 """
 
+import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import PurePath
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
@@ -114,3 +116,18 @@ def _choices(annotation: Any) -> tuple[Any, ...]:
 def _brief(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def to_toml(value: Any) -> str:
+    """A value as TOML writes it, tables in braces."""
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_key(key)} = {to_toml(part)}' for key, part in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(to_toml, value))}]"
+    if isinstance(value, float):
+        return repr(float(value))
+    return json.dumps(str(value) if isinstance(value, PurePath) else value, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)

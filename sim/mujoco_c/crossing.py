@@ -166,7 +166,7 @@ def cross(
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
     remembers = forget_all(policy, count)  # it must be asked for the same robots every time
-    most = round(cfg.max_duration_s / robot.physics_dt)
+    most = round(robot.max_duration_s / robot.physics_dt)
     for step in range(most):
         running = np.flatnonzero(outcome == Outcome.RUNNING)
         if len(running) == 0:
@@ -174,7 +174,7 @@ def cross(
         if step % robot.decimation == 0:
             qpos, qvel = episodes.qpos[running], episodes.qvel[running]
             command = np.zeros((count, 3))
-            command[running] = goal_commands(qpos, cfg)
+            command[running] = goal_commands(qpos, cfg, robot.speed)
             rows[running] = observations(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )

@@ -54,5 +54,5 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
         joint_pos=joint_pos + _on_device(robot.default_joint_pos, row.device),
         joint_vel=joint_vel / JOINT_VEL_SCALE,
         last_action=last_action,
-        scan=(scan / SCAN_SCALE + SCAN_OFFSET).reshape(-1, len(robot.scan_x), len(robot.scan_y)),
+        scan=(scan / SCAN_SCALE + SCAN_OFFSET).reshape(len(row), len(robot.scan_x), len(robot.scan_y)),
     )

@@ -17,21 +17,21 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     """Settings of a robot that the command line names; :func:`robot_of` is for what a file names.
 
     Args:
-        spec: Name of a shipped robot, or the Python file of another, which is run and must set ``ROBOT``; None is
-            ANYmal; settings are returned as they are.
+        spec: Name of a shipped robot, or the file of another: a robot.toml, or Python, which is run and must set
+            ``ROBOT``; None is ANYmal; settings are returned as they are.
     """
     if isinstance(spec, RobotCfg):
         return spec
     spec = spec or "anymal"
     if spec in ROBOTS:
         return ROBOTS[spec]
-    if spec.endswith(".py"):
+    if spec.endswith((".py", ".toml")):
         from sim.robots.own import load_robot  # Newton takes seconds to load: not for the help of commands
 
         return load_robot(Path(spec))
     raise ValueError(
-        f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or a Python file that sets ROBOT "
-        "(docs/robots.md)"
+        f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or its robot.toml, or a Python "
+        "file that sets ROBOT (docs/robots.md)"
     )
 
 
@@ -52,7 +52,7 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
         raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --{flag}")
     if robot is None and name not in ROBOTS:
         raise ValueError(
-            f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot .../{name}.py), "
+            f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot FILE), "
             "since no code runs that the command line does not name"
         )
     robot = robot or ROBOTS[name]

@@ -3,29 +3,44 @@
 import itertools
 import os
 import re
-from dataclasses import dataclass, replace
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
 import warp as wp
 
 from kernels.penalties import PENALTIES
 from sim.device import host_device
-from sim.files.settings import problems
+from sim.files.settings import from_builtins, problems, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import read_robot_spec
+from sim.robots.compiled import joint_names, read_robot_spec
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
-from sim.robots.probes import make_probes, start_height
+from sim.robots.probes import extents, make_probes, start_height
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 
 
+INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
+            "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
+"""Settings that a robot.toml may leave out though there is no default."""
+PER_JOINT = ("default_joint_pos", "stiffness", "damping", "effort_limit", "armature")
+"""Settings that a robot.toml may give as one number, or as a table of joint names or regular expressions, too."""
+_FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
+
+
 def load_robot(path: Path) -> RobotCfg:
-    """Runs a settings file and checks the robot that it sets against its model."""
-    robot: Any = getattr(run_file(path), "ROBOT", None)
+    """Reads a settings file, or runs one that is Python, and checks the robot that it sets against its model."""
+    if path.suffix == ".toml":
+        robot: Any = _read_toml(path)
+    else:
+        robot = getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
@@ -50,6 +65,131 @@ def load_robot(path: Path) -> RobotCfg:
     if mistakes:
         raise ValueError(f"{path}: {'; '.join(mistakes)}")
     return robot
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Content of a TOML file; an error names it."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} is no TOML: {error}") from None
+
+
+def _read_toml(path: Path) -> RobotCfg:
+    """The robot of a robot.toml; what it leaves out is inferred from its model."""
+    given = read_toml(path)
+    known = [field.name for field in fields(RobotCfg) if field.name != "settings_file"]
+    if unknown := [name for name in given if name not in known]:
+        raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(known)}")
+    if not isinstance(given.get("model_file"), str):
+        raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
+    file = path.resolve()
+    # Nothing that is inferred is compared with the model yet.
+    bare = RobotCfg(
+        name="", model_file=file.parent / given["model_file"], base_geoms=(), foot_geoms=(), limb_geoms=(),
+        joint_names=(), default_joint_pos=(), footprint=(1.0, 1.0), scan_x=(), scan_y=(), contact_force_limit=1.0,
+        penalties=(), collision_bit=False,
+    )  # fmt: skip
+    spec, mistakes = read_robot_spec(bare, known)
+    if mistakes:
+        raise ValueError(f"{path}: {'; '.join(mistakes)}")
+    model = spec.compile()
+    settings = given | {
+        name: per_joint(given[name], joint_names(model), f"{path}: {name}") for name in PER_JOINT if name in given
+    }
+    return from_builtins(RobotCfg, infer(settings, file, model), str(path))
+
+
+def per_joint(value: Any, joints: Sequence[str], what: str) -> list[Any]:
+    """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
+
+    A name counts before an expression; every joint must be matched once, and every entry must match.
+    """
+    if isinstance(value, list):
+        return value
+    if not isinstance(value, dict):
+        return [value] * len(joints)
+    matches = {
+        joint: [joint] if joint in value else [key for key in value if re.fullmatch(key, joint)] for joint in joints
+    }
+    idle = [key for key in value if not any(key in keys for keys in matches.values())]
+    wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in matches.items() if len(keys) != 1]
+    if idle or wrong:
+        text = f"{', '.join(idle)} matches no joint of {', '.join(joints)}" if idle else f"got {', '.join(wrong)}"
+        raise ValueError(f"{what} must match every joint by one entry: {text}")
+    return [value[matches[joint][0]] for joint in joints]
+
+
+def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
+    """Settings of a robot.toml with those that it leaves out, as far as its compiled model says them.
+
+    The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
+    point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
+    the nearest angle that a joint can take. The contact force limit is the weight.
+
+    Args:
+        given: What the file says, one value a joint where a setting is of joints.
+        file: The robot.toml, of whose folder the robot has its name; a controller.toml beside it says its scan.
+        model: The robot as :func:`sim.robots.compiled.read_robot_spec` reads it, compiled.
+    """
+    found: dict[str, Any] = {"name": file.parent.name, "joint_names": list(joint_names(model)), "collision_bit": False}
+    found |= {"default_joint_pos": _default_pose(file.parent / given["model_file"], model)} | given
+    pose = found["default_joint_pos"]
+    if len(pose) != model.njnt - 1 or not all(isinstance(angle, int | float) for angle in pose):
+        raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
+    with wp.ScopedDevice(host_device()):
+        ((bottoms, _),) = extents(builder_of(model), [pose])
+    body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
+    taken = {name for role in ("base_geoms", "foot_geoms", "limb_geoms") for name in given.get(role, ())}
+    free = [name for name in bottoms if name not in taken]
+    low, last = min(bottoms.values()) + _FOOT_RISE, {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
+    found.setdefault("base_geoms", [name for name in free if body[name] == 1])
+    found.setdefault("foot_geoms", [name for name in free if body[name] in last and bottoms[name] <= low])
+    limbs = [name for name in free if name not in {*found["base_geoms"], *found["foot_geoms"]}]
+    found.setdefault("limb_geoms", limbs)
+    found.setdefault("penalties", [name for name in PENALTIES if name != "collision" or found["limb_geoms"]])
+    weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
+    found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
+    found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))
+    return _scan(file.with_name("controller.toml")) | found
+
+
+def _default_pose(model_file: Path, model: Any) -> list[float]:
+    low, high = model.jnt_range[1:].T
+    zero = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, low, high), 0.0)
+    if read_model_files(model_file).is_urdf:
+        return zero.tolist()
+    keys = {key.name: list(key.qpos) for key in mujoco.MjSpec.from_file(str(model_file)).keys}  # type: ignore
+    home = keys.get("home", [])
+    return home[7:] if len(home) == model.nq else zero.tolist()
+
+
+def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
+    """Half length and half width of the rectangle about the base that holds the feet in the default pose [m]."""
+    data: Any = mujoco.MjData(model)  # type: ignore
+    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), pose
+    mujoco.mj_kinematics(model, data)  # type: ignore
+    names = [model.geom(k).name for k in range(model.ngeom)]
+    numbers = [names.index(name) for name in feet if name in names]
+    reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
+    return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
+
+
+def _scan(controller: Path) -> dict[str, Any]:
+    """Points of the height scan: those of the first one in a controller's observation, or none."""
+    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
+    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
+    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"}
+
+
+def describe_inferred(robot: RobotCfg) -> str:
+    """The settings that a robot's robot.toml leaves out, as lines that could stand there; nothing of other robots."""
+    file = robot.settings_file
+    if file is None or file.suffix != ".toml":
+        return ""
+    given = read_toml(file)
+    lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in INFERRED if name not in given]
+    return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
 
 
 def settings_problems(robot: RobotCfg) -> list[str]:

@@ -57,6 +57,10 @@ class RobotCfg:
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
     decimation: PositiveInt = 4
     """Physics steps per control step."""
+    speed: PositiveFloat = 0.75
+    """Commanded speed of a crossing, toward the goal [m/s]."""
+    max_duration_s: PositiveFloat = 20.0
+    """Time after which a crossing ends [s]; the goal is 12 m away."""
     max_speed: PositiveFloat = 100.0
     """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
     nconmax: PositiveInt = 40
@@ -83,7 +87,7 @@ class RobotCfg:
     tuning: TuningCfg = field(default_factory=TuningCfg)
     """How the controller is fine-tuned."""
     settings_file: Path | None = None
-    """The Python file of a user's robot, set by :func:`sim.robots.find.get_robot`; None for a shipped robot."""
+    """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
 
     @property
     def spec(self) -> str:
@@ -124,8 +128,10 @@ class RobotCfg:
 
     @property
     def policy_file(self) -> Path:
-        """The controller that comes with the robot."""
-        return self.home / f"{self.name}.pt"
+        """The controller that comes with the robot: a controller.toml beside its robot.toml, or ``<name>.pt``."""
+        described = self.home / "controller.toml"
+        is_data = self.settings_file is not None and self.settings_file.suffix == ".toml"
+        return described if is_data and described.exists() else self.home / f"{self.name}.pt"
 
     @property
     def scales_file(self) -> Path:

@@ -18,8 +18,9 @@ ROBOT = get_robot("anymal")
 
 def short_rollout(cfg, num_terrains):
     return Rollout(
-        ROBOT, cfg.policy, num_terrains=num_terrains, num_replicas=cfg.num_replicas, num_envs=4, device=cfg.device,
-        cfg=CrossingCfg(start=(12.5, 4.0), max_duration_s=1.6, poll_every_s=0.2),
+        dataclasses.replace(ROBOT, max_duration_s=1.6),
+        cfg.policy, num_terrains=num_terrains, num_replicas=cfg.num_replicas, num_envs=4, device=cfg.device,
+        cfg=CrossingCfg(start=(12.5, 4.0), poll_every_s=0.2),
     )  # fmt: skip
 
 

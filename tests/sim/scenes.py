@@ -1,5 +1,6 @@
 """Ground to stand on and bodies to drop on it, for the physics tests."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -136,5 +137,6 @@ def standing(robot: RobotCfg, num: int = 8, x: float = 8.0, y: float = 4.0, z: f
 
 def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
     """A rollout of 0.6 s, by default of robots that hold their pose; ``cfg`` are settings of the crossing."""
-    cfg = CrossingCfg(**{"max_duration_s": 0.6, "poll_every_s": 0.1} | cfg)
+    robot = dataclasses.replace(robot, max_duration_s=cfg.pop("max_duration_s", 0.6))
+    cfg = CrossingCfg(**{"poll_every_s": 0.1} | cfg)
     return Rollout(robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=cfg)

@@ -1,5 +1,7 @@
 """Friction and softness of patches: nothing without them, and with them what MuJoCo C and formulas say."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,7 +9,6 @@ import pytest
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
-from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps, joined_name, split_name
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.mujoco_c.model import crossing_model
@@ -82,12 +83,12 @@ def patchwork(seed):
 
 
 def test_walking_over_patches_costs_the_same_in_both(anymal):
-    ground, episodes, cfg = patchwork(2), 4, CrossingCfg(max_duration_s=5.0)
-    sizes = {"num_terrains": 1, "num_replicas": episodes, "device": "cpu", "cfg": cfg}
-    rollout, seeds = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True), np.array([5], np.uint32)
+    ground, episodes, robot = patchwork(2), 4, dataclasses.replace(anymal, max_duration_s=5.0)
+    sizes = {"num_terrains": 1, "num_replicas": episodes, "device": "cpu"}
+    rollout, seeds = Rollout(robot, anymal.policy_file, **sizes, with_ground=True), np.array([5], np.uint32)
     ours, on_plain = (rollout.evaluate(FLAT[None], seeds, ground=maps) for maps in (ground, None))
     starts = draw_starts(anymal, FLAT, 5, episodes, "cpu")
-    plain = cross(anymal, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, cfg, ground=ground)
+    plain = cross(robot, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, ground=ground)
     assert (ours.outcome == plain.outcome).all() and (plain.outcome == Outcome.TIME_OUT).all()
     assert ours.final_position[0, :, 0].min() > 4.5  # over two boundaries
     columns = [PENALTIES.index(name) for name in ("yaw_rate", "vel_x", "vel_y")]
@@ -97,10 +98,11 @@ def test_walking_over_patches_costs_the_same_in_both(anymal):
 
 
 def test_ground_that_changes_nothing_gives_the_same_bits(anymal):
-    genes, seeds, cfg = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32), CrossingCfg(max_duration_s=0.4)
-    sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu", "cfg": cfg}
-    without = Rollout(anymal, anymal.policy_file, **sizes).evaluate(genes, seeds)
-    plain = Rollout(anymal, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
+    genes, seeds = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32)
+    sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu"}
+    robot = dataclasses.replace(anymal, max_duration_s=0.4)
+    without = Rollout(robot, anymal.policy_file, **sizes).evaluate(genes, seeds)
+    plain = Rollout(robot, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
     np.testing.assert_array_equal(plain.penalties, without.penalties)
     np.testing.assert_array_equal(plain.final_position, without.final_position)
 

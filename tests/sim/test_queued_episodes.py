@@ -23,8 +23,8 @@ PIT = np.where(np.arange(321) >= 266, np.float32(-3.0), FLAT)  # level up to x =
 BUMPS = heights_of(GENES)
 GRIDS = np.stack([FLAT, spike(12.5), crossing_terrain("boxes", 9, 1), PIT, *BUMPS])
 # Begun 1 m before the edge of the goal, a walk of two seconds has every end there is.
-NEAR = CrossingCfg(start=(12.5, 4.0), max_duration_s=2.4, poll_every_s=0.2)
-SHORT = dataclasses.replace(NEAR, start=(2.0, 4.0), max_duration_s=1.0)
+NEAR = CrossingCfg(start=(12.5, 4.0), poll_every_s=0.2)
+FAR = dataclasses.replace(NEAR, start=(2.0, 4.0))
 
 
 class FearsDepth:
@@ -38,9 +38,10 @@ class FearsDepth:
         return torch.where((deep > 0.0) & (deep < 0.5), torch.nan, self.walker(row))
 
 
-def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=6):
+def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=6, duration_s=2.4):
     return Rollout(
-        robot, policy or FearsDepth(robot, device), num_terrains=num_terrains, num_replicas=REPLICAS, device=device,
+        dataclasses.replace(robot, max_duration_s=duration_s),
+        policy or FearsDepth(robot, device), num_terrains=num_terrains, num_replicas=REPLICAS, device=device,
         num_envs=num_envs, cfg=cfg,
     )  # fmt: skip
 
@@ -139,8 +140,8 @@ def test_a_world_that_broke_and_a_failure_leave_a_rollout_that_works(anymal, alo
 
 def test_an_episode_that_begins_in_contact_forgets_what_its_world_did_before(anymal):
     """Feet begin in the ground, so that the solver's first step has contacts, for which it would start warm."""
-    low, cfg = dataclasses.replace(anymal, default_base_height=0.5), dataclasses.replace(SHORT, max_duration_s=0.1)
-    expected, queued = (rollout_of(low, num, stretch, cfg).evaluate(GRIDS[:2], SEEDS[:2]) for num in (None, 1))
+    low, how = dataclasses.replace(anymal, default_base_height=0.5), {"cfg": FAR, "duration_s": 0.1}
+    expected, queued = (rollout_of(low, num, stretch, **how).evaluate(GRIDS[:2], SEEDS[:2]) for num in (None, 1))
     check_same(expected, queued)
 
 
@@ -174,13 +175,14 @@ class CountsTogether(CountsByRow):
 
 
 def test_a_policy_that_remembers_begins_every_episode_anew(anymal):
-    expected = rollout_of(anymal, None, CountsTogether(), SHORT).evaluate(GRIDS[:5], SEEDS[:5])
-    forgetful = rollout_of(anymal, None, stretch, SHORT).evaluate(GRIDS[:5], SEEDS[:5])
+    short = {"cfg": FAR, "duration_s": 1.0}
+    expected = rollout_of(anymal, None, CountsTogether(), **short).evaluate(GRIDS[:5], SEEDS[:5])
+    forgetful = rollout_of(anymal, None, stretch, **short).evaluate(GRIDS[:5], SEEDS[:5])
     assert not np.array_equal(expected.penalties, forgetful.penalties)
-    check_same(expected, rollout_of(anymal, 7, CountsByRow(), SHORT).evaluate(GRIDS[:5], SEEDS[:5]))
+    check_same(expected, rollout_of(anymal, 7, CountsByRow(), **short).evaluate(GRIDS[:5], SEEDS[:5]))
     # One that cannot forget single robots lets them begin together.
     policy = CountsTogether()
-    rollout = rollout_of(anymal, 7, policy, SHORT)
+    rollout = rollout_of(anymal, 7, policy, **short)
     rollout.put(GRIDS[:3], SEEDS[:3])
     rollout.put(GRIDS[3:5], SEEDS[3:5])
     check_same(expected, rollout.take(), slice(0, 3))
@@ -196,9 +198,9 @@ def test_never_more_robots_than_episodes(anymal):
 
 def test_a_gpus_robots_run_the_same_episodes(anymal, device):
     """With the same starts to the bit; what follows differs by rounding, since a GPU adds in any order."""
-    cfg = dataclasses.replace(NEAR, max_duration_s=0.2, poll_every_s=0.1)
+    cfg = dataclasses.replace(NEAR, poll_every_s=0.1)
     queued, cpu = (
-        rollout_of(anymal, num_envs, cfg=cfg, device=where).evaluate(GRIDS[[0, 2, 4]], SEEDS[:3])
+        rollout_of(anymal, num_envs, cfg=cfg, device=where, duration_s=0.2).evaluate(GRIDS[[0, 2, 4]], SEEDS[:3])
         for num_envs, where in ((5, device), (None, "cpu"))
     )
     np.testing.assert_array_equal(queued.outcome, cpu.outcome)

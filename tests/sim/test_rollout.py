@@ -1,5 +1,7 @@
 """The crossing: its settings as the kernels take them, how episodes end, and what they cost."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -154,8 +156,8 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
         actions.append(np.array(action.cpu().numpy(), dtype=np.float32))
         return action
 
-    cfg = CrossingCfg(max_duration_s=0.4 if robot.name == "anymal" else 0.7)  # Cassie's pelvis has farther to fall
-    recorder = Rollout(robot, record, num_terrains=2, num_replicas=2, device=device, cfg=cfg)
+    robot = dataclasses.replace(robot, max_duration_s=0.4 if robot.name == "anymal" else 0.7)  # a pelvis falls farther
+    recorder = Rollout(robot, record, num_terrains=2, num_replicas=2, device=device)
     sim = recorder.sim
     result = recorder.evaluate(np.stack([FLAT, spike()]), np.array([3, 4]))
     put(sim, *starts[0])

@@ -91,7 +91,7 @@ def walk(robot, policy, plain, seconds):
     action = np.zeros((EPISODES, robot.num_joints))
     default = np.array(robot.default_joint_pos)
     for _ in range(round(seconds / robot.control_dt)):
-        command = goal_commands(plain.qpos, CrossingCfg())
+        command = goal_commands(plain.qpos, CrossingCfg(), robot.speed)
         state = (plain.qpos, plain.qvel, command, action)
         rows = observations(FLAT, *state, default_joint_pos=default, scan=np.stack(robot.scan_points(), axis=1))
         with torch.inference_mode():
@@ -139,7 +139,7 @@ def test_what_ends_a_crossing(robot):
     starts.qpos[2, 2] = 0.05  # its belly in the ground
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
     policy = load_policy(robot.policy_file, robot, "cpu")
-    result = cross(robot, policy, FLAT, starts, CrossingCfg(max_duration_s=0.1))
+    result = cross(dataclasses.replace(robot, max_duration_s=0.1), policy, FLAT, starts)
     assert result.outcome.tolist() == [[Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]]
     assert result.invalidity.tolist() == [[0, 0, 0, Invalidity.STATE]]
     assert result.penalty_names == robot.penalties
@@ -168,10 +168,10 @@ def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
     starts = draw_starts(anymal, FLAT, 5, 3, "cpu")
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
-    policy, cfg = Remembers(), CrossingCfg(max_duration_s=0.1)
-    result = cross(anymal, policy, FLAT, starts, cfg)
+    policy, robot = Remembers(), dataclasses.replace(anymal, max_duration_s=0.1)
+    result = cross(robot, policy, FLAT, starts)
     assert (policy.resets, policy.asked) == (1, [3] * 5)
-    expected = cross(anymal, stand, FLAT, starts, cfg)
+    expected = cross(robot, stand, FLAT, starts)
     np.testing.assert_array_equal(result.outcome, expected.outcome)
     np.testing.assert_array_equal(result.penalties, expected.penalties)
 

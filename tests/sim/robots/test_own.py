@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
 from sim.files.records import robot_digest
+from sim.mujoco_c.crossing import cross, draw_starts
+from sim.policy.adapters import read_row
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.model import build_robot, geom_names
@@ -20,7 +24,7 @@ from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
 from tests.kernels import oracle
 from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
-from tests.sim.scenes import FLAT, put, simulate, standing
+from tests.sim.scenes import FLAT, crossing, put, simulate, standing
 
 
 @pytest.fixture(params=KINDS)
@@ -53,6 +57,73 @@ def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
     replace_once(file, "default_base_height=0.29,", "")
     # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
     assert get_robot(str(file)).default_base_height == pytest.approx(0.2911, abs=3e-3)
+
+
+HOME = " ".join(["0 0 .3 1 0 0 0", *["0.6 -1.2"] * 4])
+
+
+def write_toml(folder, text="", model=None):
+    """Writes dog.xml and a robot.toml that names it; returns the latter."""
+    folder.mkdir()
+    (folder / "dog.xml").write_text(model or mjcf())
+    file = folder / "robot.toml"
+    file.write_text(f'model_file = "dog.xml"\n{text}')
+    return file
+
+
+def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
+    keys = f'<keyframe><key name="home" qpos="{HOME}"/></keyframe></mujoco>'
+    file = write_toml(tmp_path / "dog", model=mjcf().replace("</mujoco>", keys))
+    dog, written = get_robot(str(file)), get_robot(str(write_dog(tmp_path / "py")))
+    for name in ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "collision_bit", "spec"):
+        expected = str(file) if name == "spec" else getattr(written, name)
+        assert getattr(dog, name) == expected, name
+    assert {*dog.limb_geoms} == {*written.limb_geoms}
+    assert dog.penalties == PENALTIES and (dog.scan_x, dog.scan_y) == ((), ())
+    assert dog.contact_force_limit == pytest.approx(MASS * 9.81, rel=5e-3)
+    assert dog.default_base_height == pytest.approx(0.2911, abs=3e-3)
+    (file.parent / "dog.xml").write_text(mjcf())  # without a keyframe: 0, and -.1 where knees end
+    assert get_robot(str(file)).default_joint_pos == (0.0, -0.1) * 4
+
+
+def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path):
+    text = 'stiffness = 50\ndamping = {".*_hip" = 2, ".*_knee" = 3, HR_knee = 4}\nspeed = 0.5\n'
+    file = write_toml(tmp_path / "dog", f"{text}default_joint_pos = {{'.*hip' = 0.6, '.*knee' = -1.2}}")
+    (file.parent / "controller.toml").write_text('observation = [{term = "scan", x = [0.0, 0.2], y = [0]}]')
+    dog = get_robot(str(file))
+    assert (dog.stiffness, dog.damping, dog.default_joint_pos) == ((50,) * 8, (2, 3) * 3 + (2, 4), (0.6, -1.2) * 4)
+    assert (dog.speed, dog.scan_x, dog.scan_y, dog.policy_file.name) == (0.5, (0.0, 0.2), (0.0,), "controller.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("speeed = 1", "speeed"),
+        ("stiffness = {'.*hip' = 50}\ndamping = 2", "FL_knee"),
+        ("stiffness = {'.*' = 50, '.*knee' = 40}\ndamping = 2", "FL_knee"),
+        ("stiffness = {'.*' = 50, '.*ankle' = 40}\ndamping = 2", "ankle"),
+        ("default_joint_pos = [0.1]", "default_joint_pos"),
+        ("speed = 'fast'", "speed"),
+        ("base_geoms = ['tail']", "tail"),
+        ("=", "TOML"),
+    ],
+)
+def test_a_wrong_robot_toml_is_refused(tmp_path, text, named):
+    with pytest.raises(ValueError, match=re.escape(named)) as error:
+        get_robot(str(write_toml(tmp_path / "dog", text)))
+    assert "robot.toml" in str(error.value)
+
+
+def test_a_blind_robot_crosses_in_both_simulators(tmp_path, device):
+    dog = dataclasses.replace(get_robot(str(write_dog(tmp_path))), scan_x=(), scan_y=())
+
+    def hold(row):
+        return read_row(row, dog).last_action
+
+    assert crossing(dog, device, hold).evaluate(FLAT[None], np.array([1])).outcome.tolist() == [[Outcome.TIME_OUT] * 4]
+    short = dataclasses.replace(dog, max_duration_s=0.1)
+    result = cross(short, hold, FLAT, draw_starts(short, FLAT, 1, 2, "cpu"))
+    assert result.outcome.tolist() == [[Outcome.TIME_OUT] * 2]
 
 
 FREE = '<freejoint name="root"/>'
