@@ -63,7 +63,8 @@ class WorkerProcess:
         self._process.join(timeout=5)
         code = self._process.exitcode
         reason = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
-        raise EvaluatorError(f"a worker process died ({reason}): out of memory?") from None
+        why = "out of memory?" if code == -signal.SIGKILL else "a crash in compiled code, of a controller's perhaps"
+        raise EvaluatorError(f"a worker process died ({reason}): {why}") from None
 
     def stop(self) -> None:
         """Ends the process, whatever it does."""

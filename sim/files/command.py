@@ -128,14 +128,28 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
         check(command)
         status = command.execute()
         return status if isinstance(status, int) else 0
-    except (ValueError, OSError, FloatingPointError, UserError) as error:
-        if debugging():
+    except Exception as error:
+        remedy = _cache_remedy(error)
+        if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
             raise
-        say(("error:", "bold red"), f" {' '.join(filter(None, map(str.strip, str(error).splitlines())))}", error=True)
+        text = " ".join(filter(None, map(str.strip, str(error).splitlines())))
+        say(("error:", "bold red"), f" {text}{remedy}", error=True)
         return error.status if isinstance(error, UserError) else 2
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def _cache_remedy(error: Exception) -> str:
+    """What helps where Warp's or numba's cache of compiled code is damaged, or cannot be written; else nothing."""
+    folder = os.environ.get("WARP_CACHE_PATH") or str(Path.home() / ".cache" / "warp")
+    if re.search(r"Failed to load (CPU|CUDA) module", str(error)):
+        return f": the compiled kernels in {folder} are damaged: remove that folder, they are compiled again"
+    if isinstance(error, OSError) and error.filename and str(error.filename).startswith((folder, str(Path.home()))):
+        return f": kernels are compiled into {folder}: let WARP_CACHE_PATH name a folder that can be written"
+    if "no locator available" in str(error):
+        return ": let NUMBA_CACHE_DIR name a folder that can be written"
+    return ""
 
 
 def say(*parts: str | tuple[str, str], error: bool = False) -> None:

@@ -107,6 +107,7 @@ def read_heightmap(
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
         heights = heights * meaning.scale_m + meaning.offset_m
     _check_heights(path, heights)
+    _refuse_turned(path, heights.shape, meaning.size_m)
     return Heightmap(heights=heights, size_m=meaning.size_m, ground=_ground_in(path, arrays, meaning.size_m))
 
 
@@ -163,6 +164,17 @@ def _check_heights(path: Path, heights: NDArray[np.float64]) -> None:
         raise ValueError(
             f"{path}: heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), "
             "and is the ground about 0 (--offset)?"
+        )
+
+
+def _refuse_turned(path: Path, shape: tuple[int, ...], size_m: tuple[float, float]) -> None:
+    """Refuses a map whose nodes would be as far apart along x as along y if x and y were swapped, and now are not."""
+    (rows, columns), (size_x, size_y) = shape, size_m
+    now, turned = size_x / (columns - 1) * (rows - 1) / size_y, size_x / (rows - 1) * (columns - 1) / size_y
+    if abs(np.log(turned)) < 0.01 and abs(np.log(now)) > np.log(2.0):
+        raise ValueError(
+            f"{path}: heights must be (nrow, ncol) with rows along y, got {shape} over {size_x:g} m along x and "
+            f"{size_y:g} m along y: x and y are swapped; transpose them"
         )
 
 

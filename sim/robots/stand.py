@@ -21,6 +21,8 @@ _GRAVITY = 9.81
 _TERRAINS = 4
 _ROOM = 1.5  # highest ground that a dropped robot could touch is looked for this far round it [m]
 _UPRIGHT_DEG = 15.0
+_STRAY = 0.1  # share of the weight that geoms without a role may carry
+_LOW = 0.015  # geoms so near to the lowest one touch the ground [m]
 _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
 _FALL = 0.1  # a start so much above the right one is a mistake [m]
 _REST_S = 0.5  # the end of the time that a robot stands, at which it should rest
@@ -49,6 +51,8 @@ class Standing:
     """Of the base, at the end."""
     joint_error: float
     """Largest distance of a joint from its default angle at the end [rad]."""
+    roleless: tuple[str, ...]
+    """Geoms without a role that are hardly higher than the lowest one in the default pose."""
     carried: dict[str, float]
     """Share of the weight that each touching geom carries, on average over the last half second."""
     bounce: tuple[float, float]
@@ -104,6 +108,11 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         gap=min(bottoms[name] for name in robot.foot_geoms),
         lowest=min(bottoms, key=lambda name: bottoms[name]),
         right_height=start_height(robot, builder),
+        roleless=tuple(
+            name
+            for name, bottom in bottoms.items()
+            if name not in robot.geom_names and bottom < min(bottoms.values()) + _LOW
+        ),
         height=(robot.default_base_height, float(first[2])),
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
         joint_error=float(np.abs(first[7:] - robot.default_joint_pos).max(initial=0.0)),
@@ -241,6 +250,9 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
         )
     if standing.lowest not in robot.foot_geoms:
         mistakes.append(f"in the default pose {standing.lowest} is lower than the feet")
+    stray = 1.0 - sum(standing.carried.values())
+    if standing.finite and standing.height[1] > 0.5 * standing.height[0] and stray > _STRAY:
+        mistakes.append(f"geoms without a role carry {stray:.0%} of its weight: {', '.join(standing.roleless)}?")
     if not standing.finite:
         mistakes.append("states became not finite: gains too high for physics_dt, or too little armature?")
     if standing.stands and standing.restless > _RESTLESS:

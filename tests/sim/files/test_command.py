@@ -20,6 +20,18 @@ ERRORS = {
     "number": (FloatingPointError("not finite"), 2, "error: not finite\n"),
     "stop": (KeyboardInterrupt(), 130, "\nStopped.\n"),
     "resumable": (Interrupted("Stopped; 3 saved"), 130, "\nStopped; 3 saved\n"),
+    "kernels": (
+        Exception("Failed to load CPU module 'x'"),
+        2,
+        "error: Failed to load CPU module 'x': the compiled kernels in "
+        "/cache/warp are damaged: remove that folder, they are compiled again\n",
+    ),
+    "cache": (
+        OSError(13, "Permission denied", "/cache/warp/x"),
+        2,
+        "error: [Errno 13] Permission denied: '/cache/warp/x': kernels "
+        "are compiled into /cache/warp: let WARP_CACHE_PATH name a folder that can be written\n",
+    ),
     "bug": (ZeroDivisionError(), 0, ""),
 }
 
@@ -52,7 +64,8 @@ def run(*argv):
 
 
 @pytest.mark.parametrize("how", [how for how in ERRORS if how != "bug"])
-def test_errors_become_one_line_and_an_exit_status(capsys, how):
+def test_errors_become_one_line_and_an_exit_status(capsys, how, monkeypatch):
+    monkeypatch.setenv("WARP_CACHE_PATH", "/cache/warp")
     _, status, message = ERRORS[how]
     assert run("--how", how) == status
     assert capsys.readouterr().err == message

@@ -95,6 +95,7 @@ NPZ_MISTAKES = {
     "NaN": ({"heights": np.array([[0.0, np.nan], [0.0, np.inf]])}, "2 of 4 heights"),
     "too deep": ({"heights": np.full((5, 9), -10.5)}, "-10.5"),
     "too small": ({"size_m": np.array([16.0, 0.5])}, "size_m"),
+    "x and y swapped": ({"heights": np.zeros((9, 5))}, "swapped"),
     "a size in words": ({"size_m": np.array(["a", "b"])}, "size_m"),
     "friction of a part": ({"friction": np.ones((4, 8)), "size_m": np.array([8.0, 8.0])}, "friction"),
 }

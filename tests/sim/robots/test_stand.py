@@ -34,6 +34,7 @@ def test_a_dog_stands_on_its_feet(tmp_path, device, kind):
         ({"default_base_height": 0.45}, ("0.177 m", "default_base_height 0.29")),  # 0.45 - 0.2726 m
         ({"default_joint_pos": (0.0, -2.6) * 4}, ("default pose",)),
         ({"njmax": 8}, ("njmax",)),
+        ({"foot_geoms": ("FL_foot",)}, ("without a role", "FR_foot, HL_foot, HR_foot")),
         ({"armature": (0.0,) * 8}, ("armature", "contact_time_constant_s")),  # its feet bounce
     ],
 )
