@@ -1,0 +1,196 @@
+"""Weights of other people's training: checkpoints of every rsl_rl, networks that remember, graphs of one robot."""
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from rsl_rl.models import RNNModel
+from tensordict import TensorDict
+
+from sim.policy.loaders import load_policy
+from sim.policy.mlp import MlpPolicy
+from sim.policy.onnx import export_onnx, load_onnx
+from sim.policy.runner import Memory, memory_of
+from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor
+
+ACTOR = rsl_rl_actor(normalised=True).state_dict()
+SIZES = OBSERVATIONS, ACTIONS
+
+
+def rows_of(*shape):
+    return torch.randn((*shape, OBSERVATIONS), generator=torch.Generator().manual_seed(1)) * 2
+
+
+def renamed(**names):
+    return {new + key.removeprefix(old): value for old, new in names.items() for key, value in ACTOR.items()
+            if key.startswith(old)}  # fmt: skip
+
+
+def old_checkpoints():
+    """The same actor as rsl_rl 1 or 2, with a normaliser of its own, and 3 or 4 keep it."""
+    critic = {"critic.0.weight": torch.zeros(16, 9), "critic.0.bias": torch.zeros(16)}
+    layers, normaliser = renamed(mlp="actor"), renamed(obs_normalizer="actor_obs_normalizer")
+    bare = {key.removeprefix("obs_normalizer."): value for key, value in ACTOR.items() if "normalizer" in key}
+    rest = {"optimizer_state_dict": {}, "iter": 3, "infos": None}
+    return {
+        "2": {"model_state_dict": layers | critic | {"std": torch.ones(12)}, "obs_norm_state_dict": bare} | rest,
+        "3": {"model_state_dict": layers | critic | normaliser | {"log_std": torch.ones(12)}} | rest,
+        "5": {"actor_state_dict": ACTOR, "critic_state_dict": {}} | rest,
+    }
+
+
+@pytest.mark.parametrize("version", ["2", "3", "5"])
+@pytest.mark.parametrize("place", ["agent.yaml", "params/agent.yaml"])
+def test_a_checkpoint_of_any_rsl_rl_acts_as_its_training_says(tmp_path, anymal, version, place):
+    path, agent = tmp_path / "model_9.pt", tmp_path / place
+    torch.save(old_checkpoints()[version], path)
+    with pytest.raises(ValueError, match=r"model_9\.pt.*agent\.yaml"):  # it does not say what is between its layers
+        load_policy(path, anymal, "cpu")
+    agent.parent.mkdir(exist_ok=True)
+    tags = "range: !!python/tuple [0, 1]\nact: !!python/name:torch.nn.Tanh\n"
+    agent.write_text(f"{tags}{'actor' if version == '5' else 'policy'}:\n  class_name: X\n  activation: tanh\n")
+    rows = rows_of(4)
+    x = (rows - ACTOR["obs_normalizer._mean"]) / (ACTOR["obs_normalizer._std"] + 1e-2)
+    for k in (0, 2, 4):
+        x = x @ ACTOR[f"mlp.{k}.weight"].T + ACTOR[f"mlp.{k}.bias"]
+        x = torch.tanh(x) if k < 4 else x
+    torch.testing.assert_close(load_policy(path, anymal, "cpu")(rows).detach(), x, rtol=1e-5, atol=1e-5)
+    agent.write_text("policy: {activation: !!python/object/apply:os.system [exit]}")
+    with pytest.raises(ValueError, match="activation"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize("key", ["student.0.weight", "estimator.0.bias", "actor.1.running_mean"])
+def test_what_is_no_part_of_a_known_network_is_refused_by_name(tmp_path, anymal, key):
+    content = old_checkpoints()["2"]
+    content["model_state_dict"][key] = torch.zeros(3)
+    torch.save(content | {"activation": "elu"}, tmp_path / "model.pt")
+    with pytest.raises(ValueError, match=rf"model\.pt.*{key}"):
+        load_policy(tmp_path / "model.pt", anymal, "cpu")
+
+
+@pytest.fixture(scope="module", params=["lstm", "gru"])
+def recurrent(request):
+    """rsl_rl's own recurrent actor of two layers, with a normaliser; and what it does with 12 steps of 5 robots."""
+    torch.manual_seed(3)
+    rows = TensorDict({"policy": rows_of(64)}, batch_size=64)
+    actor = RNNModel(rows, {"actor": ["policy"]}, "actor", ACTIONS, (16,), "elu", True, rnn_type=request.param,
+                     rnn_hidden_dim=8, rnn_num_layers=2)  # fmt: skip
+    actor.train()
+    actor.obs_normalizer.update(rows["policy"])
+    actor.eval()
+    steps = rows_of(12, 5)
+    with torch.inference_mode():
+        expected = [actor(TensorDict({"policy": step}, batch_size=5)) for step in steps]
+    return actor, steps, torch.stack(expected)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit", "ignore:.torch.onnx", "ignore:You are using the legacy")
+@pytest.mark.parametrize("kind", ["checkpoint", "script", "onnx"])
+def test_what_remembers_one_robot_remembers_any_number_apart(tmp_path, anymal, recurrent, kind):
+    actor, steps, expected = recurrent
+    path = tmp_path / ("policy.onnx" if kind == "onnx" else "policy.pt")
+    if kind == "checkpoint":
+        torch.save({"actor_state_dict": actor.state_dict(), "activation": "elu"}, path)
+    elif kind == "script":
+        torch.jit.script(actor.as_jit().eval()).save(str(path))
+    else:
+        model = actor.as_onnx(False).eval()
+        torch.onnx.export(model, model.get_dummy_inputs(), str(path), input_names=model.input_names,
+                          output_names=model.output_names, opset_version=18, dynamo=False)  # fmt: skip
+    policy = load_policy(path, anymal, "cpu")
+    assert memory_of(policy) is Memory.BY_ROW
+    policy.reset(torch.ones(5, dtype=torch.bool))
+    for step, actions in zip(steps, expected, strict=True):
+        torch.testing.assert_close(policy(step), actions, rtol=1e-4, atol=1e-5)
+    policy.reset(torch.tensor([False, True, False, False, True]))  # these two begin again
+    again = torch.stack([policy(step) for step in steps])
+    torch.testing.assert_close(again[:, [1, 4]], expected[:, [1, 4]], rtol=1e-4, atol=1e-5)
+    assert (again - expected)[:, [0, 2, 3]].abs().amax() > 1e-3
+    alone = []
+    for count in (1, 3, 40):  # bit for bit beside any others
+        policy.reset(torch.ones(count, dtype=torch.bool))
+        alone.append(torch.stack([policy(step[:1].expand(count, -1))[0] for step in steps]))
+    assert torch.equal(alone[0], alone[1]) and torch.equal(alone[0], alone[2])
+
+
+class Exported(torch.nn.Module):
+    """A layer as exporters write it, with a ``reset`` that does nothing, or a memory."""
+
+    def __init__(self, kind: str):
+        super().__init__()
+        self.kind, self.layer = kind, torch.nn.Linear(OBSERVATIONS, ACTIONS)
+        self.last = torch.nn.Buffer(torch.zeros(1, OBSERVATIONS))
+
+    @torch.jit.export
+    def reset(self) -> None:
+        if self.kind == "averages":
+            self.last[:] = 0.0
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.kind == "averages":
+            self.last[:] = 0.5 * self.last + 0.5 * x
+            return self.layer(self.last)
+        if self.kind == "the first row's":
+            self.last[:] = 0.5 * self.last + 0.5 * x[:1]
+            return self.layer(x + self.last[:1])
+        return self.layer(x)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
+    policies = {}
+    for kind in ("plain", "averages", "the first row's"):
+        torch.manual_seed(0)
+        torch.jit.script(Exported(kind)).save(str(tmp_path / f"{kind}.pt"))
+        if kind == "the first row's":
+            with pytest.raises(ValueError, match=r"row's\.pt.* last"):
+                load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
+        else:
+            policies[kind] = load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
+    assert memory_of(policies["plain"]) is Memory.NONE
+    assert memory_of(policies["averages"]) is Memory.BY_ROW
+    layer, rows = Exported("plain").layer, rows_of(4)
+    torch.manual_seed(0)
+    layer = Exported("plain").layer
+    torch.testing.assert_close(policies["averages"](rows), layer(rows / 2).detach(), rtol=1e-4, atol=1e-5)
+
+
+def one_robot(path, *, reshaped):
+    """An exported perceptron whose batch is 1; with ``reshaped`` a node of it knows that too."""
+    policy = MlpPolicy(ACTOR)
+    export_onnx(policy, path)
+    model = onnx.load(path)
+    for port in (*model.graph.input, *model.graph.output):
+        port.type.tensor_type.shape.dim[0].dim_value = 1
+    if reshaped:
+        model.graph.initializer.append(numpy_helper.from_array(np.array([1, OBSERVATIONS]), "shape"))
+        model.graph.node.insert(0, helper.make_node("Reshape", ["raw", "shape"], ["observation"]))
+        model.graph.input[0].name = "raw"
+    path.write_bytes(model.SerializeToString())
+    return policy
+
+
+def test_a_graph_of_one_robot_runs_any_number(tmp_path, anymal):
+    policy, rows = one_robot(tmp_path / "free.onnx", reshaped=False), rows_of(7)
+    expected = policy(rows).detach()
+    torch.testing.assert_close(load_policy(tmp_path / "free.onnx", anymal, "cpu")(rows), expected, rtol=1e-4, atol=1e-4)
+    one_robot(tmp_path / "bound.onnx", reshaped=True)
+    with pytest.warns(UserWarning, match=r"bound\.onnx.*one robot after the other"):
+        bound = load_policy(tmp_path / "bound.onnx", anymal, "cpu")
+    torch.testing.assert_close(bound(rows), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("names", [("h_in", "state"), ("time_step", "h_out")])
+def test_a_graph_with_ports_of_unknown_meaning_is_refused_by_their_names(tmp_path, names):
+    def port(name, *shape):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+
+    nodes = [helper.make_node("Identity", ["obs"], ["act"]), helper.make_node("Identity", [names[0]], [names[1]])]
+    graph = helper.make_graph(nodes, "it", [port("obs", "n", 12), port(names[0], 1, "n", 3)],
+                              [port("act", "n", 12), port(names[1], 1, "n", 3)])  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    (tmp_path / "it.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(ValueError, match=rf"it\.onnx.*{names[0]}.*{names[1]}"):
+        load_onnx(tmp_path / "it.onnx", (12, 12), "cpu")
