@@ -4,6 +4,7 @@ import importlib
 import re
 import runpy
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import tyro
 
 import faultline
 from qd.workers.evaluator import Compute
+from sim.policy.described import Described, Term, read_controller
 from sim.policy.loaders import load_policy
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
@@ -72,13 +74,31 @@ def test_the_robots_of_the_page_are_read(tmp_path):
 
 
 def test_the_controllers_of_the_page_act(tmp_path, anymal):
-    for text in code_of("docs/controllers.md", "python")[:2]:
+    for text in code_of("docs/controllers.md", "python"):
         (tmp_path / re.findall(r"\w+\.py", text)[0]).write_text(text)
     row = torch.randn(5, 235)
     assert not load_policy(f"{tmp_path}/walk.py:act", anymal, "cpu")(row.clone()).any()
     # Its actor returns joint positions, which stand behind angular velocity, gravity and command in its row.
     adapted = runpy.run_path(str(tmp_path / "row.py"))["adapt"](lambda parts: parts[:, 9:21], anymal)(row)
-    torch.testing.assert_close(adapted, row[:, 12:24] + torch.tensor(anymal.default_joint_pos))
+    torch.testing.assert_close(adapted, row[:, 12:24], rtol=1e-5, atol=1e-6)
+    smooth, actor = (
+        load_policy(f"{code}{anymal.policy_file}", anymal, "cpu") for code in (f"{tmp_path}/smooth.py:Smooth@", "")
+    )
+    with torch.inference_mode():
+        for begins, share in (([True] * 5, [0.5] * 5), ([True] + [False] * 4, [0.5] + [0.75] * 4)):
+            smooth.reset(torch.tensor(begins))
+            torch.testing.assert_close(smooth(row), torch.tensor(share)[:, None] * actor(row))
+
+
+def test_the_description_of_the_page_is_read(tmp_path, anymal):
+    (text,) = code_of("docs/controllers.md", "toml")
+    (tmp_path / "controller.toml").write_text(text)
+    robot = replace(anymal, scan_x=(0.0, 0.4, 0.8), scan_y=(-0.2, 0.2))
+    described = Described(read_controller(tmp_path / "controller.toml"), robot, "it")
+    # Five steps of four terms of three columns, three of six joints and a clock; one of six points.
+    assert (described.observation_size, described.num_actions) == (5 * (4 * 3 + 3 * 6 + 2) + 6, 6)
+    terms = re.findall(r"^\| `(\w+)` \| [3a2]", text_of("docs/controllers.md"), re.MULTILINE)
+    assert terms == [term.name for term in Term.__subclasses__()]
 
 
 def test_the_map_of_the_page(tmp_path, monkeypatch):

@@ -43,8 +43,8 @@ class ControllerFlags(RobotFlag):
     """Options that say which robot, under which controller."""
 
     policy: str | None = None
-    """Controller other than the robot's own: an rsl_rl checkpoint, a TorchScript or ONNX file, file.py:callable,
-    module:callable, or file.py:adapter@FILE for a file that expects another observation."""
+    """Controller other than the robot's own: a controller.toml, an rsl_rl checkpoint, a TorchScript or ONNX file,
+    file.py:callable, module:callable, or file.py:adapter@FILE for a file that expects another observation."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -275,6 +275,8 @@ class Described(torch.nn.Module):
         for k, (term, width) in enumerate(zip(cfg.observation, self.widths, strict=True)):
             if isinstance(term.scale, tuple) and len(term.scale) != width:
                 self._refuse(f"observation[{k}].scale must be one number or {width}, got {len(term.scale)}")
+            if isinstance(term.clip, tuple) and term.clip[0] > term.clip[1]:
+                self._refuse(f"observation[{k}].clip must have its lower limit first, got {list(term.clip)}")
             if isinstance(term, Scan):
                 self.scan_numbers(term)
         history = cfg.history
@@ -311,6 +313,8 @@ class Described(torch.nn.Module):
         xs, ys = self.robot.scan_points()
         numbers = {(round(float(x), 4), round(float(y), 4)): k for k, (x, y) in enumerate(zip(xs, ys, strict=True))}
         points = [(round(x, 4), round(y, 4)) for x, y in term.points(self.robot)]
+        if not points:
+            self._refuse("a scan must have x and y where the robot has no scan_x and scan_y")
         if not set(points) <= numbers.keys():
             x, y = ([*dict.fromkeys(values)] for values in zip(*points, strict=True))
             self._refuse(
