@@ -39,6 +39,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
         "harden": Command("train.commands:Harden", "rounds of search and training, until little breaks it"),
     },
     "Bring a robot or a controller": {
+        "import": Command("qd.commands:Import", "describe a public controller and its robot from what came with it"),
         "check": Command("qd.commands:Check", "look at a robot and its controller: does it stand, and walk"),
     },
 }

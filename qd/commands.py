@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import tyro
 from msgspec import Meta
 
 from qd.evaluate.labels import SetsCfg
@@ -198,6 +199,29 @@ class Minimise(_OnRun):
 
         run, named = self.named()
         minimise(run, elite=self.elite, how=self.how, judged=self.judge or bool(self.certifiers), **named)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Describe a controller and its robot as robot.toml and controller.toml, from what came with its weights.
+
+    It prints both files. What is not understood is refused by its name; what is a guess says so, with its reason; what
+    nobody says is left to be filled in.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """A folder or YAML of rl_sar, a YAML of unitree_rl_gym's deploy_mujoco, an ONNX file of mjlab, a run folder of
+    Isaac Lab, or weights alone."""
+    model: Path
+    """The robot's MJCF or URDF. It stays where it is."""
+    out: Path
+    """Folder for the files, and a copy of the weights; the robot is called after it."""
+
+    def execute(self) -> None:
+        """Writes the files."""
+        from sim.policy.imports import import_controller
+
+        import_controller(self.source, self.model, self.out)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -266,7 +266,7 @@ def _activation_of(content: dict[str, Any], path: Path) -> str:
     said, agent = content.get("activation", "elu" if own else None), agent_file(path)
     if said is None and agent is not None:
         try:
-            settings = yaml.load(agent.read_text(encoding="utf-8"), _PlainYaml)
+            settings = yaml.load(agent.read_text(encoding="utf-8"), PlainYaml)
             parts = [settings.get(name) or {} for name in ("actor", "policy")]
             said = next((part["activation"] for part in parts if "activation" in part), None)
         except (OSError, ValueError, AttributeError, TypeError, yaml.YAMLError) as error:
@@ -281,11 +281,19 @@ def _activation_of(content: dict[str, Any], path: Path) -> str:
     return said
 
 
-class _PlainYaml(yaml.SafeLoader):
-    """Data alone; what Python would make of a tag is left out."""
+class PlainYaml(yaml.SafeLoader):
+    """Data alone: of what Python would make by a tag, lists, tables and texts remain."""
 
 
-_PlainYaml.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
+def _without_tag(loader: Any, suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return loader.construct_scalar(node) or suffix.partition(":")[2]
+
+
+PlainYaml.add_multi_constructor("tag:yaml.org,2002:python/", _without_tag)
 
 
 class _Script(torch.nn.Module):

@@ -84,20 +84,24 @@ def _read_toml(path: Path) -> RobotCfg:
     if not isinstance(given.get("model_file"), str):
         raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
     file = path.resolve()
-    # Nothing that is inferred is compared with the model yet.
-    bare = RobotCfg(
-        name="", model_file=file.parent / given["model_file"], base_geoms=(), foot_geoms=(), limb_geoms=(),
-        joint_names=(), default_joint_pos=(), footprint=(1.0, 1.0), scan_x=(), scan_y=(), contact_force_limit=1.0,
-        penalties=(), collision_bit=False,
-    )  # fmt: skip
-    spec, mistakes = read_robot_spec(bare, known)
-    if mistakes:
-        raise ValueError(f"{path}: {'; '.join(mistakes)}")
-    model = spec.compile()
+    model = compile_model(file.parent / given["model_file"], f"{path}: ")
     settings = given | {
         name: per_joint(given[name], joint_names(model), f"{path}: {name}") for name in PER_JOINT if name in given
     }
     return from_builtins(RobotCfg, infer(settings, file, model), str(path))
+
+
+def compile_model(model_file: Path, what: str = "") -> Any:
+    """A robot's model, of which no setting is known yet; an error begins with ``what``."""
+    bare = RobotCfg(
+        name="", model_file=model_file, base_geoms=(), foot_geoms=(), limb_geoms=(), joint_names=(),
+        default_joint_pos=(), footprint=(1.0, 1.0), scan_x=(), scan_y=(), contact_force_limit=1.0, penalties=(),
+        collision_bit=False,
+    )  # fmt: skip
+    spec, mistakes = read_robot_spec(bare, [field.name for field in fields(RobotCfg)])
+    if mistakes:
+        raise ValueError(what + "; ".join(mistakes))
+    return spec.compile()
 
 
 def per_joint(value: Any, joints: Sequence[str], what: str) -> list[Any]:
@@ -133,7 +137,7 @@ def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
         model: The robot as :func:`sim.robots.compiled.read_robot_spec` reads it, compiled.
     """
     found: dict[str, Any] = {"name": file.parent.name, "joint_names": list(joint_names(model)), "collision_bit": False}
-    found |= {"default_joint_pos": _default_pose(file.parent / given["model_file"], model)} | given
+    found |= {"default_joint_pos": default_pose(file.parent / given["model_file"], model)[0]} | given
     pose = found["default_joint_pos"]
     if len(pose) != model.njnt - 1 or not all(isinstance(angle, int | float) for angle in pose):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
@@ -154,14 +158,15 @@ def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
     return _scan(file.with_name("controller.toml")) | found
 
 
-def _default_pose(model_file: Path, model: Any) -> list[float]:
+def default_pose(model_file: Path, model: Any) -> tuple[list[float], bool]:
+    """Angles of the keyframe ``home`` of a robot's file, or those nearest to zero, and whether there is one [rad]."""
     low, high = model.jnt_range[1:].T
     zero = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, low, high), 0.0)
     if read_model_files(model_file).is_urdf:
-        return zero.tolist()
+        return zero.tolist(), False
     keys = {key.name: list(key.qpos) for key in mujoco.MjSpec.from_file(str(model_file)).keys}  # type: ignore
     home = keys.get("home", [])
-    return home[7:] if len(home) == model.nq else zero.tolist()
+    return (home[7:], True) if len(home) == model.nq else (zero.tolist(), False)
 
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
