@@ -325,49 +325,57 @@ class _RecurrentScript(Recurrent):
 
 def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
     try:
-        module = torch.jit.load(str(path), map_location=device).eval()
+        module, probe = (torch.jit.load(str(path), map_location=place).eval() for place in (device, "cpu"))
     except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
             f"or holding code): {reason_of(reason)}; expected {_FORMATS}"
         ) from error
-    return module if sizes is None else _script_policy(module, path, device, sizes[0])
+    if sizes is None:
+        return module
+    initial, axis = _memory_of_script(probe, path, sizes[0])
+    if initial is None:
+        return module
+    return _RecurrentScript(module, initial, axis).to(device) if initial else _Script(module)
 
 
 @torch.inference_mode()
-def _script_policy(module: Any, path: Path, device: str, width: int) -> Policy:
-    """A TorchScript module with a ``reset(rows)`` if it remembers, and none if it does not.
+def _memory_of_script(probe: Any, path: Path, width: int) -> tuple[dict[str, torch.Tensor] | None, int]:
+    """The buffers in which a module on the CPU remembers, as an episode begins, and their axis of robots.
 
-    What it remembers are the buffers that a call changes. They are made for one robot: as many rows of them must act
-    as one robot after the other does.
+    They are those that a call changes, made for one robot: as many rows of them must act as one robot after the other
+    does. None where it remembers elsewhere and has a ``reset()``; empty where it remembers nothing.
     """
-    rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0)).to(device)  # steps, robots
-    begin = next((getattr(module, name) for name in ("reset", "reset_memory") if hasattr(module, name)), None)
+    rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
+    begin = next((getattr(probe, name) for name in ("reset", "reset_memory") if hasattr(probe, name)), None)
     if begin is not None:
         begin()
-    before = {name: value.clone() for name, value in module.named_buffers()}
+    before = {name: value.clone() for name, value in probe.named_buffers()}
     try:
-        once, again = (module(rows[0, :1]) for _ in range(2))
+        once, again = (probe(rows[0, :1]) for _ in range(2))
     except RuntimeError:  # of another width: it is tried afterwards
-        return _Script(module)
-    initial = {name: before[name] for name, value in module.named_buffers() if not torch.equal(before[name], value)}
+        return {}, 0
+    initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
+    if not initial and torch.equal(once, again):
+        return {}, 0
+    if not initial and begin is None:
+        raise ValueError(f"policy '{path}' answers the same row differently, and none of its buffers changes: mend it")
     if not initial:
-        return module if begin is not None and not torch.equal(once, again) else _Script(module)
-
+        return None, 0
     apart = []
     for robot in range(rows.shape[1]):
-        for name, value in module.named_buffers():
+        for name, value in probe.named_buffers():
             value.copy_(before[name])
-        apart.append(torch.cat([module(step[robot : robot + 1]) for step in rows]))
+        apart.append(torch.cat([probe(step[robot : robot + 1]) for step in rows]))
     for axis in (1, 0):
         if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
-            free = _RecurrentScript(module, initial, axis).to(device)
+            free = _RecurrentScript(probe, initial, axis)
             try:
                 together = torch.stack([free(step) for step in rows], dim=1)
             except RuntimeError:
                 continue
             if torch.allclose(together, torch.stack(apart), rtol=1e-4, atol=1e-4):
-                return free
+                return initial, axis
     raise ValueError(
         f"policy '{path}' remembers one robot alone, in {', '.join(initial)}, and rows of it do not act as one "
         "robot does: give the checkpoint that it was exported from"
