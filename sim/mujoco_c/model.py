@@ -74,9 +74,9 @@ def crossing_model(
     """The robot's file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
 
     The solver may take as many iterations as it needs: the caps of the parallel simulation are themselves in question.
-    Ground with maps is a geom a patch, whose friction and softness have priority over those of the robot: a box where
-    the patch is level, else a heightfield. Patches that follow each other along the way are one where they are alike in
-    every row.
+    Level ground is a plane. Ground with maps is a geom a patch, whose friction and softness have priority over those of
+    the robot: a box where the patch is level, else a heightfield. Patches that follow each other along the way are one
+    where they are alike in every row.
 
     Args:
         robot: Robot settings.
@@ -91,7 +91,13 @@ def crossing_model(
     option.integrator, option.cone = _mj.mjtIntegrator.mjINT_IMPLICITFAST, _mj.mjtCone.mjCONE_ELLIPTIC
     option.disableflags = _mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     patches = [] if ground is None else _patches_of(ground)
-    data = _add_patches(spec, heights, patches) if patches else _add_field(spec, heights, 0)
+    if patches:
+        data = _add_patches(spec, heights, patches)
+    elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
+        data = np.zeros(0)
+        _add_geom(spec, _GROUND, (0.0, 0.0, float(heights[0, 0])), type=_mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
+    else:
+        data = _add_field(spec, heights, 0)
     for name in robot.geom_names:
         spec.add_sensor(
             name=name, type=_mj.mjtSensor.mjSENS_CONTACT, objtype=_mj.mjtObj.mjOBJ_GEOM, objname=name,

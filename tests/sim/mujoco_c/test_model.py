@@ -133,13 +133,15 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
 
 
 def test_what_ends_a_crossing(robot):
+    heights = FLAT.copy()
+    heights[0, 0] = 0.01  # or the ground were a plane, which would push off legs that are half a metre deep in it
     starts = draw_starts(robot, FLAT, 5, 4, "cpu")
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal
     starts.qpos[1, 1] = 10.5  # outside
     starts.qpos[2, 2] = 0.05  # its belly in the ground
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
     policy = load_policy(robot.policy_file, robot, "cpu")
-    result = cross(dataclasses.replace(robot, max_duration_s=0.1), policy, FLAT, starts)
+    result = cross(dataclasses.replace(robot, max_duration_s=0.1), policy, heights, starts)
     assert result.outcome.tolist() == [[Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]]
     assert result.invalidity.tolist() == [[0, 0, 0, Invalidity.STATE]]
     assert result.penalty_names == robot.penalties
