@@ -225,7 +225,7 @@ def read_controller(path: Path) -> ControllerCfg:
     """Reads a description; an error names the file and the field."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as TOML: {error}") from None
     items = content.pop("observation", None)
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):

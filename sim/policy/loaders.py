@@ -170,7 +170,8 @@ def _load_described(path: Path, robot: RobotCfg, device: str) -> Described:
     cfg = read_controller(path)
     policy = Described(cfg, robot, str(path))
     sizes, weights = (policy.observation_size, policy.num_actions), weights_file(path)
-    assert weights is not None
+    if weights is None:
+        raise ValueError(f"{path}: policy must be the name of a file, got {cfg.policy!r}")
     of = f"{path} ({policy.columns})"
     network = load_network(weights, device, sizes, of=of, activation=cfg.activation)
     _try_rows(network, sizes, device, str(weights), of, reason_of)
@@ -276,7 +277,7 @@ def _activation_of(content: dict[str, Any], path: Path) -> str:
             f"policy '{path}' does not say what is between its layers: put the agent.yaml of its training "
             'beside it, or describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
         )
-    if said not in ACTIVATIONS:
+    if not isinstance(said, str) or said not in ACTIVATIONS:
         raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {said}")
     return said
 

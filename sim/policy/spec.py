@@ -71,11 +71,11 @@ class ControllerSpec:
 
 def _with_companions(file: Path) -> list[Path]:
     """A controller's file, the weights that a description names, and the settings of the training that made them."""
-    if file.suffix == ".toml":
-        weights = weights_file(file)
-        return [file] if weights is None else [file, *_with_companions(weights)]
-    agent = agent_file(file)
-    return [file] if agent is None else [file, agent]
+    files = [file]
+    if file.suffix == ".toml" and (weights := weights_file(file)) is not None:
+        files.append(weights)
+    agent = agent_file(files[-1])
+    return files if agent is None else [*files, agent]
 
 
 def weights_file(path: Path) -> Path | None:
@@ -86,9 +86,9 @@ def weights_file(path: Path) -> Path | None:
     try:
         policy = tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
         named, beside = path.parent / policy, path.parent / Path(policy).name
-    except (OSError, ValueError, KeyError, TypeError):
+        return beside if not named.is_file() and beside.is_file() else named
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return beside if not named.is_file() and beside.is_file() else named
 
 
 def agent_file(weights: Path) -> Path | None:

@@ -124,6 +124,7 @@ LOADERS = {
     "archive.npz": read_archive,
     "elite-0.recording.npz": read_recording,
     "policy.pt": lambda file: load_policy(file, get_robot("anymal"), "cpu"),
+    "controller.toml": lambda file: load_policy(file, get_robot("anymal"), "cpu"),
     "policy.onnx": lambda file: load_policy(file, get_robot("anymal"), "cpu"),
 }
 

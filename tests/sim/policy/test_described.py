@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from rsl_rl.models import RNNModel
+from tensordict import TensorDict
 
 from sim.policy.described import Described, read_controller
 from sim.policy.loaders import load_policy, prepare_torch
@@ -145,10 +147,27 @@ def remembering(tmp_path, describe):
                     "action_delay_steps = 1")  # fmt: skip
 
 
+@pytest.fixture(params=["perceptron", "lstm", "script"])
+def network(request, tmp_path, remembering):
+    """Its weights: a perceptron, an LSTM, or an LSTM exported for one robot."""
+    if request.param == "perceptron":
+        return
+    torch.manual_seed(1)
+    row = TensorDict({"policy": torch.zeros(1, 3 * 29)}, batch_size=1)
+    actor = RNNModel(row, {"a": ["policy"]}, "a", ACTIONS, (16,), rnn_hidden_dim=8).eval()
+    if request.param == "lstm":
+        save_checkpoint(tmp_path / "weights.pt", actor.state_dict())
+    else:
+        torch.jit.script(actor.as_jit().eval()).save(str(tmp_path / "weights.pt"))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+@pytest.mark.usefixtures("network")
 def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
     """Robots that begin at different times, through the runner: on a GPU it captures the controller with its reset."""
     prepare_torch(device)
     policy = load_policy(remembering, anymal, device)
+    assert policy.graph_safe
     count, steps = 5, torch.randn((12, 5, OBSERVATIONS), generator=torch.Generator().manual_seed(2))
     observation, action = (wp.zeros((count, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
     begins = wp.zeros(count, dtype=int, device=device)
@@ -168,7 +187,6 @@ def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
                 np.testing.assert_array_equal(together[k][robot], own)
             else:
                 np.testing.assert_allclose(together[k][robot], own, rtol=2e-3, atol=5e-3)  # TF32
-    assert policy.graph_safe
 
 
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
@@ -206,6 +224,7 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
          r"scan_x = \[0\.05\] and scan_y = \[0\.0, 0\.1\]"),
         ('{term = "gravity"}', "", r"87 observations.*\(gravity 3\) has 3 observations"),
         ("", "", "observation"),
+        ("[" * 5000, "", "TOML"),
         ('{term = "gravity"', "", "TOML"),
     ],
 )  # fmt: skip
