@@ -78,7 +78,8 @@ def calibrate(
     missed the goal, up to five times as many. With fewer failing episodes even then, all episodes give the scales.
 
     Returns:
-        The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written.
+        The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written;
+        one of a robot.toml, whose penalties are all that could occur, has the scale 1.
     """
     if policy is not None and out is None and robot.settings_file is None:
         raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")
@@ -106,10 +107,15 @@ def calibrate(
     origin = {**origin_of(compute.device, seed, compute.workers), **identity(robot, policy), "space": space.name}
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
     report = {**origin, "crossing": crossing, **measured(result)}
+    absent = [name for name in robot.penalties if name not in report["scales"]]
+    if absent and robot.settings_file is not None and robot.settings_file.suffix == ".toml":
+        print(f"{', '.join(absent)} never occurred, and is left as it is: its scale is 1.")
+        report["scales"] |= dict.fromkeys(absent, 1.0)
+        absent = []
     _print_scales(report)
     write_atomically(out, to_json(report))
     print(f"Written to {out}.")
-    if absent := [name for name in robot.penalties if name not in report["scales"]]:
+    if absent:
         raise ValueError(
             f"penalties must occur in the episodes that scales are means over, got 0 of {', '.join(absent)}: leave "
             f"them out of the robot's penalties, for which the scales in {out} fit, or calibrate on more terrains"

@@ -17,6 +17,7 @@ from qd.workers.invalid import invalid_reasons, reason_words
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.mujoco_c.crossing import cross_terrains
+from sim.robots.find import read_penalty_scales
 from sim.robots.own import describe_inferred
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, describe_standing, stand
@@ -70,6 +71,26 @@ def check(
         if out is not None or not robot.scales_file.exists():
             calibrate(robot, policy, compute=compute, terrains=_terrains(compute), replicas=4, seed=seed, out=out)
     return fine and walks
+
+
+def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
+    """A robot of a robot.toml with room in its buffers and the scales of its penalties; any other as it is.
+
+    What is missing is measured with the controller of its first use, and written beside it. Scales of the robot before
+    it changed are missing, too.
+    """
+    file = robot.settings_file
+    if file is None or file.suffix != ".toml":
+        return robot
+    try:
+        read_penalty_scales(robot)
+    except ValueError:
+        policy = policy or str(robot.policy_file)
+        check_policy(policy, robot, compute.device)
+        print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
+        robot, _ = _with_room(robot, compute.device, 1.0, 0)
+        calibrate(robot, policy, compute=compute, terrains=_terrains(compute), replicas=4)
+    return robot
 
 
 def _terrains(compute: Compute) -> int:

@@ -82,6 +82,7 @@ class Archive(ControllerFlags, WorkerFlags):
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
+        from qd.check import made_ready
         from qd.judge import find_search, judge
         from qd.run.directory import free_path
         from qd.run.settings import preset
@@ -92,7 +93,7 @@ class Archive(ControllerFlags, WorkerFlags):
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         if self.resume is None:
-            robot, policy = get_robot(self.robot), None
+            robot, policy = made_ready(get_robot(self.robot), self.policy, compute), None
             space = space_at(load_space(self.space), self.height, robot)
             cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
         elif self.run_dir:
@@ -286,6 +287,7 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
+        from qd.check import made_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
         from qd.evaluate.labels import COMPARED
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
@@ -319,6 +321,7 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
         controllers = controllers_of(self.policies, robot)
+        robot = made_ready(robot, next(iter(controllers.values())), compute)
         names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"}
         if compared:
             if self.archive is None:

@@ -2,12 +2,14 @@
 
 import pytest
 
-from qd.check import check
+from qd.check import check, made_ready
 from qd.commands import Check
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
-from sim.robots.find import get_robot
-from tests.sim.dogs import write_dog
+from sim.robots.find import get_robot, read_penalty_scales
+from tests.qd.robots import Robots
+from tests.qd.stand_in import compute_by
+from tests.sim.dogs import CONTROLLER, write_dog, write_toml
 
 
 def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mended(tmp_path, capsys):
@@ -34,3 +36,18 @@ def test_a_controller_that_stands_still_does_not_walk(monkeypatch, tmp_path, cap
     assert not check(get_robot("anymal"), "tests.sim.policies:stand", compute=compute, seconds=0.5)
     text = capsys.readouterr().out
     assert text.count("0 of 8 reach the goal") == 2 and "It does not walk" in text and "kerb" not in text
+
+
+def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    pose = "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n"
+    file, policy = write_toml(tmp_path / "dog", f"{pose}njmax = 8\n"), f"{tmp_path / 'trot.py'}:Trot"
+    (tmp_path / "trot.py").write_text(CONTROLLER)
+    robot = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
+    assert robot == get_robot(str(file)) and robot.njmax > 8
+    assert len(read_penalty_scales(robot)) == len(robot.penalties)
+    assert made_ready(robot, policy, compute_by(Robots(stop_after=0))) is robot
+    file.write_text(f"speed = 0.5\n{file.read_text()}")
+    changed = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
+    assert len(read_penalty_scales(changed)) == len(robot.penalties) and changed.speed == 0.5
+    assert capsys.readouterr().out.count("measured first") == 2

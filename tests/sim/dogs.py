@@ -116,6 +116,15 @@ def write_dog(folder: Path, *, model: str | None = None, suffix: str = "xml", mo
     return file
 
 
+def write_toml(folder: Path, text: str = "", model: str | None = None) -> Path:
+    """Writes dog.xml and a robot.toml that names it; returns the latter."""
+    folder.mkdir()
+    (folder / "dog.xml").write_text(model or mjcf())
+    file = folder / "robot.toml"
+    file.write_text(f'model_file = "dog.xml"\n{text}')
+    return file
+
+
 KINDS = {"mjcf": {}, "urdf": {"model": urdf(), "suffix": "urdf", "more": GAINS}}
 """What :func:`write_dog` takes for each kind of model file."""
 

@@ -23,7 +23,21 @@ from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
 from tests.kernels import oracle
-from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, LEGS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog
+from tests.sim.dogs import (
+    DRIVE,
+    GAINS,
+    JOINTS,
+    KINDS,
+    LEGS,
+    MASS,
+    TRUNK,
+    mjcf,
+    stl,
+    urdf,
+    with_mesh,
+    write_dog,
+    write_toml,
+)
 from tests.sim.scenes import FLAT, crossing, put, simulate, standing
 
 
@@ -60,15 +74,6 @@ def test_the_height_is_computed_where_the_settings_have_none(tmp_path):
 
 
 HOME = " ".join(["0 0 .3 1 0 0 0", *["0.6 -1.2"] * 4])
-
-
-def write_toml(folder, text="", model=None):
-    """Writes dog.xml and a robot.toml that names it; returns the latter."""
-    folder.mkdir()
-    (folder / "dog.xml").write_text(model or mjcf())
-    file = folder / "robot.toml"
-    file.write_text(f'model_file = "dog.xml"\n{text}')
-    return file
 
 
 def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
