@@ -233,7 +233,7 @@ def read_controller(path: Path) -> ControllerCfg:
     terms = []
     for k, item in enumerate(items):
         name = item.pop("term", None)
-        if name not in _TERMS:
+        if not isinstance(name, str) or name not in _TERMS:
             raise ValueError(f"{path}: observation[{k}].term must be one of {', '.join(_TERMS)}, got {name}")
         terms.append(from_builtins(_TERMS[name], item, f"{path}: observation[{k}] ({name})"))
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
@@ -263,20 +263,22 @@ class Described(torch.nn.Module):
         self.cfg, self.robot, self._place = cfg, robot, place
         self.network: Any = None
         self._device = torch.device("cpu")
+        self._numbers: dict[Any, tuple[int, ...]] = {}
         self._tensors: dict[Any, torch.Tensor] = {}
         self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
-        moved = self.numbers(None)
-        self.num_actions = len(moved)
+        self.num_actions = len(self.numbers(None))
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
             if isinstance(values, tuple) and len(values) != self.num_actions:
                 self._refuse(f"{name} must have one value a joint, {self.num_actions}, got {len(values)}")
+        if any(lower > upper for lower, upper in _limits(cfg.action_clip, 1)):
+            self._refuse(f"action_clip must be above 0, or have its lower limits first, got {cfg.action_clip}")
         self.widths = [term._width(self) for term in cfg.observation]
         for k, (term, width) in enumerate(zip(cfg.observation, self.widths, strict=True)):
             if isinstance(term.scale, tuple) and len(term.scale) != width:
                 self._refuse(f"observation[{k}].scale must be one number or {width}, got {len(term.scale)}")
-            if isinstance(term.clip, tuple) and term.clip[0] > term.clip[1]:
-                self._refuse(f"observation[{k}].clip must have its lower limit first, got {list(term.clip)}")
+            if any(lower > upper for lower, upper in _limits(term.clip, 1)):
+                self._refuse(f"observation[{k}].clip must be above 0, or have its lower limit first, got {term.clip}")
             if isinstance(term, Scan):
                 self.scan_numbers(term)
         history = cfg.history
@@ -293,14 +295,17 @@ class Described(torch.nn.Module):
     def _refuse(self, problem: str) -> None:
         raise ValueError(f"{self._place}: {problem}")
 
-    def numbers(self, joints: Sequence[str] | None) -> tuple[int, ...]:
+    def numbers(self, joints: tuple[str, ...] | None) -> tuple[int, ...]:
         """The robot's numbers of joints, by default of those that it moves."""
-        names = joints or self.cfg.joints or self.robot.joint_names
-        unknown = [name for name in names if name not in self.robot.joint_names]
-        if unknown or len(set(names)) < len(names):
-            got = f"no {', '.join(unknown)}" if unknown else "one of them twice"
-            self._refuse(f"joints must be of {', '.join(self.robot.joint_names)}, which has {got}")
-        return tuple(self.robot.joint_names.index(name) for name in names)
+        if joints not in self._numbers:
+            own, given = self.robot.joint_names, self.cfg.joints if joints is None else joints
+            names = own if given is None else given
+            unknown = [name for name in names if name not in own]
+            if unknown or len(set(names)) < len(names):
+                got = f"no {', '.join(unknown)}" if unknown else "each of them once"
+                self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(own)}")
+            self._numbers[joints] = tuple(own.index(name) for name in names)
+        return self._numbers[joints]
 
     def pose_of(self, numbers: Sequence[int]) -> tuple[float, ...]:
         """Its default pose of the robot's joints of these numbers, and the robot's of those that it does not move."""
@@ -310,6 +315,8 @@ class Described(torch.nn.Module):
 
     def scan_numbers(self, term: Scan) -> tuple[int, ...]:
         """The robot's numbers of a scan's points."""
+        if term in self._numbers:
+            return self._numbers[term]
         xs, ys = self.robot.scan_points()
         numbers = {(round(float(x), 4), round(float(y), 4)): k for k, (x, y) in enumerate(zip(xs, ys, strict=True))}
         points = [(round(x, 4), round(y, 4)) for x, y in term.points(self.robot)]
@@ -320,12 +327,13 @@ class Described(torch.nn.Module):
             self._refuse(
                 f"the scan's points are not those of the robot: write into robot.toml scan_x = {x} and scan_y = {y}"
             )
-        return tuple(numbers[point] for point in points)
+        self._numbers[term] = tuple(numbers[point] for point in points)
+        return self._numbers[term]
 
     def constant(self, values: Sequence[float]) -> torch.Tensor:
         """Floats on the device, which are copied once."""
         if values not in self._tensors:
-            self._tensors[values] = torch.tensor(values, device=self._device)
+            self._tensors[values] = torch.tensor(values, dtype=torch.float32, device=self._device)
         return self._tensors[values]
 
     def index(self, numbers: tuple[int, ...]) -> torch.Tensor:
@@ -394,7 +402,8 @@ class Described(torch.nn.Module):
     def _column(self, term: Term, sensed: Sensed, memory: _Memory) -> torch.Tensor:
         value = term._read(sensed, self, memory)
         if term.clip is not None:
-            value = value.clamp(*(term.clip if isinstance(term.clip, tuple) else (-term.clip, term.clip)))
+            ((lower, upper),) = _limits(term.clip, 1)
+            value = value.clamp(lower, upper)
         return value * (self.constant(term.scale) if isinstance(term.scale, tuple) else term.scale)
 
     def _with_history(self, now: torch.Tensor, memory: _Memory) -> torch.Tensor:
@@ -416,8 +425,7 @@ class Described(torch.nn.Module):
         clip = self.cfg.action_clip
         if clip is None:
             return action
-        pairs = clip if isinstance(clip, tuple) else [(-clip, clip)] * self.num_actions
-        lower, upper = (self.constant(limits) for limits in zip(*pairs, strict=True))
+        lower, upper = (self.constant(limits) for limits in zip(*_limits(clip, self.num_actions), strict=True))
         return torch.clamp(action, lower, upper)
 
     def _as_the_robots(self, action: torch.Tensor) -> torch.Tensor:
@@ -433,3 +441,10 @@ class Described(torch.nn.Module):
 
 def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,) * count
+
+
+def _limits(clip: Any, count: int) -> Sequence[tuple[float, float]]:
+    """Lower and upper limits of so many columns, by one size, one pair, one pair each or None."""
+    if isinstance(clip, tuple):
+        return clip if isinstance(clip[0], tuple) else [clip] * count
+    return [(-math.inf, math.inf) if clip is None else (-clip, clip)] * count

@@ -223,6 +223,8 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
         ('{term = "scan", order = "x fastest", x = [0.05], y = [0, 0.1]}', "",
          r"scan_x = \[0\.05\] and scan_y = \[0\.0, 0\.1\]"),
         ('{term = "gravity"}', "", r"87 observations.*\(gravity 3\) has 3 observations"),
+        ('{term = "gravity", clip = [1, 0]}', "", r"observation\[0\]\.clip"),
+        ('{term = "gravity"}', "action_clip = -1", "action_clip"),
         ("", "", "observation"),
         ("[" * 5000, "", "TOML"),
         ('{term = "gravity"', "", "TOML"),
