@@ -87,12 +87,17 @@ def recurrent(request):
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit", "ignore:.torch.onnx", "ignore:You are using the legacy")
-@pytest.mark.parametrize("kind", ["checkpoint", "script", "onnx"])
+@pytest.mark.parametrize("kind", ["checkpoint", "rsl_rl 3", "script", "onnx"])
 def test_what_remembers_one_robot_remembers_any_number_apart(tmp_path, anymal, recurrent, kind):
     actor, steps, expected = recurrent
     path = tmp_path / ("policy.onnx" if kind == "onnx" else "policy.pt")
     if kind == "checkpoint":
         torch.save({"actor_state_dict": actor.state_dict(), "activation": "elu"}, path)
+    elif kind == "rsl_rl 3":
+        names = {"rnn.rnn.": "memory_a.rnn.", "mlp.": "actor.", "obs_normalizer.": "actor_obs_normalizer."}
+        old = {new + key.removeprefix(now): value for now, new in names.items()
+               for key, value in actor.state_dict().items() if key.startswith(now)}  # fmt: skip
+        torch.save({"model_state_dict": old, "activation": "elu"}, path)
     elif kind == "script":
         torch.jit.script(actor.as_jit().eval()).save(str(path))
     else:
