@@ -34,9 +34,9 @@ _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m
 
 def check(
     robot: RobotCfg, policy: str | None = None, *, compute: Compute, seconds: float = 3.0, seed: int = 0,
-    anyway: bool = False, out: Path | None = None,
+    anyway: bool = False,
 ) -> bool:  # fmt: skip
-    """Prints what is read, whether it stands and walks, and what it gets over; measures scales if there are none.
+    """Prints what is read, whether it stands and walks, and what it gets over.
 
     Args:
         robot: Robot settings.
@@ -45,7 +45,6 @@ def check(
         seconds: How long it stands, and lies [s].
         seed: Draws poses, terrains and starts.
         anyway: Whether to go on although it does not walk.
-        out: Where the scales of its penalties go; beside the robot if None, and then only if there are none.
 
     Returns:
         Whether it stands as it should and walks alike in both simulators.
@@ -68,19 +67,16 @@ def check(
         dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=seed)
         stairs, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
         print(f"Half get over a kerb {kerb}, stairs {stairs}; 80 % cross hard-random terrains at --height {height:g}.")
-        if out is not None or not robot.scales_file.exists():
-            calibrate(robot, policy, compute=compute, terrains=_terrains(compute), replicas=4, seed=seed, out=out)
     return fine and walks
 
 
 def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
-    """A robot of a robot.toml with room in its buffers and the scales of its penalties; any other as it is.
+    """A user's robot with room in its buffers and the scales of its penalties.
 
     What is missing is measured with the controller of its first use, and written beside it. Scales of the robot before
     it changed are missing, too.
     """
-    file = robot.settings_file
-    if file is None or file.suffix != ".toml":
+    if robot.settings_file is None:
         return robot
     try:
         read_penalty_scales(robot)

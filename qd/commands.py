@@ -231,9 +231,8 @@ class Check(ControllerFlags, WorkerFlags):
 
     It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
     contacts and constraint rows it needs when it lies on rough ground; whether it walks on flat ground, here and in
-    MuJoCo C; at which height of terrain it crosses about 80 %; and which kerbs and stairs stop it. At the end it
-    measures the scales of the penalties, on hard-random terrains of that height, if there are none. The exit status is
-    1 if something must be mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
+    MuJoCo C; at which height of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1
+    if something must be mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
     """
 
     seconds: Annotated[float, Meta(gt=0, le=60)] = 3.0
@@ -242,8 +241,6 @@ class Check(ControllerFlags, WorkerFlags):
     """Draws poses, terrains and starts."""
     anyway: bool = False
     """Go on although it does not walk."""
-    out: Path | None = None
-    """Measure the scales anew, and write them here."""
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
@@ -252,7 +249,7 @@ class Check(ControllerFlags, WorkerFlags):
         from sim.robots.find import get_robot
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
-        flags = {"seconds": self.seconds, "seed": self.seed, "anyway": self.anyway, "out": self.out}
+        flags = {"seconds": self.seconds, "seed": self.seed, "anyway": self.anyway}
         return 0 if check(get_robot(self.robot), self.policy, compute=compute, **flags) else 1
 
 

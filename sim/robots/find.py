@@ -63,7 +63,7 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
 def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[float, ...]:
     """Scales of the penalties, in their order; an error says how to measure those of the command line's policy."""
     given = policy if robot.settings_file is not None else None  # a shipped robot's are of its own controller
-    remedy = f"run `{command_line('check', robot=robot.spec, policy=given)}`"
+    remedy = f"run `{command_line('archive', robot=robot.spec, policy=given)}`, which measures them first"
     if given is None and not robot.policy_file.exists():
         remedy = f"train its controller first with `{robot.train_command}`, or name one with --policy; then {remedy}"
     if not robot.scales_file.exists():
