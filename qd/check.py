@@ -13,7 +13,6 @@ from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, check_policy
-from qd.workers.invalid import invalid_reasons, reason_words
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.mujoco_c.crossing import cross_terrains
@@ -59,7 +58,7 @@ def check(
         return fine
     check_policy(policy, robot, compute.device)
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
-        walks = _walk(crossings, policy, seed)
+        walks = _walks(robot, walk(crossings, policy, seed))
         if walks or anyway:
             height = fitting_height(crossings, policy, SUPER_GAUSSIAN, seed=seed)
     if walks or anyway:
@@ -119,23 +118,47 @@ def _with_room(robot: RobotCfg, device: str, seconds: float, seed: int) -> tuple
     return wanted, standing
 
 
-def _walk(crossings: Crossings, policy: str, seed: int) -> bool:
-    """Lets it cross flat ground here and in MuJoCo C; prints speed, height and goal of both, and whether they agree."""
-    robot = crossings.robot
+def walk(crossings: Crossings, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
+    """How a controller walks over flat ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
+
+    Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` from the start to the end
+    [m/s], and ``height`` of the base at the end [m].
+    """
     flat, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([seed], np.uint32)
     here = crossings.cross(policy, flat, seeds, replicas=_WALKS, label="flat ground", invalid_ok=True)
     ((_, there),) = cross_terrains(
-        robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
+        crossings.robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
     )
-    (speed, words), (other, other_words) = (_walked(result) for result in (here, there))
-    print(f"On flat ground at {robot.speed:g} m/s: {words}. In MuJoCo C: {other_words}.", flush=True)
-    walks = here.reached_goal.mean() >= 0.5 and there.reached_goal.mean() >= 0.5
-    alike = abs(speed - other) <= _APART * max(speed, other)
-    if not walks:
+    return {"searched": _walked(here), "mujoco_c": _walked(there)}
+
+
+def _walked(result: RolloutResult) -> dict[str, float]:
+    valid = ~result.invalid
+    way = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
+    numbers = {
+        "goal": result.reached_goal[valid],
+        "speed": way / result.duration_s[valid],
+        "height": result.final_position[valid][:, 2],
+    }
+    means = {name: float(values.mean()) if valid.any() else 0.0 for name, values in numbers.items()}
+    return {"episodes": int(valid.sum()), **means}
+
+
+def _walks(robot: RobotCfg, walked: dict[str, dict[str, float]]) -> bool:
+    """Prints how it walks in both simulators; returns whether it does, and at the same speed."""
+    here, there = (
+        f"{round(now['goal'] * now['episodes'])} of {now['episodes']:.0f} reach the goal, {now['speed']:.3f} m/s, base "
+        f"{now['height']:.3f} m high"
+        for now in walked.values()
+    )
+    print(f"On flat ground at {robot.speed:g} m/s: {here}. In MuJoCo C: {there}.", flush=True)
+    slow, fast = sorted(now["speed"] for now in walked.values())
+    if min(now["goal"] for now in walked.values()) < FAILING_GOAL_RATE:
         print("It does not walk: look at the order of joints, default pose, scales, gains, and what it observes.")
-    elif not alike:
+        return False
+    if fast - slow > _APART * fast:
         print(f"Its speeds differ by more than {_APART:.0%}: what holds in one simulator need not in the other.")
-    return walks and alike
+    return fast - slow <= _APART * fast
 
 
 def _half_words(dose: dict[str, Any], element: str) -> str:
@@ -146,15 +169,3 @@ def _half_words(dose: dict[str, Any], element: str) -> str:
         over = first is not None and first >= FAILING_GOAL_RATE
         return f"of over {100 * _RISES[-1]:.0f} cm" if over else f"of less than {100 * _RISES[0]:.0f} cm"
     return f"of {100 * half:.0f} cm"
-
-
-def _walked(result: RolloutResult) -> tuple[float, str]:
-    """Mean speed of the valid episodes [m/s], and how they went in words."""
-    valid = ~result.invalid
-    if not valid.any():
-        return 0.0, f"no valid episode ({reason_words(invalid_reasons(result))})"
-    way = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
-    speed = float((way / result.duration_s[valid]).mean())
-    goal, count = int(result.reached_goal.sum()), int(valid.sum())
-    height = float(result.final_position[valid][:, 2].mean())
-    return speed, f"{goal} of {count} reach the goal, {speed:.3f} m/s, base {height:.3f} m high"

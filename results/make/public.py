@@ -1,0 +1,108 @@
+"""What breaks published controllers, each by one import and one search: results/public.json.
+
+FOLDER holds the controllers and models of their publishers, as docs/controllers.md says where to get them. Everything
+but the network of mujoco_playground's Go1 is read from the publisher's files; of that nobody says what it sees.
+"""
+
+import argparse
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from qd.check import made_ready, walk
+from qd.judge import judge
+from qd.run.directory import RunDirectory
+from qd.run.settings import preset
+from qd.search import search
+from qd.workers.cross import Crossings
+from qd.workers.evaluator import Compute
+from results.make.spaces import COUNTS, causes_of
+from sim.device import resolve_device
+from sim.files.atomic import write_atomically
+from sim.files.records import provenance, sources_sha256
+from sim.policy.imports import import_controller
+from sim.robots.find import fitting_space, get_robot
+
+CONTROLLERS = {  # source and model below FOLDER, and what is filled in behind the lines of controller and robot
+    "go2-robot-lab": ("go2", "go2/model/urdf/go2.urdf", "", ""),
+    "go2-himloco": ("go2/himloco.yaml", "go2/model/urdf/go2.urdf", "", ""),
+    "g1-unitree": ("g1/g1.yaml", "g1/model/g1_12dof.xml", "", ""),
+    "go1-playground": (
+        "go1/go1_policy.onnx",
+        "go1/model/go1_mjx_fullcollisions.xml",
+        """action_scale = 0.5
+observation = [
+  {term = "lin_vel", at = [-0.01592, -0.06659, -0.00617]}, {term = "ang_vel"}, {term = "gravity"}, {term = "joint_pos"},
+  {term = "joint_vel"}, {term = "last_action"}, {term = "command"},
+]
+""",
+        "default_joint_pos = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]\n"
+        "physics_dt = 0.004\ndecimation = 5\n",
+    ),
+}
+ITERATIONS = 40
+"""Of preset wide: 256,000 episodes."""
+
+
+def fill_in(file: Path, text: str) -> None:
+    """Puts settings into a TOML of an import, in place of its gaps and guesses of the same names."""
+    names = [line.partition(" =")[0] for line in text.splitlines() if " = " in line and line[0].isalpha()]
+    kept = [line for line in file.read_text().splitlines(True)
+            if not any(line.removeprefix("# ").startswith(f"{name} =") for name in names)]  # fmt: skip
+    file.write_text("".join(kept) + text)
+
+
+def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
+    """Imports a controller, lets it walk in both simulators, and searches what breaks it."""
+    source, model, of_controller, of_robot = CONTROLLERS[name]
+    home, run = runs / name, runs / f"{name}-archive"
+    if not (home / "robot.toml").exists():
+        import_controller(folder / source, folder / model, home)
+        fill_in(home / "controller.toml", of_controller)
+        fill_in(home / "robot.toml", of_robot)
+    robot = made_ready(get_robot(str(home / "robot.toml")), None, compute)
+    with Crossings(robot, compute, cache=runs / "crossings") as crossings:
+        walked = walk(crossings, str(robot.policy_file), seed)
+    cfg = preset("small" if small else "wide", robot, None, space=fitting_space(robot) or "super_gaussian")
+    began = time.perf_counter()
+    search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
+    wall_s = time.perf_counter() - began
+    certifiers = sorted(robot.panel.glob("*.pt")) + sorted(robot.panel.glob("*/controller.toml"))
+    stages: Any = ("fresh",) if small else ("fresh", "resolved", *(["others"] if certifiers else []))
+    archive = judge(run, stages=stages, compute=compute, robot=robot.spec)
+    summary = RunDirectory(run).read_summary()
+    counts = {count: summary.get(count) for count in COUNTS}
+    return {"flat": walked, "space": cfg.space, **counts, "wall_s": wall_s, "causes": causes_of(archive)}
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Measures all of them, or those named, and writes what came of it as each is done."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder of the publishers' files")
+    parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
+    parser.add_argument("--device", help="a CUDA device if there is one")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
+    parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
+    args = parser.parse_args(argv)
+    compute = Compute(resolve_device(args.device))
+    out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
+    runs = out.parent / "public" if args.small else Path("runs/make") / sources_sha256()[:12] / "public"
+    if args.small:
+        shutil.rmtree(runs, ignore_errors=True)
+    content = provenance(compute.device, args.seed) | {"controllers": {}}
+    for name in args.only:
+        numbers = measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+        content["controllers"][name] = numbers
+        print(json.dumps({name: numbers}, indent=1), flush=True)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, (json.dumps(content, indent=1) + "\n").encode())
+    return content
+
+
+if __name__ == "__main__":
+    main()
