@@ -44,7 +44,7 @@ observation = [
         "physics_dt = 0.004\ndecimation = 5\n",
     ),
 }
-ITERATIONS = 40
+ITERATIONS = 8
 """Of preset wide: 256,000 episodes."""
 
 

@@ -13,7 +13,7 @@ def on_plane(robot, quat_wxyz=(1, 0, 0, 0), *, time_constant_s=None) -> mujoco.M
     ground = model.geom("ground").id
     model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0
     model.geom_size[ground], model.geom_pos[ground] = (0.0, 0.0, 0.05), (8.0, 4.0, 0.0)
-    model.geom_quat[ground] = quat_wxyz
+    model.geom_quat[ground], model.geom_sameframe[ground] = quat_wxyz, 0  # else MuJoCo keeps the frame of its body
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the heightfield
     return model
 
