@@ -2,10 +2,10 @@
 
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from msgspec import Meta
@@ -16,166 +16,44 @@ from sim.policy.mlp import ACTIVATIONS
 from sim.policy.runner import with_rows_of_zeros
 from sim.robots.robot import RobotCfg
 
+TERMS: dict[str, tuple[str, ...]] = {
+    "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
+    "joint_vel": ("joints",), "last_action": (), "clock": ("period_s",), "scan": ("order", "x", "y", "offset"),
+}  # fmt: skip
+"""Fields of each term beside those that all have; docs/controllers.md says what they are."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Term:
     """Columns of the observation: limited, then scaled, then remembered."""
 
-    name: ClassVar[str]
-
+    term: str
+    """Which of :data:`TERMS`."""
     clip: float | tuple[float, float] | None = None
     """Largest size, or limits, in the quantity's unit, before ``scale``."""
     scale: float | tuple[float, ...] = 1.0
     """One factor, or one a column."""
     history: PositiveInt | None = None
     """How many control steps of it are seen; the controller's if None."""
-
-    def _width(self, controller: "Described") -> int:
-        """Columns of one control step."""
-        return 3
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        """Its quantity, shape (num_envs, width)."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class LinVel(Term):
-    """Linear velocity, base frame [m/s]."""
-
-    name = "lin_vel"
-
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Place where it is measured, for example of the IMU, base frame [m]."""
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        place = controller.constant(self.at).expand_as(sensed.ang_vel)
-        return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, place)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AngVel(Term):
-    """Angular velocity, base frame [rad/s]."""
-
-    name = "ang_vel"
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        return sensed.ang_vel
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gravity(Term):
-    """Direction of gravity, base frame: (0, 0, -1) upright."""
-
-    name = "gravity"
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        return sensed.gravity
-
-
-@dataclass(frozen=True, kw_only=True)
-class Command(Term):
-    """Commanded v_x, v_y [m/s] and yaw rate [rad/s]."""
-
-    name = "command"
-
+    at: tuple[float, float, float] | None = None
+    """Where the velocity is measured, for example by the IMU, base frame [m]; at the base link's origin if None."""
     limit: float | tuple[float, float, float] | None = None
-    """The largest size of each that it is told."""
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        if self.limit is None:
-            return sensed.command
-        limit = controller.constant(_each(self.limit, 3))
-        return torch.clamp(sensed.command, -limit, limit)
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointPos(Term):
-    """Joint angles minus its default pose [rad]."""
-
-    name = "joint_pos"
-
+    """The largest size of each command that it is told."""
     joints: tuple[str, ...] | None = None
     """Other joints than those that it moves; in this order."""
-
-    def _width(self, controller: "Described") -> int:
-        return len(controller.numbers(self.joints))
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        numbers = controller.numbers(self.joints)
-        return sensed.joint_pos[:, controller.index(numbers)] - controller.constant(controller.pose_of(numbers))
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointVel(Term):
-    """Joint rates [rad/s]."""
-
-    name = "joint_vel"
-
-    joints: tuple[str, ...] | None = None
-    """Other joints than those that it moves; in this order."""
-
-    def _width(self, controller: "Described") -> int:
-        return len(controller.numbers(self.joints))
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        return sensed.joint_vel[:, controller.index(controller.numbers(self.joints))]
-
-
-@dataclass(frozen=True, kw_only=True)
-class LastAction(Term):
-    """What its network last returned, within ``action_clip``; 0 at the start."""
-
-    name = "last_action"
-
-    def _width(self, controller: "Described") -> int:
-        return controller.num_actions
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        return memory.action
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clock(Term):
-    """Sine and cosine of the time since the episode began."""
-
-    name = "clock"
-
-    period_s: PositiveFloat
-
-    def _width(self, controller: "Described") -> int:
-        return 2
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        angle = memory.steps * (2.0 * math.pi * controller.robot.control_dt / self.period_s)
-        return torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scan(Term):
-    """Height of the base over the ground minus ``offset`` [m], at points about the base, yaw frame."""
-
-    name = "scan"
-
-    order: Annotated[str, Meta(pattern="^(x fastest|y fastest)$")]
+    period_s: PositiveFloat | None = None
+    order: Annotated[str, Meta(pattern="^(x fastest|y fastest)$")] | None = None
     x: tuple[float, ...] | None = None
-    """Ahead of the base [m]; the robot's ``scan_x`` if None."""
+    """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None
     """Left of it [m]; the robot's ``scan_y`` if None."""
-    offset: float = 0.0
+    offset: float | None = None
+    """What is taken off the height of the base over the ground [m]."""
 
-    def points(self, robot: RobotCfg) -> list[tuple[float, float]]:
-        """Where it is measured, in its order [m]."""
-        xs, ys = self.x or robot.scan_x, self.y or robot.scan_y
-        if self.order == "x fastest":
-            return [(x, y) for y in ys for x in xs]
-        return [(x, y) for x in xs for y in ys]
-
-    def _width(self, controller: "Described") -> int:
-        return len(self.points(controller.robot))
-
-    def _read(self, sensed: Sensed, controller: "Described", memory: "_Memory") -> torch.Tensor:
-        return sensed.scan.flatten(1)[:, controller.index(controller.scan_numbers(self))] - self.offset
+    @property
+    def name(self) -> str:
+        """Which of :data:`TERMS`."""
+        return self.term
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,9 +96,6 @@ class ControllerCfg:
     """Between the layers of an rsl_rl checkpoint, which does not say it."""
 
 
-_TERMS = {term.name: term for term in Term.__subclasses__()}
-
-
 def read_controller(path: Path) -> ControllerCfg:
     """Reads a description; an error names the file and the field."""
     try:
@@ -232,26 +107,25 @@ def read_controller(path: Path) -> ControllerCfg:
         raise ValueError(f'{path}: observation must be a list of terms, for example [{{term = "gravity"}}]')
     terms = []
     for k, item in enumerate(items):
-        name = item.pop("term", None)
-        if not isinstance(name, str) or name not in _TERMS:
-            raise ValueError(f"{path}: observation[{k}].term must be one of {', '.join(_TERMS)}, got {name}")
-        terms.append(from_builtins(_TERMS[name], item, f"{path}: observation[{k}] ({name})"))
+        name = item.get("term")
+        if not isinstance(name, str) or name not in TERMS:
+            raise ValueError(f"{path}: observation[{k}].term must be one of {', '.join(TERMS)}, got {name}")
+        place = f"{path}: observation[{k}] ({name})"
+        if unknown := item.keys() - {"term", "clip", "scale", "history", *TERMS[name]}:
+            raise ValueError(f"{place} has no setting {', '.join(sorted(unknown))}")
+        if missing := {"period_s", "order"} & {*TERMS[name]} - item.keys():
+            raise ValueError(f"{place}: missing '{missing.pop()}'")
+        terms.append(from_builtins(Term, item, place))
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
 
 
 class _Memory(NamedTuple):
-    """What a controller knows of each robot, written in place; tensors lead with num_envs."""
+    """What a controller knows of each robot, written in place; 0 as an episode begins."""
 
-    steps: torch.Tensor
-    """Control steps since the episode began, float, shape (num_envs, 1)."""
-    action: torch.Tensor
-    """Last output of the network."""
-    sent: torch.Tensor
-    """Outputs that do not count yet, the newest first, shape (num_envs, action_delay_steps, num_actions)."""
-    past: torch.Tensor
-    """Observations, the newest first, shape (num_envs, length, width)."""
-    begins: torch.Tensor
-    """Whether the coming step is the first, bool, shape (num_envs, 1, 1)."""
+    steps: torch.Tensor  # control steps since then, float, (num_envs, 1)
+    action: torch.Tensor  # last output of the network, (num_envs, num_actions)
+    sent: torch.Tensor  # outputs that do not count yet, the newest first, (num_envs, action_delay_steps, num_actions)
+    past: torch.Tensor  # observations, the newest first, (num_envs, length, width)
 
 
 class Described(torch.nn.Module):
@@ -262,64 +136,80 @@ class Described(torch.nn.Module):
         super().__init__()
         self.cfg, self.robot, self._place = cfg, robot, place
         self.network: Any = None
-        self._device = torch.device("cpu")
-        self._numbers: dict[Any, tuple[int, ...]] = {}
-        self._tensors: dict[Any, torch.Tensor] = {}
-        self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
-        self.num_actions = len(self.numbers(None))
+        self._moved = self._numbers(cfg.joints)
+        self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
             if isinstance(values, tuple) and len(values) != self.num_actions:
                 self._refuse(f"{name} must have one value a joint, {self.num_actions}, got {len(values)}")
-        if any(lower > upper for lower, upper in _limits(cfg.action_clip, 1)):
-            self._refuse(f"action_clip must be above 0, or have its lower limits first, got {cfg.action_clip}")
-        self.widths = [term._width(self) for term in cfg.observation]
+        self._check_limits("action_clip", cfg.action_clip)
+        self._picked = [self._columns_of(term) for term in cfg.observation]
+        self.widths = [len(columns) for columns in self._picked]
         for k, (term, width) in enumerate(zip(cfg.observation, self.widths, strict=True)):
             if isinstance(term.scale, tuple) and len(term.scale) != width:
                 self._refuse(f"observation[{k}].scale must be one number or {width}, got {len(term.scale)}")
-            if any(lower > upper for lower, upper in _limits(term.clip, 1)):
-                self._refuse(f"observation[{k}].clip must be above 0, or have its lower limit first, got {term.clip}")
-            if isinstance(term, Scan):
-                self.scan_numbers(term)
+            self._check_limits(f"observation[{k}].clip", term.clip)
         history = cfg.history
         self.lengths = [term.history or (history.length if history else 1) for term in cfg.observation]
         if max(self.lengths) > 1 and history is None:
             self._refuse("history must say how steps are laid out: {length = 1, newest, by, fill}")
         if history is not None and history.by == "row" and len(set(self.lengths)) > 1:
             self._refuse(f'history.by must be "term" where terms have other lengths, got {self.lengths}')
+        self.use(None, torch.device("cpu"))
 
     def use(self, network: Any, device: torch.device) -> None:
         """Set the network, which has :attr:`observation_size` columns and one action a joint."""
+        cfg, pose, count = self.cfg, self.robot.default_joint_pos, self.num_actions
         self.network, self._device = network, device
+        self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
+
+        def constant(values: Iterable[Any]) -> torch.Tensor:
+            return torch.tensor(list(values), dtype=torch.float32, device=device)
+
+        own = dict(enumerate(pose)) | dict(zip(self._moved, cfg.default or [pose[k] for k in self._moved], strict=True))
+        minus, limits, scale = [], [], []
+        for term, columns in zip(cfg.observation, self._picked, strict=True):
+            minus += [own[k] if term.name == "joint_pos" else term.offset or 0.0 for k in columns]
+            scale += _each(term.scale, len(columns))
+            ((lower, upper),) = _limits(term.clip, 1)
+            told = _each(math.inf if term.limit is None else term.limit, len(columns))
+            limits += [[min(max(limit, lower), upper) for limit in (-size, size)] for size in told]
+        self._index = [torch.tensor(columns, device=device) for columns in self._picked]
+        self._at = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
+        self._minus, self._limits, self._scale = constant(minus), constant(limits).T, constant(scale)
+        self._clip = constant(_limits(cfg.action_clip, count)).T
+        self._joints, self._pose = torch.tensor(self._moved, device=device), constant(pose[k] for k in self._moved)
+        self._offset = constant(cfg.action_offset or [own[k] for k in self._moved])
+        self._radians = constant(_each(cfg.action_scale, count))
 
     def _refuse(self, problem: str) -> None:
         raise ValueError(f"{self._place}: {problem}")
 
-    def numbers(self, joints: tuple[str, ...] | None) -> tuple[int, ...]:
-        """The robot's numbers of joints, by default of those that it moves."""
-        if joints not in self._numbers:
-            own, given = self.robot.joint_names, self.cfg.joints if joints is None else joints
-            names = own if given is None else given
-            unknown = [name for name in names if name not in own]
-            if unknown or len(set(names)) < len(names):
-                got = f"no {', '.join(unknown)}" if unknown else "each of them once"
-                self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(own)}")
-            self._numbers[joints] = tuple(own.index(name) for name in names)
-        return self._numbers[joints]
+    def _check_limits(self, name: str, clip: Any) -> None:
+        if any(lower > upper for lower, upper in _limits(clip, 1)):
+            self._refuse(f"{name} must be above 0, or have its lower limit first, got {clip}")
 
-    def pose_of(self, numbers: Sequence[int]) -> tuple[float, ...]:
-        """Its default pose of the robot's joints of these numbers, and the robot's of those that it does not move."""
-        pose = dict(enumerate(self.robot.default_joint_pos))
-        pose |= zip(self.numbers(None), self.cfg.default or [pose[k] for k in self.numbers(None)], strict=True)
-        return tuple(pose[k] for k in numbers)
+    def _numbers(self, names: tuple[str, ...] | None) -> tuple[int, ...]:
+        """The robot's numbers of joints, of all of them by default."""
+        own = self.robot.joint_names
+        names = own if names is None else names
+        unknown = [name for name in names if name not in own]
+        if unknown or len(set(names)) < len(names):
+            got = f"no {', '.join(unknown)}" if unknown else "each of them once"
+            self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(own)}")
+        return tuple(own.index(name) for name in names)
 
-    def scan_numbers(self, term: Scan) -> tuple[int, ...]:
-        """The robot's numbers of a scan's points."""
-        if term in self._numbers:
-            return self._numbers[term]
-        xs, ys = self.robot.scan_points()
-        numbers = {(round(float(x), 4), round(float(y), 4)): k for k, (x, y) in enumerate(zip(xs, ys, strict=True))}
-        points = [(round(x, 4), round(y, 4)) for x, y in term.points(self.robot)]
+    def _columns_of(self, term: Term) -> Sequence[int]:
+        """Which columns a term takes of its quantity."""
+        if term.name.startswith("joint"):
+            return self._moved if term.joints is None else self._numbers(term.joints)
+        if term.name != "scan":
+            return range({"last_action": self.num_actions, "clock": 2}.get(term.name, 3))
+        xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
+        points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
+        numbers = {(round(float(x), 4), round(float(y), 4)): k
+                   for k, (x, y) in enumerate(zip(*self.robot.scan_points(), strict=True))}  # fmt: skip
+        points = [(round(x, 4), round(y, 4)) for x, y in points]
         if not points:
             self._refuse("a scan must have x and y where the robot has no scan_x and scan_y")
         if not set(points) <= numbers.keys():
@@ -327,20 +217,7 @@ class Described(torch.nn.Module):
             self._refuse(
                 f"the scan's points are not those of the robot: write into robot.toml scan_x = {x} and scan_y = {y}"
             )
-        self._numbers[term] = tuple(numbers[point] for point in points)
-        return self._numbers[term]
-
-    def constant(self, values: Sequence[float]) -> torch.Tensor:
-        """Floats on the device, which are copied once."""
-        if values not in self._tensors:
-            self._tensors[values] = torch.tensor(values, dtype=torch.float32, device=self._device)
-        return self._tensors[values]
-
-    def index(self, numbers: tuple[int, ...]) -> torch.Tensor:
-        """Column numbers on the device, which are copied once."""
-        if ("index", numbers) not in self._tensors:
-            self._tensors["index", numbers] = torch.tensor(numbers, device=self._device)
-        return self._tensors["index", numbers]
+        return [numbers[point] for point in points]
 
     @property
     def observation_size(self) -> int:
@@ -351,8 +228,7 @@ class Described(torch.nn.Module):
     def columns(self) -> str:
         """What the network sees, in words."""
         terms = zip(self.cfg.observation, self.widths, self.lengths, strict=True)
-        parts = [f"{term.name} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms]
-        return ", ".join(parts)
+        return ", ".join(f"{term.name} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
 
     @property
     def graph_safe(self) -> bool:
@@ -364,17 +240,13 @@ class Described(torch.nn.Module):
         if count not in self._memories:
             sizes = ((1,), (self.num_actions,), (self.cfg.action_delay_steps, self.num_actions),
                      (max(self.lengths), sum(self.widths)))  # fmt: skip
-            zeros = [torch.zeros((count, *size), device=self._device) for size in sizes]
-            begins = torch.ones((count, 1, 1), dtype=torch.bool, device=self._device)
-            self._memories[count] = _Memory._make([*zeros, begins])
+            self._memories[count] = _Memory(*(torch.zeros((count, *size), device=self._device) for size in sizes))
         return self._memories[count]
 
     @torch.inference_mode()
     def reset(self, rows: torch.Tensor) -> None:
         """Begin an episode where ``rows``, bool, shape (num_envs,), is true."""
-        memory = self._memory_of(len(rows))
-        memory.begins.copy_(rows[:, None, None])
-        for values in memory[:-1]:
+        for values in self._memory_of(len(rows)):
             values.masked_fill_(rows.reshape(-1, *[1] * (values.ndim - 1)), 0.0)
         if hasattr(self.network, "reset"):
             self.network.reset(rows)
@@ -382,29 +254,45 @@ class Described(torch.nn.Module):
     @torch.inference_mode()
     def forward(self, row: torch.Tensor) -> torch.Tensor:
         """The robot's actions, shape (num_envs, num_joints)."""
-        cfg, memory = self.cfg, self._memory_of(len(row))
-        sensed = read_row(row, self.robot)
-        now = torch.cat([self._column(term, sensed, memory) for term in cfg.observation], dim=1)
-        if cfg.observation_clip is not None:
-            now = now.clamp(-cfg.observation_clip, cfg.observation_clip)
-        seen = self._with_history(now, memory)
+        seen = self.observe(row)
         if hasattr(self.network, "reset"):
-            output = self.network(seen)
-        else:
-            output = self.network(with_rows_of_zeros(seen))[: len(row)]
-        memory.action.copy_(self._clipped(output))
+            return self.act(self.network(seen))
+        return self.act(self.network(with_rows_of_zeros(seen))[: len(row)])
+
+    @torch.inference_mode()
+    def observe(self, row: torch.Tensor) -> torch.Tensor:
+        """What the network sees of the robot's rows, shape (num_envs, observation_size); once a control step."""
+        clip, memory, sensed = self.cfg.observation_clip, self._memory_of(len(row)), read_row(row, self.robot)
+        parts = [
+            self._quantity(term, sensed, memory, at)[:, index]
+            for term, at, index in zip(self.cfg.observation, self._at, self._index, strict=True)
+        ]
+        now = (torch.cat(parts, dim=1) - self._minus).clamp(*self._limits) * self._scale
+        return self._with_history(now if clip is None else now.clamp(-clip, clip), memory)
+
+    @torch.inference_mode()
+    def act(self, output: torch.Tensor) -> torch.Tensor:
+        """The robot's actions of what the network returns, shape (num_envs, num_actions)."""
+        memory = self._memory_of(len(output))
+        memory.action.copy_(output.clamp(*self._clip))
         memory.steps.add_(1.0)
-        memory.begins.zero_()
         queue = torch.cat([memory.action[:, None], memory.sent], dim=1)
         memory.sent.copy_(queue[:, :-1])
-        return self._as_the_robots(queue[:, -1])
+        own = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
+        actions = own.new_zeros(len(own), self.robot.num_joints)  # 0 holds the default pose
+        actions[:, self._joints] = own
+        return actions
 
-    def _column(self, term: Term, sensed: Sensed, memory: _Memory) -> torch.Tensor:
-        value = term._read(sensed, self, memory)
-        if term.clip is not None:
-            ((lower, upper),) = _limits(term.clip, 1)
-            value = value.clamp(lower, upper)
-        return value * (self.constant(term.scale) if isinstance(term.scale, tuple) else term.scale)
+    def _quantity(self, term: Term, sensed: Sensed, memory: _Memory, at: torch.Tensor) -> torch.Tensor:
+        """What a term takes its columns from, shape (num_envs, any)."""
+        if term.name == "lin_vel":
+            return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, at.expand_as(sensed.ang_vel))
+        if term.name == "last_action":
+            return memory.action
+        if term.name == "clock":
+            angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
+            return torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
+        return getattr(sensed, term.name).flatten(1)
 
     def _with_history(self, now: torch.Tensor, memory: _Memory) -> torch.Tensor:
         history = self.cfg.history
@@ -412,31 +300,12 @@ class Described(torch.nn.Module):
             return now
         past = torch.cat([now[:, None], memory.past[:, :-1]], dim=1)
         if history.fill == "first":
-            past = torch.where(memory.begins, now[:, None], past)
+            past = torch.where(memory.steps[:, :, None] == 0.0, now[:, None], past)
         memory.past.copy_(past)
         terms = [past] if history.by == "row" else past.split(self.widths, dim=2)
         lengths = self.lengths if history.by == "term" else self.lengths[:1]
         steps = [term[:, :length] for term, length in zip(terms, lengths, strict=True)]
-        if history.newest == "last":
-            steps = [term.flip(1) for term in steps]
-        return torch.cat([term.flatten(1) for term in steps], dim=1)
-
-    def _clipped(self, action: torch.Tensor) -> torch.Tensor:
-        clip = self.cfg.action_clip
-        if clip is None:
-            return action
-        lower, upper = (self.constant(limits) for limits in zip(*_limits(clip, self.num_actions), strict=True))
-        return torch.clamp(action, lower, upper)
-
-    def _as_the_robots(self, action: torch.Tensor) -> torch.Tensor:
-        """Actions of all joints that make its targets; of the joints that it does not move they are 0."""
-        cfg, robot, moved = self.cfg, self.robot, self.numbers(None)
-        scale = self.constant(_each(cfg.action_scale, self.num_actions))
-        target = self.constant(cfg.action_offset or self.pose_of(moved)) + scale * action
-        own = (target - self.constant(tuple(robot.default_joint_pos[k] for k in moved))) / robot.action_scale
-        actions = own.new_zeros(len(own), robot.num_joints)
-        actions[:, self.index(moved)] = own
-        return actions
+        return torch.cat([(term.flip(1) if history.newest == "last" else term).flatten(1) for term in steps], dim=1)
 
 
 def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
