@@ -1,26 +1,109 @@
 """What a training or a vendor left of a controller and its robot, as robot.toml and controller.toml."""
 
 import os
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
 
 from sim.files.command import command_line
 from sim.files.settings import to_toml
-from sim.policy.isaac_lab import read_isaac_lab
-from sim.policy.sources import (
-    Found,
-    Model,
-    Setting,
-    onnx_metadata,
-    read_deployment,
-    read_mjlab,
-    read_rl_sar,
-    read_weights,
-    read_yaml,
-)
+from sim.policy.loaders import PlainYaml, load_network
 from sim.robots.compiled import joint_names
-from sim.robots.own import compile_model
+from sim.robots.own import PER_JOINT, compile_model, default_pose, per_joint
+from sim.robots.robot import RobotCfg
+
+_FILES = {
+    "robot.toml": ("model_file", *PER_JOINT, "physics_dt", "decimation", "speed", "max_duration_s"),
+    "controller.toml": ("policy", "joints", "action_scale", "action_offset", "action_clip", "observation_clip",
+                        "activation", "history", "observation"),
+}  # fmt: skip
+_TERMS = {
+    "lin_vel": "lin_vel", "ang_vel": "ang_vel", "ang_vel_body": "ang_vel", "gravity_vec": "gravity",
+    "commands": "command", "dof_pos": "joint_pos", "dof_vel": "joint_vel", "base_lin_vel": "lin_vel",
+    "base_ang_vel": "ang_vel", "projected_gravity": "gravity", "command": "command", "velocity_commands": "command",
+    "joint_pos": "joint_pos", "joint_vel": "joint_vel", "actions": "last_action", "last_action": "last_action",
+}  # fmt: skip
+"""Of rl_sar and of mjlab, whose names have nothing but their meaning in common."""
+_ISAAC_TERMS = {"base_lin_vel": "lin_vel", "base_ang_vel": "ang_vel", "projected_gravity": "gravity",
+                "generated_commands": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel",
+                "last_action": "last_action", "height_scan": "scan", "gait_phase": "clock"}  # fmt: skip
+_ISAAC_GROUP = ("concatenate_terms", "concatenate_dim", "enable_corruption", "history_length", "flatten_history_dim")
+_RL_SAR = {"default_dof_pos": "default_joint_pos", "rl_kp": "stiffness", "rl_kd": "damping", "dt": "physics_dt",
+           "decimation": "decimation", "action_scale": "action_scale"}  # fmt: skip
+_RL_SAR_MORE = {"torque_limits": "effort_limit", "clip_obs": "observation_clip"}
+_RL_SAR_SCALES = {"lin_vel": "lin_vel_scale", "ang_vel": "ang_vel_scale", "command": "commands_scale",
+                  "joint_pos": "dof_pos_scale", "joint_vel": "dof_vel_scale"}  # fmt: skip
+_DEPLOYMENT = {"default_angles": "default_joint_pos", "kps": "stiffness", "kds": "damping",
+               "simulation_dt": "physics_dt", "control_decimation": "decimation",
+               "action_scale": "action_scale"}  # fmt: skip
+_MJLAB = {"default_joint_pos": "default_joint_pos", "joint_stiffness": "stiffness", "joint_damping": "damping",
+          "action_scale": "action_scale"}  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What a source says of a robot, whose file is known, and of its controller."""
+
+    model_file: Path
+    model: Any
+    joints: tuple[str, ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+    """None where the user has to fill it in."""
+    why: dict[str, str] = field(default_factory=dict)
+    """Why a setting is a guess, or what belongs there."""
+    unused: list[str] = field(default_factory=list)
+    """What the source says beside, and nothing needs."""
+
+    def put(self, why: str = "", **settings: Any) -> None:
+        self.settings |= settings
+        self.why |= dict.fromkeys(settings, why)
+
+    def check(self, file: Path, said: Mapping[str, Any], needed: Sequence[str], more: Sequence[str], idle: str) -> None:
+        """Refuses names that are missing, and those that nobody understands."""
+        self.unused = [name for name in idle.split() if name in said]
+        if missing := [name for name in needed if name not in said]:
+            raise ValueError(f"{file} must say {', '.join(missing)}")
+        _refuse_unknown(file, said, (*needed, *more, *self.unused))
+
+    def take(self, file: Path, said: Mapping[str, Any], table: Mapping[str, str], joints: Sequence[str]) -> None:
+        """Settings that ``table`` gives other names; those of the robot's joints in the order of its file."""
+        for key, name in table.items():
+            value = said.get(key)
+            if name in PER_JOINT and isinstance(value, list):
+                if len(value) != len(joints):
+                    got = f"{', '.join(joints)}, got {len(value)}"
+                    raise ValueError(f"{file}: {key} must have {len(joints)} values, of {got}")
+                if set(joints) != set(self.joints):
+                    must = f"those of {self.model_file}, {', '.join(self.joints)}"
+                    raise ValueError(f"{file}: joints of {key} must be {must}, got {', '.join(joints)}")
+                value = [value[list(joints).index(joint)] for joint in self.joints]
+            if key in said:
+                self.put(**{name: _one_of(value)})
+
+    def order(self, joints: Sequence[str], why: str = "") -> None:
+        """The controller's order of joints, where it is not that of the file."""
+        if tuple(joints) != self.joints:
+            self.put(joints=list(joints), why=why)
+
+    def stack(self, terms: list[dict[str, Any]], lengths: Sequence[int]) -> None:
+        """How Isaac Lab and mjlab lay out former steps; lengths that differ are written into the terms."""
+        for term, length in zip(terms, lengths, strict=True):
+            term |= {"history": length} if len(set(lengths)) > 1 else {}
+        if max(lengths) > 1:
+            self.put(history={"length": max(lengths), "newest": "last", "by": "term", "fill": "first"})
+
+    def imu(self) -> list[float] | None:
+        """Place of the base's site that is called after an IMU [m]."""
+        model = self.model
+        sites = [k for k in range(model.nsite) if model.site_bodyid[k] == 1 and "imu" in model.site(k).name.lower()]
+        return model.site_pos[sites[0]].round(5).tolist() if len(sites) == 1 else None
 
 
 def import_controller(source: Path, model_file: Path, out: Path) -> None:
@@ -32,61 +115,349 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
         model_file: The robot's MJCF or URDF.
         out: A folder, which gives the robot its name.
     """
-    files = {name: out / name for name in ("robot.toml", "controller.toml")}
-    if taken := [str(file) for file in files.values() if file.exists()]:
+    if taken := [str(out / name) for name in _FILES if (out / name).exists()]:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
-    compiled = compile_model(model_file)
-    model = Model(file=model_file, compiled=compiled, joints=joint_names(compiled))
+    model = compile_model(model_file)
+    found = _Found(model_file=model_file, model=model, joints=joint_names(model))
     kind, read = _reader_of(source)
-    found = read(source, model)
+    weights = read(source, found)
     out.mkdir(parents=True, exist_ok=True)
-    here = Path(os.path.relpath(model_file.resolve(), out.resolve()))
-    robot = {"model_file": Setting(here), **found.robot}
-    controller = {"policy": Setting(found.weights.name), **found.controller}
-    print(f"{source} is read as {kind}; its weights are {found.weights}.")
+    found.put(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights.name)
+    print(f"{source} is read as {kind}; its weights are {weights}.")
     if found.unused:
         print(f"Not needed: {', '.join(found.unused)}.")
-    if not (out / found.weights.name).exists():
-        shutil.copyfile(found.weights, out / found.weights.name)
-    for file, settings in zip(files.values(), (robot, controller), strict=True):
-        text = "".join(f"{_as_line(name, setting)}\n" for name, setting in settings.items())
-        file.write_text(f"# Of {source.name}\n{text}", encoding="utf-8")
-        print(f"\n{file}:\n{text}", end="")
-    gaps = [name for part in (robot, controller) for name, setting in part.items() if setting.value is None]
-    if gaps:
-        print(f"\nFill in {', '.join(gaps)}; then:")
-    else:
-        print("\nNext:")
+    if not (out / weights.name).exists():
+        shutil.copyfile(weights, out / weights.name)
+    gaps = []
+    for file, names in _FILES.items():
+        given = [name for name in names if name in found.settings]
+        gaps += [name for name in given if found.settings[name] is None]
+        text = "".join(f"{_as_line(name, found.settings[name], found.why[name])}\n" for name in given)
+        (out / file).write_text(f"# Of {source.name}\n{text}", encoding="utf-8")
+        print(f"\n{out / file}:\n{text}", end="")
+    print(f"\nFill in {', '.join(gaps)}; then:" if gaps else "\nNext:")
     for name in ("check", "archive"):
-        print(f"  {command_line(name, robot=files['robot.toml'])}")
+        print(f"  {command_line(name, robot=out / 'robot.toml')}")
 
 
-def _as_line(name: str, setting: Setting) -> str:
-    value, why = setting
+def _as_line(name: str, value: Any, why: str) -> str:
     if value is None:
         return f"# {name} = ...  # fill in: {why}"
-    text = to_toml(value)
-    if name == "observation":
-        text = "[\n" + "".join(f"  {to_toml(term)},\n" for term in value) + "]"
+    rows = [f"  {to_toml(term)},\n" for term in value] if name == "observation" else []
+    text = "".join(["[\n", *rows, "]"]) if rows else to_toml(value)
     return f"{name} = {text}{f'  # a guess: {why}' if why else ''}"
 
 
-def _reader_of(source: Path) -> tuple[str, Callable[[Path, Model], Found]]:
+def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
+    """What a source is, and what reads it: finds settings, and returns the file of weights."""
     if (source / "params" / "env.yaml").is_file():
-        return "a run of Isaac Lab", read_isaac_lab
+        return "a run of Isaac Lab", _read_isaac_lab
     if source.is_dir() or source.suffix in (".yaml", ".yml"):
         file = source / "config.yaml" if source.is_dir() else source
-        content = read_yaml(file)
+        content = _read_yaml(file)
         if "kps" in content:
-            return "a deployment of unitree_rl_gym", read_deployment
+            return "a deployment of unitree_rl_gym", _read_deployment
         if len(content) == 1 and "observations" in (next(iter(content.values())) or ()):
-            return "a controller of rl_sar", read_rl_sar
+            return "a controller of rl_sar", _read_rl_sar
         raise ValueError(
             f"{file} must be of rl_sar (a name with observations, ...) or unitree_rl_gym (kps, kds, ...), or the run "
             f"folder of Isaac Lab have params/env.yaml; got {', '.join(map(str, content))}"
         )
-    if source.suffix == ".onnx" and "observation_names" in onnx_metadata(source):
-        return "a controller of mjlab", read_mjlab
-    return "weights alone", read_weights
+    if source.suffix == ".onnx" and "observation_names" in _onnx_metadata(source):
+        return "a controller of mjlab", _read_mjlab
+    return "weights alone", _read_weights
+
+
+def _read_yaml(file: Path) -> dict[str, Any]:
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), PlainYaml)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{file} cannot be read as YAML: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} must hold names with values, got {type(content).__name__}")
+    return content
+
+
+def _onnx_metadata(file: Path) -> Mapping[str, str]:
+    import onnxruntime  # takes long to load
+
+    try:
+        return onnxruntime.InferenceSession(file.read_bytes()).get_modelmeta().custom_metadata_map
+    except Exception as error:  # its errors have no base
+        raise ValueError(f"{file} is no ONNX file: {error}") from None
+
+
+def _weights_of(folder: Path, name: str) -> Path:
+    """File of weights that a source names, of which a path of another machine may be known."""
+    file = folder / Path(name).name
+    if not file.is_file():
+        raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+    return file
+
+
+def _refuse_unknown(file: Path, names: Any, known: Any) -> None:
+    if unknown := [str(name) for name in names if name not in known]:
+        raise ValueError(f"{file} says what is not understood: {', '.join(unknown)}: take it out if it does not matter")
+
+
+def _one_of(values: Any) -> Any:
+    """One value in place of a list of equal ones."""
+    return values[0] if isinstance(values, list) and all(value == values[0] for value in values) else values
+
+
+def _term(name: str, scale: Any = None, **more: Any) -> dict[str, Any]:
+    """A term of the observation, without what changes nothing."""
+    given = more if scale is None or np.all(np.equal(scale, 1.0)) else {"scale": scale, **more}
+    return {"term": name, **{key: value for key, value in given.items() if value is not None}}
+
+
+def _read_rl_sar(source: Path, found: _Found) -> Path:
+    """A controller's YAML over the base.yaml of its robot, which is beside it or in the folder above."""
+    file = source / "config.yaml" if source.is_dir() else source
+    bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
+    base = next((place for place in bases if place.is_file()), None)
+    if base is None:
+        raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
+    said = next(iter(_read_yaml(base).values())) | next(iter(_read_yaml(file).values()))
+    needed = (*_RL_SAR, "model_name", "observations", "joint_names", "joint_mapping")
+    more = (*_RL_SAR_MORE, *_RL_SAR_SCALES.values(), "observations_history", "observations_history_priority",
+            "clip_actions_lower", "clip_actions_upper", "wheel_indices")  # fmt: skip
+    unused = "fixed_kp fixed_kd num_of_dofs num_observations joint_controller_names framework"
+    found.check(file, said, needed, more, unused)
+    if said.get("wheel_indices"):
+        raise ValueError(f"{file}: wheel_indices must be empty, since wheels are not supported")
+    joints = [said["joint_names"][k] for k in said["joint_mapping"]]
+    found.order(joints)
+    found.take(file, said, _RL_SAR | _RL_SAR_MORE, joints)
+    if "clip_actions_upper" in said:
+        pairs = [list(pair) for pair in zip(said["clip_actions_lower"], said["clip_actions_upper"], strict=True)]
+        high = pairs[0][1]
+        found.put(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
+    steps = said.get("observations_history") or [0]
+    if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
+        raise ValueError(f"{file}: observations_history must be all steps from 0 on, got {steps}")
+    if len(steps) > 1:
+        by = {"time": "row", "term": "term"}[said.get("observations_history_priority", "time")]
+        history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
+        found.put(history=history, why="steps before the start are zeros, as in rl_sar's own loop")
+    _refuse_unknown(file, said["observations"], _TERMS)
+    names = [_TERMS[name] for name in said["observations"]]
+    found.put(observation=[_term(name, said.get(_RL_SAR_SCALES.get(name, ""))) for name in names])
+    return _weights_of(file.parent, said["model_name"])
+
+
+def _read_deployment(source: Path, found: _Found) -> Path:
+    """A YAML of ``deploy_mujoco``, whose script has the observation: its order, and a clock if there is room for it."""
+    said = _read_yaml(source)
+    needed = (*_DEPLOYMENT, "policy_path", "ang_vel_scale", "dof_pos_scale", "dof_vel_scale", "cmd_scale",
+              "num_actions", "num_obs")  # fmt: skip
+    found.check(source, said, needed, (), "xml_path simulation_duration cmd_init")
+    count, width = said["num_actions"], said["num_obs"]
+    if count != len(found.joints):
+        joints = f"{len(found.joints)}, the joints of {found.model_file}"
+        raise ValueError(f"{source}: num_actions must be {joints}, got {count}")
+    blind, clocked = 9 + 3 * count, 11 + 3 * count
+    if width not in (blind, clocked):
+        by_hand = "describe it by hand (docs/controllers.md)"
+        raise ValueError(f"{source}: num_obs must be {blind}, or {clocked} with a clock, got {width}: {by_hand}")
+    found.take(source, said, _DEPLOYMENT, found.joints)
+    scales = {"ang_vel": "ang_vel_scale", "gravity": "", "command": "cmd_scale", "joint_pos": "dof_pos_scale",
+              "joint_vel": "dof_vel_scale", "last_action": ""}  # fmt: skip
+    terms = [_term(name, said.get(key)) for name, key in scales.items()]
+    terms += [{"term": "clock", "period_s": 0.8}] * (width == clocked)
+    clock = ", and the period of its clock" * (width == clocked)
+    found.put(observation=terms, why=f"the order of unitree_rl_gym's deploy_mujoco.py{clock}")
+    return _weights_of(source.parent, said["policy_path"])
+
+
+def _read_mjlab(source: Path, found: _Found) -> Path:
+    """An ONNX file with the metadata of mjlab's exporter, rounded to three decimals."""
+    said = _onnx_metadata(source)
+    of_terms = [f"observation_terms_{name}" for name in ("scale", "clip", "history_length")]
+    needed = (*_MJLAB, "joint_names", "observation_names")
+    found.check(source, said, needed, of_terms, "run_path command_names observation_terms_flatten_history_dim")
+    names, joints = said["observation_names"].split(","), said["joint_names"].split(",")
+    _refuse_unknown(source, names, _TERMS)
+    found.take(source, {key: [float(part) for part in said[key].split(",")] for key in _MJLAB}, _MJLAB, joints)
+    found.order(joints)
+    found.put(physics_dt=0.005, decimation=4, why="the metadata do not say it; mjlab's own tasks are like this")
+    scales, clips, lengths = (said[key].split(",") if said.get(key) else [""] * len(names) for key in of_terms)
+    terms, why = [], ""
+    for name, scale, clip in zip(names, scales, clips, strict=True):
+        limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
+        limits = np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None
+        place = found.imu() if _TERMS[name] == "lin_vel" else None
+        why = "the velocity is that of the IMU's site" if place else why
+        terms.append(_term(_TERMS[name], float(scale or 1.0), clip=limits, at=place))
+    found.stack(terms, [max(1, round(float(length or 0))) for length in lengths])
+    found.put(observation=terms, why=why)
+    return source
+
+
+def _read_weights(source: Path, found: _Found) -> Path:
+    """Weights that say nothing but their widths."""
+    (width, count), place = _widths(source), found.imu()
+    pose, keyframe = default_pose(found.model_file, found.model)
+    asked = f"an angle of each joint [rad], its pose at action 0: {', '.join(found.joints)}"
+    found.put(default_joint_pos=pose if keyframe else None, why="" if keyframe else asked)
+    if not found.model.nu or not found.model.actuator_biasprm[:, 1].any():
+        for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad")):
+            found.put(**{name: None}, why=f"a gain of each joint, or one number [{unit}]")
+    found.put(physics_dt=0.005, decimation=4, why="50 control steps a second, as most controllers have")
+    found.put(action_scale=None, why="radians per unit of action, one or one a joint")
+    if count not in (None, len(found.joints)):
+        found.put(joints=None, why=f"the {count} joints that it moves, in its order")
+    terms = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
+    example = to_toml([_term("lin_vel", at=place), *map(_term, terms)])
+    found.put(observation=None, why=f"its {width or 'all'} columns in its order, with scale; of {example}")
+    return source
+
+
+def _widths(source: Path) -> tuple[int | None, int | None]:
+    """Columns and actions of a network, as far as it says them."""
+    network: Any = load_network(source, "cpu", None, of="it")
+    if hasattr(network, "sizes"):
+        return network.sizes
+    for weight in network.parameters():
+        if weight.ndim == 2:
+            try:
+                return weight.shape[1], network(torch.zeros(1, weight.shape[1])).shape[1]
+            except (RuntimeError, AttributeError):
+                continue
+    return None, None
+
+
+def _read_isaac_lab(source: Path, found: _Found) -> Path:
+    """A run folder of Isaac Lab: params/env.yaml, params/agent.yaml, exported/ or checkpoints."""
+    file, agent_file = source / "params" / "env.yaml", source / "params" / "agent.yaml"
+    env = _read_yaml(file)
+    try:
+        _isaac_robot(env, file, found)
+        order = _isaac_action(env["actions"], source, file, found)
+        group = env["observations"]["policy"]
+        terms = {name: term for name, term in group.items() if name not in _ISAAC_GROUP and term is not None}
+        lengths = [group.get("history_length") or term.get("history_length") or 1 for term in terms.values()]
+        rows = [_isaac_term(name, term, env["scene"], order, file, found) for name, term in terms.items()]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file} is not what Isaac Lab writes for a robot: {type(error).__name__}: {error}") from None
+    found.stack(rows, lengths)
+    found.put(observation=rows)
+    agent = _read_yaml(agent_file) if agent_file.is_file() else {}
+    if agent.get("clip_actions") is not None:
+        found.put(action_clip=agent["clip_actions"])
+    exported = [place for name in ("policy.pt", "policy.onnx") if (place := source / "exported" / name).is_file()]
+    checkpoints = sorted(source.glob("model_*.pt"), key=lambda place: int(re.sub(r"\D", "", place.stem) or 0))
+    if not exported and not checkpoints:
+        raise ValueError(f"{source} must have weights, exported/policy.pt or model_*.pt, got none")
+    activation = [part["activation"] for name in ("actor", "policy") if "activation" in (part := agent.get(name) or {})]
+    if not exported and activation:
+        found.put(activation=activation[0])
+    return (*exported, *checkpoints[::-1])[0]
+
+
+def _isaac_robot(env: dict[str, Any], file: Path, found: _Found) -> None:
+    """Pose, gains, limits, steps and speed."""
+    articulation, joints = env["scene"]["robot"], found.joints
+    pose = per_joint(articulation["init_state"]["joint_pos"], joints, f"{file}: init_state.joint_pos", partly=True)
+    found.put(default_joint_pos=_one_of([angle or 0.0 for angle in pose]))
+    values: dict[str, dict[str, Any]] = {name: {} for name in PER_JOINT[1:]}
+    notes = []
+    for name, group in articulation["actuators"].items():
+        kind = str(group.get("class_type", "")).rpartition(":")[2]
+        if kind not in ("", "ImplicitActuator", "IdealPDActuator"):
+            notes.append(f"{name} is a {kind}, simulated as PD gains with a limit")
+        moved = _chosen(group["joint_names_expr"], joints)
+        for key, of_key in values.items():
+            given = group.get(f"{key}_sim") if group.get(key) is None else group[key]
+            of_key |= zip(moved, per_joint(given, moved, f"{file}: {name}.{key}", partly=True), strict=True)
+    for key, of_key in values.items():
+        without = [joint for joint in joints if of_key.get(joint) is None]
+        if not without:
+            known = _one_of([of_key[joint] for joint in joints])
+            found.put(**{key: known}, why="; ".join(notes) if key == "stiffness" else "")
+        elif key in ("stiffness", "damping"):
+            asked = f"a gain of each joint: none is said of {', '.join(without)}"
+            found.put(**{key: None}, why="; ".join([asked, *notes]))
+    found.put(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
+    ranges = [command["ranges"]["lin_vel_x"][1] for command in (env.get("commands") or {}).values()
+              if isinstance(command, dict) and "lin_vel_x" in (command.get("ranges") or {})]  # fmt: skip
+    if ranges and 0.0 < ranges[0] < RobotCfg.speed:
+        found.put(speed=ranges[0], why=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
+        found.put(max_duration_s=round(15.0 / ranges[0], 1), why="in proportion")
+
+
+def _chosen(patterns: Any, order: Sequence[str], preserve: Any = False) -> list[str]:
+    """The joints that patterns name, in the robot's order or in that of the patterns."""
+    patterns = patterns if isinstance(patterns, list) else [patterns]
+    found = dict.fromkeys(joint for pattern in patterns for joint in order if re.fullmatch(pattern, joint))
+    return list(found) if preserve else [joint for joint in order if joint in found]
+
+
+def _isaac_action(actions: dict[str, Any], source: Path, file: Path, found: _Found) -> list[str]:
+    """Scale, offset and order of actions; returns the order of all joints, which env.yaml does not say."""
+    why = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
+    order = _breadth_first(found.model)
+    for said in sorted(source.rglob("*IO_descriptors.yaml"))[:1]:
+        order, why = _read_yaml(said)["articulations"]["robot"]["joint_names"], ""
+    actions = {name: term for name, term in actions.items() if term is not None}
+    kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items()}
+    if list(kinds.values()) != ["JointPositionAction"]:
+        raise ValueError(f"{file}: actions must be one JointPositionAction, got {kinds}")
+    ((name, term),) = actions.items()
+    if term.get("clip") is not None:
+        raise ValueError(f"{file}: actions.{name}.clip limits targets, which is not supported: give joints that range")
+    joints = _chosen(term["joint_names"], order, term.get("preserve_order"))
+    found.order(joints, why)
+    found.put(action_scale=_one_of(per_joint(term["scale"], joints, f"{file}: actions.{name}.scale")))
+    if not term.get("use_default_offset", True):
+        offset = per_joint(term["offset"], joints, f"{file}: actions.{name}.offset", partly=True)
+        found.put(action_offset=[angle or 0.0 for angle in offset])
+    return order
+
+
+def _breadth_first(model: Any) -> list[str]:
+    """Joints from the base outwards, those of a body's children by name."""
+    order, level = list[str](), [1]
+    names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
+    while level:
+        level = [
+            child
+            for parent in level
+            for child in sorted(np.flatnonzero(model.body_parentid == parent), key=lambda k: names[int(k)])
+        ]
+        order += [names[int(body)] for body in level]
+    return order
+
+
+def _isaac_term(
+    name: str, term: dict[str, Any], scene: dict[str, Any], order: Sequence[str], file: Path, found: _Found
+) -> dict[str, Any]:  # fmt: skip
+    function, params = re.split(r"[:.]", str(term["func"]))[-1], term.get("params") or {}
+    if function not in _ISAAC_TERMS or term.get("modifiers"):
+        what = f"{term['func']}{' with modifiers' if term.get('modifiers') else ''}"
+        known = ", ".join(_ISAAC_TERMS)
+        raise ValueError(f"{file} says what is not understood: observation {name}, {what}; only {known}")
+    row = _term(_ISAAC_TERMS[function], term.get("scale"), clip=term.get("clip"))
+    if function in ("joint_pos_rel", "joint_vel_rel"):
+        asset = params.get("asset_cfg") or {}
+        joints = _chosen(asset.get("joint_names") or ".*", order, asset.get("preserve_order"))
+        if joints != found.settings.get("joints", list(found.joints)):
+            row["joints"] = joints
+    elif function == "gait_phase":
+        row["period_s"] = params["period"]
+    elif function == "height_scan":  # points in the yaw frame of its sensor
+        sensor = scene[params["sensor_cfg"]["name"]]
+        pattern, place = sensor["pattern_cfg"], sensor["offset"]["pos"]
+        level = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
+        if "resolution" not in pattern or not level:
+            raise ValueError(f"{file}: a height scanner must be a grid in the yaw frame, got {pattern}")
+        step = pattern["resolution"]
+        x, y = (
+            [round(centre - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
+            for side, centre in zip(pattern["size"], place, strict=False)
+        )
+        first = "x fastest" if pattern.get("ordering", "xy") == "xy" else "y fastest"
+        row |= {"order": first, "offset": params.get("offset", 0.5), "x": x, "y": y}
+    return row

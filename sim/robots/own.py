@@ -104,24 +104,24 @@ def compile_model(model_file: Path, what: str = "") -> Any:
     return spec.compile()
 
 
-def per_joint(value: Any, joints: Sequence[str], what: str) -> list[Any]:
+def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = False) -> list[Any]:
     """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
 
-    A name counts before an expression; every joint must be matched once, and every entry must match.
+    A name counts before an expression; every joint must be matched once, or, where ``partly``, not at all (None), and
+    every entry must match.
     """
     if isinstance(value, list):
         return value
     if not isinstance(value, dict):
         return [value] * len(joints)
-    matches = {
-        joint: [joint] if joint in value else [key for key in value if re.fullmatch(key, joint)] for joint in joints
-    }
-    idle = [key for key in value if not any(key in keys for keys in matches.values())]
-    wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in matches.items() if len(keys) != 1]
-    if idle or wrong:
-        text = f"{', '.join(idle)} matches no joint of {', '.join(joints)}" if idle else f"got {', '.join(wrong)}"
-        raise ValueError(f"{what} must match every joint by one entry: {text}")
-    return [value[matches[joint][0]] for joint in joints]
+    matches = [[joint] if joint in value else [key for key in value if re.fullmatch(key, joint)] for joint in joints]
+    if idle := [key for key in value if not any(key in keys for keys in matches)]:
+        raise ValueError(f"{what}: {', '.join(idle)} matches no joint of {', '.join(joints)}")
+    wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in zip(joints, matches, strict=True)
+             if len(keys) > 1 or not (keys or partly)]  # fmt: skip
+    if wrong:
+        raise ValueError(f"{what} must match every joint by one entry: got {', '.join(wrong)}")
+    return [value[keys[0]] if keys else None for keys in matches]
 
 
 def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
