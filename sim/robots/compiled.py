@@ -91,9 +91,9 @@ def joint_names(model: Any) -> tuple[str, ...]:
     return tuple(model.joint(k).name for k in range(1, model.njnt))
 
 
-def touching_geoms(spec: Any) -> list[Any]:
-    """Geoms that touch the ground, body by body."""
-    return [geom for body in spec.bodies for geom in body.geoms if geom.contype or geom.conaffinity]
+def touching_geoms(*bodies: Any) -> list[Any]:
+    """Geoms of bodies that touch the ground, body by body."""
+    return [geom for body in bodies for geom in body.geoms if geom.contype or geom.conaffinity]
 
 
 def _of_urdf(root: ET.Element) -> Any:
@@ -106,7 +106,7 @@ def _of_urdf(root: ET.Element) -> Any:
                   inertiafromgeom="false")  # fmt: skip
     spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     for body in spec.bodies:
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
+        touching = touching_geoms(body)
         for number, geom in enumerate(touching):
             geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
             geom.friction[0], geom.solref = _URDF_FRICTION, (_URDF_TIME_CONSTANT_S, 1.0)
@@ -188,8 +188,7 @@ def _keep_robot(spec: Any) -> list[str]:
         problems += [f"a ball joint ({joint.info})" for joint in moving if joint.type == _JOINT.mjJNT_BALL]
         problems += [f"<joint ref> ({joint.info})" for joint in moving if joint.ref]
         problems += [f"<body {name}> ({body.info})" for name in ("gravcomp", "mocap") if getattr(body, name)]
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        for number, geom in enumerate(touching):
+        for number, geom in enumerate(touching_geoms(body)):
             geom.name = geom.name or f"{body.name}_geom_{number}"
             geom.contype, geom.conaffinity = 1, 0
             problems += [f"<geom {name}> of {geom.name} ({geom.info})" for name in ("margin", "gap", "adhesion")
@@ -241,14 +240,14 @@ def _unknown(kind: str, wanted: Sequence[str], present: Sequence[str], robot: Ro
 
 
 def _geom_problems(spec: Any, wanted: Sequence[str], robot: RobotCfg) -> list[str]:
-    sites = {site.name for site in spec.sites} - {geom.name for geom in touching_geoms(spec)}
+    sites = {site.name for site in spec.sites} - {geom.name for geom in touching_geoms(*spec.bodies)}
     visual = {geom.name for geom in spec.geoms if not geom.contype} - {""}
     problems = []
     for kind, names in (("a site", sites), ("a geom that touches nothing", visual)):
         got = [name for name in wanted if name in names]
         problems += [f"{', '.join(got)} is {kind} in {robot.model_file}: name geoms that touch the ground"] * bool(got)
     known = [name for name in wanted if name not in sites | visual]
-    return problems + _unknown("geom", known, [geom.name for geom in touching_geoms(spec)], robot)
+    return problems + _unknown("geom", known, [geom.name for geom in touching_geoms(*spec.bodies)], robot)
 
 
 def _joint_value_problems(model: Any, robot: RobotCfg, weak: Sequence[str], wrong: Collection[str]) -> list[str]:
@@ -314,11 +313,8 @@ class _Drives:
         if model.actuator_ctrllimited[k] and kind == "position":
             self.control[joint] = model.actuator_ctrlrange[k]
         elif model.actuator_ctrllimited[k]:
-            most = (
-                gear
-                * abs(model.actuator_gainprm[k, 0])
-                * self._least(model.actuator_ctrlrange[k], f"ctrlrange {where}")
-            )
+            most = gear * abs(model.actuator_gainprm[k, 0])
+            most *= self._least(model.actuator_ctrlrange[k], f"ctrlrange {where}")
             self.effort[joint] = min(self.effort[joint], most)
 
     def _least(self, span: NDArray[np.float64], what: str) -> float:
@@ -382,7 +378,7 @@ def _set_drives(spec: Any, drives: _Drives, model: Any, robot: RobotCfg) -> None
 
 def _set_contact(spec: Any, robot: RobotCfg) -> None:
     """Friction and contact time constant of the settings."""
-    for geom in touching_geoms(spec):
+    for geom in touching_geoms(*spec.bodies):
         if robot.friction is not None:
             geom.friction[0] = robot.friction
         if robot.contact_time_constant_s is not None:

@@ -13,15 +13,8 @@ from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
 _GEOM, _TYPE = _mj.mjtGeom, newton.GeoType
-_TYPES = {
-    _GEOM.mjGEOM_SPHERE: _TYPE.SPHERE,
-    _GEOM.mjGEOM_CAPSULE: _TYPE.CAPSULE,
-    _GEOM.mjGEOM_CYLINDER: _TYPE.CYLINDER,
-    _GEOM.mjGEOM_BOX: _TYPE.BOX,
-    _GEOM.mjGEOM_ELLIPSOID: _TYPE.ELLIPSOID,
-    _GEOM.mjGEOM_MESH: _TYPE.MESH,
-    _GEOM.mjGEOM_PLANE: _TYPE.PLANE,
-}
+_TYPES = {getattr(_GEOM, f"mjGEOM_{name}"): getattr(_TYPE, name)
+          for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "ELLIPSOID", "MESH", "PLANE")}  # fmt: skip
 _FREE_RANGE = 1e10  # limits of a joint that turns freely [rad]
 _NO_EFFORT_LIMIT = 1e6  # [N m]
 _RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
@@ -84,9 +77,8 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
         return builder.add_joint_free(child=link, label=name)
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
-    add = (
-        builder.add_joint_revolute if model.jnt_type[joint] == _mj.mjtJoint.mjJNT_HINGE else builder.add_joint_prismatic
-    )
+    turns = model.jnt_type[joint] == _mj.mjtJoint.mjJNT_HINGE
+    add = builder.add_joint_revolute if turns else builder.add_joint_prismatic
     effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _NO_EFFORT_LIMIT
     return add(
         parent=int(model.body_parentid[body]) - 1,
