@@ -107,15 +107,16 @@ def compile_model(model_file: Path, what: str = "") -> Any:
 def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = False) -> list[Any]:
     """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
 
-    A name counts before an expression; every joint must be matched once, or, where ``partly``, not at all (None), and
-    every entry must match.
+    A name counts before an expression; every joint must be matched once, and every entry must match. ``partly``: joints
+    without a match have None, entries may be of joints that are not there.
     """
     if isinstance(value, list):
         return value
     if not isinstance(value, dict):
         return [value] * len(joints)
     matches = [[joint] if joint in value else [key for key in value if re.fullmatch(key, joint)] for joint in joints]
-    if idle := [key for key in value if not any(key in keys for keys in matches)]:
+    idle = [key for key in value if not any(key in keys for keys in matches)]
+    if idle and not partly:
         raise ValueError(f"{what}: {', '.join(idle)} matches no joint of {', '.join(joints)}")
     wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in zip(joints, matches, strict=True)
              if len(keys) > 1 or not (keys or partly)]  # fmt: skip
