@@ -41,7 +41,7 @@ from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.records import identity
-from sim.policy.spec import ControllerSpec, certifier_hash, spec_of
+from sim.policy.spec import ControllerSpec, certifier_hash, spec_of, weights_file
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -150,13 +150,19 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
 
 def panel_of(robot: RobotCfg) -> dict[str, str]:
     """The robot's fixed certifiers by name."""
-    return {file.stem: str(file) for file in sorted(robot.panel.glob("*.pt"))}
+    return controllers_in(robot.panel)
+
+
+def controllers_in(folder: Path) -> dict[str, str]:
+    """Certifiers of a folder by name: descriptions, ``<name>.toml``, and weights that are not of one, ``<name>.pt``."""
+    described = sorted(folder.glob("*.toml"))
+    weights = sorted({*folder.glob("*.pt")} - {*map(weights_file, described)})
+    return {file.stem: str(file) for file in sorted([*weights, *described])}
 
 
 def certifiers_of(search: Search) -> dict[str, str]:
     """Certifiers of a search by name: the robot's panel and the run's own, without the controller that was searched."""
-    files = {file.stem: str(file) for file in sorted((search.run / CERTIFIERS_FOLDER).glob("*.pt"))}
-    certifiers = panel_of(search.robot) | files
+    certifiers = panel_of(search.robot) | controllers_in(search.run / CERTIFIERS_FOLDER)
     return {name: file for name, file in certifiers.items() if not is_searched(search.cfg, file, search.robot)}
 
 

@@ -98,8 +98,9 @@ class FinetuneCfg(TrainCfg):
     """A fine-tuning. With the robot and the files it names, it says all that the result depends on."""
 
     policy: str | None = None
-    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the robot's own. The checkpoint.pt of a
-    training is its last actor, with its critic; its policy.pt is the mean of the last actors."""
+    """Controller to begin with: an rsl_rl checkpoint with layers of any size, or a controller.toml of such or of
+    TorchScript with plain layers; the robot's own. The checkpoint.pt of a training is its last actor, with its critic;
+    its policy.pt is the mean of the last actors."""
     mix: Literal["generated", "hard-random", "hand-crafted"] = "generated"
     """Terrains: half hand-crafted ones, and half elites (generated, the paper's C-G) or hard-random ones (C-HR); or
     hand-crafted ones alone (C-HC)."""
@@ -178,7 +179,7 @@ class HardenCfg:
     """A hardening. With the robot and the files it names, it says all that the result depends on."""
 
     policy: str | None = None
-    """Controller to begin with: an rsl_rl checkpoint with layers of any size; the robot's own."""
+    """Controller to begin with: an rsl_rl checkpoint with layers of any size, or a controller.toml; the robot's own."""
     rounds: PositiveInt = 3
     """Rounds of training; there is one search more. A larger number later continues a finished run."""
     seed: Annotated[int, Meta(ge=0, le=10_000_000)] = 0

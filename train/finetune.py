@@ -14,17 +14,18 @@ from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, s
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
+from sim.policy.described import ControllerCfg, parse_controller
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import identity, load_space
+from sim.spaces.registry import identity, load_space, space_at
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
-from train.ppo.checkpoint import CHECKPOINT, Start, read_start
+from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, Start, read_start
 from train.ppo.learner import Ranks
 from train.ppo.training import (
-    POLICY,
+    DESCRIBED,
     Kind,
     Training,
     check_settings,
@@ -55,6 +56,9 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         start = read_start(Path(cfg.policy or robot.policy_file), robot)
         if cfg.recipe.noise_of is not None:
             start = start.with_noise_of(read_start(Path(cfg.recipe.noise_of), robot))
+    controller = start.controller if start else None
+    if saved is not None and DESCRIPTION in saved:
+        controller = parse_controller(saved[DESCRIPTION], run_dir / CHECKPOINT)
     hidden_dims = start.hidden_dims if start else saved["settings"]["ppo"]["hidden_dims"] if saved else ()
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=tuple(hidden_dims)))
     elites = elites_of(robot, cfg)
@@ -67,16 +71,23 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         check_settings(run_dir, saved, settings)
         if is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done. A larger --iterations goes on.")
-            return run_dir / POLICY
+            return run_dir / (POLICY if controller is None else DESCRIBED)
+    beside = None if run.export is None else run.export.with_suffix(".toml")
+    if controller is not None and beside is not None and beside.exists() and saved is None:
+        raise ValueError(
+            f"export {run.export} must have no {beside.name} beside it, which is written too: name another"
+        )
     with run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
         training = FineTuning(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
-        )
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start,
+            controller=controller,
+        )  # fmt: skip
         policy = training.run(run.export)
-    export_onnx(load_checkpoint(policy, robot), policy.with_suffix(".onnx"))
+    if controller is None:
+        export_onnx(load_checkpoint(policy, robot), policy.with_suffix(".onnx"))
     return policy
 
 
@@ -98,7 +109,8 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, device_of(options.device), **SPECIALIST)
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
-    return specialist
+    described = specialist.with_suffix(".toml")
+    return described if described.exists() else specialist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +130,7 @@ class Elites:
 def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
     """The elites to train on."""
     if cfg.mix != "generated":
-        space = load_space(cfg.space)
+        space = space_at(load_space(cfg.space), None, robot)
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]
@@ -173,6 +185,7 @@ class FineTuning(Training):
         saved: dict[str, Any] | None,
         elites: Elites,
         start: Start | None,
+        controller: ControllerCfg | None = None,
     ) -> None:
         """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
         self.mix = Mix(
@@ -194,8 +207,9 @@ class FineTuning(Training):
         self._swap_every = cfg.recipe.swap_every
         # Every episode is whole, at the beginning as after an exchange: who crossed which terrain is counted.
         super().__init__(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, random_ages=False
-        )
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, random_ages=False,
+            controller=controller,
+        )  # fmt: skip
         if start is not None:
             self.learner.start_from(start)
 

@@ -31,11 +31,10 @@ from sim.files.records import identity
 from sim.files.settings import check
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import load_space
+from sim.spaces.registry import load_space, space_at
 from train.cfg import LARGE, FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
 from train.ppo.checkpoint import CHECKPOINT, read_start
-from train.ppo.training import POLICY
 
 MOST_LOST = 0.01
 """How much of its goal rate on hand-crafted and on hard-random terrains a controller may lose against the base."""
@@ -72,7 +71,7 @@ def harden(
     """
     cfg, content = _begin(robot, cfg, run_dir, compute)
     hardening = _Hardening(
-        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=load_space(cfg.space),
+        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=space_at(load_space(cfg.space), None, robot),
         certifiers=certifiers, content=content,
         policies={"base": cfg.policy or str(robot.policy_file)}, start=cfg.policy,
     )  # fmt: skip
@@ -163,8 +162,8 @@ class _Hardening:
             self.cfg.tune, seed=self._seed(number), policy=self.start, archive=tuple(map(str, searches)),
             space=self.space.name, recipe=recipe,
         )  # fmt: skip
-        finetune(self.robot, cfg, run, RunCfg(device=self.compute.device))
-        before, after = list(self.policies.values())[-1], str(run / POLICY)
+        after = str(finetune(self.robot, cfg, run, RunCfg(device=self.compute.device)))
+        before = list(self.policies.values())[-1]
         choice = self._choose({"base": base, "before": before, "after": after}, searches)
         self.choices[run.name] = choice
         print(f"{run.name} is {'kept' if choice['kept'] else 'not kept'}: {choice['why']}", flush=True)

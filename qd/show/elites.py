@@ -12,7 +12,7 @@ from qd.causes import UNCLEAR
 from qd.faults import certifier_of
 from qd.fitness import FitnessCfg
 from qd.groups import rank
-from qd.judge import CERTIFIERS_FOLDER, panel_of
+from qd.judge import CERTIFIERS_FOLDER, controllers_in, panel_of
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy
@@ -106,8 +106,8 @@ class OpenedRun:
         if faults is None:
             return {}
         names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
-        own = [*sorted((folder / CERTIFIERS_FOLDER).glob("*.pt")), folder.parent / f"{folder.name}.pt"]
-        files = [*panel_of(self.robot).values(), *map(str, own)]
+        own = [*controllers_in(folder / CERTIFIERS_FOLDER).values(), str(folder.parent / f"{folder.name}.pt")]
+        files = [*panel_of(self.robot).values(), *own]
         return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
 
     def certifier(self, number: int) -> str | None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.check import made_ready, walk
-from qd.judge import judge
+from qd.judge import judge, panel_of
 from qd.run.directory import RunDirectory
 from qd.run.settings import preset
 from qd.search import search
@@ -71,8 +71,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     began = time.perf_counter()
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
     wall_s = time.perf_counter() - began
-    certifiers = sorted(robot.panel.glob("*.pt")) + sorted(robot.panel.glob("*/controller.toml"))
-    stages: Any = ("fresh",) if small else ("fresh", "resolved", *(["others"] if certifiers else []))
+    stages: Any = ("fresh",) if small else ("fresh", "resolved", *(["others"] if panel_of(robot) else []))
     archive = judge(run, stages=stages, compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
     counts = {count: summary.get(count) for count in COUNTS}

@@ -3,14 +3,14 @@
 import math
 import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import torch
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins
+from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, to_toml
 from sim.policy.adapters import Sensed, read_row
 from sim.policy.mlp import ACTIVATIONS
 from sim.policy.runner import with_rows_of_zeros
@@ -99,8 +99,16 @@ class ControllerCfg:
 def read_controller(path: Path) -> ControllerCfg:
     """Reads a description; an error names the file and the field."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        return parse_controller(path.read_text(encoding="utf-8"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read as TOML: {error}") from None
+
+
+def parse_controller(text: str, path: Path) -> ControllerCfg:
+    """What the text of a description says, which is called ``path`` in errors."""
+    try:
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as TOML: {error}") from None
     items = content.pop("observation", None)
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
@@ -117,6 +125,16 @@ def read_controller(path: Path) -> ControllerCfg:
             raise ValueError(f"{place}: missing '{missing.pop()}'")
         terms.append(from_builtins(Term, item, place))
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
+
+
+def text_of(cfg: ControllerCfg) -> str:
+    """The description as TOML, which :func:`parse_controller` reads."""
+    content = _given(asdict(cfg)) | {"observation": [_given(asdict(term)) for term in cfg.observation]}
+    return "".join(f"{name} = {to_toml(value)}\n" for name, value in content.items())
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 class _Memory(NamedTuple):

@@ -17,7 +17,7 @@ import yaml
 
 from sim.files.atomic import check_zip, read_json
 from sim.files.records import robot_digest
-from sim.policy.described import Described, read_controller
+from sim.policy.described import ControllerCfg, Described, read_controller
 from sim.policy.mlp import ACTIVATIONS, MlpPolicy, RnnPolicy
 from sim.policy.runner import Recurrent, action_problem, forget_all, with_rows_of_zeros
 from sim.policy.spec import ControllerSpec, agent_file, find_named, in_one_line, weights_file
@@ -160,16 +160,16 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
             f"`{robot.train_command}`, or name another with --policy"
         )
     if path.suffix == ".toml" and path.is_file():
-        return _load_described(path, robot, device)
+        return load_described(read_controller(path), weights_file(path), robot, device, path)
     return load_network(
         path, device, (robot.observation_size, robot.num_joints) if fits else None, of=f"robot '{robot.name}'"
     )
 
 
-def _load_described(path: Path, robot: RobotCfg, device: str) -> Described:
-    cfg = read_controller(path)
+def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, device: str, path: Path) -> Described:
+    """The controller of a description, which is called ``path`` in errors, with the network of a file."""
     policy = Described(cfg, robot, str(path))
-    sizes, weights = (policy.observation_size, policy.num_actions), weights_file(path)
+    sizes = policy.observation_size, policy.num_actions
     if weights is None:
         raise ValueError(f"{path}: policy must be the name of a file, got {cfg.policy!r}")
     of = f"{path} ({policy.columns})"

@@ -140,7 +140,7 @@ class RobotCfg:
 
     @property
     def panel(self) -> Path:
-        """Folder of the fixed controllers that certify its faults (``faultline judge``), ``<name>.pt``."""
+        """Folder of the controllers that certify its faults (``faultline judge``), ``<name>.pt`` or ``<name>.toml``."""
         return self.home / self.name / "panel"
 
     @property

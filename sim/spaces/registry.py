@@ -86,6 +86,12 @@ def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     return replace(space, height=height)
 
 
+def share_of_height(space: TerrainSpace) -> float:
+    """Its highest bump over that of the shipped heights; 1 of a space of one's own."""
+    space = space.inner if isinstance(space, OnGround) else space
+    return space.height / MOST_HEIGHT if isinstance(space, SuperGaussian | Course) else 1.0
+
+
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
     if not is_own(name):
         raise ValueError(

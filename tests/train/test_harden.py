@@ -3,6 +3,7 @@
 import os
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,13 +63,14 @@ class World:
         (run / "archive.json").write_bytes(to_json(counts))
         return archive
 
-    def finetune(self, robot, cfg, run, options) -> None:
+    def finetune(self, robot, cfg, run, options) -> Path:
         if self._work(run):
             self.trained[run.name] = cfg
             content = torch.load(cfg.policy, weights_only=True)
             content["actor_state_dict"]["mlp.0.bias"] += len(self.trained)
             for name in ("policy.pt", "checkpoint.pt"):
                 torch.save(content, run / name)
+        return run / "policy.pt"
 
     @contextmanager
     def open(self, cfg):

@@ -9,15 +9,23 @@ from typing import Any
 import torch
 
 from sim.files.atomic import write_atomically
-from sim.policy.loaders import load_policy, read_weights, reason_of
-from sim.policy.mlp import MlpPolicy
+from sim.policy.described import ControllerCfg, Described, parse_controller
+from sim.policy.loaders import load_described, load_policy, read_weights, reason_of
+from sim.policy.mlp import ACTIVATIONS, MlpPolicy
+from sim.policy.spec import weights_file
 from sim.robots.robot import RobotCfg
 
 FORMAT = "faultline training checkpoint 2"
 CHECKPOINT = "checkpoint.pt"
 """File of a training's directory that it goes on from."""
+POLICY = "policy.pt"
+"""File of a training's directory with its controller."""
+DESCRIPTION = "controller"
+"""Key of a checkpoint with the description of its controller, if it has one, as TOML."""
 STD = "distribution.std_param"
 """Key of the standard deviation of the actions in an actor's state."""
+_NOISES = (STD, "distribution.log_std_param", "std", "log_std")
+_USUAL_NOISE = 0.3  # of a network whose file says none: about what trainings end with
 State = dict[str, torch.Tensor]
 """Weights under rsl_rl's keys."""
 
@@ -48,6 +56,8 @@ class Start:
     critic: State | None
     hidden_dims: tuple[int, ...]
     """Hidden layers of both."""
+    controller: ControllerCfg | None = None
+    """What the actor sees and does, with the activation between its layers, if it is described."""
 
     def with_noise_of(self, other: "Start") -> "Start":
         """The same with another's standard deviation of the actions, where that is known."""
@@ -61,6 +71,9 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
     A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
     such a file is left: its own normaliser is another.
     """
+    described = _load_described(path, robot)
+    if described is not None:
+        return _start_described(described, path, robot)
     policy = load_policy(path, robot, "cpu")
     if not isinstance(policy, MlpPolicy):
         raise ValueError(
@@ -74,22 +87,83 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
             f"{policy.activation} and {', '.join(content)}: {path}; give another controller"
         )
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
+    critic = None if policy.normalised else content.get("critic_state_dict")
+    return _start_of(policy, actor, critic, robot, path)
+
+
+def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, path: Path) -> Start:
     if policy.normalised:
         weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
         actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
     hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
-    critic = None if policy.normalised else content.get("critic_state_dict")
-    _check_std(actor, robot, path)
+    _check_std(actor, policy.sizes[1], path)
     if critic is not None:
-        _check_critic(critic, (policy.sizes[0], *hidden, 1), path)
+        _check_critic(critic, (robot.observation_size, *hidden, 1), path)
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
 
 
-def _check_std(actor: State, robot: RobotCfg, path: Path) -> None:
+def _load_described(path: Path, robot: RobotCfg) -> Described | None:
+    """The described controller of a controller.toml, or of the checkpoint of its training."""
+    if path.suffix == ".toml":
+        policy = load_policy(path, robot, "cpu")
+        assert isinstance(policy, Described)
+        return policy
+    if path.name != CHECKPOINT or not path.is_file() or DESCRIPTION not in (saved := read_checkpoint(path)):
+        return None
+    return load_described(parse_controller(saved[DESCRIPTION], path), path, robot, "cpu", path)
+
+
+def _start_described(described: Described, path: Path, robot: RobotCfg) -> Start:
+    """The network of a description, and its critic of the robot's row where a training has made one."""
+    weights = path if path.name == CHECKPOINT else weights_file(path)
+    policy = plain_layers(described.network, str(path))
+    # Of TorchScript the noise is not known.
+    content = read_weights(weights) if weights and isinstance(described.network, MlpPolicy) else {}
+    before = content.get("actor_state_dict", content.get("model_state_dict", {}))
+    noise = {name: torch.exp(before[name]) if "log" in name else before[name] for name in _NOISES if name in before}
+    std = next(iter(noise.values()), torch.full((policy.sizes[1],), _USUAL_NOISE)).float()
+    actor = {f"mlp.{key}": value.detach().clone() for key, value in policy.layers.state_dict().items()} | {STD: std}
+    start = _start_of(policy, actor, content.get("critic_state_dict") if path.name == CHECKPOINT else None, robot, path)
+    return replace(start, controller=replace(described.cfg, policy=POLICY, activation=policy.activation))
+
+
+@torch.inference_mode()
+def plain_layers(network: Any, place: str) -> MlpPolicy:
+    """A network as a perceptron; one of a TorchScript module must answer as its layers say.
+
+    ``place`` names the controller in errors.
+    """
+    if isinstance(network, MlpPolicy):
+        return network
+    module = getattr(network, "module", None)
+    tensors = module.state_dict() if module is not None and not hasattr(network, "reset") else {}
+    names = [
+        name.removesuffix("weight") for name, value in tensors.items() if name.endswith("weight") and value.ndim == 2
+    ]
+    parts = [(k, name, part) for k, name in enumerate(names) for part in ("weight", "bias")]
+    state = {f"mlp.{2 * k}.{part}": tensors[name + part] for k, name, part in parts if name + part in tensors}
+    state |= {f"obs_normalizer.{end}": tensors[name] for name in tensors for end in ("_mean", "_std")
+              if name.rpartition(".")[2] == end}  # fmt: skip
+    for activation in ACTIVATIONS if len(names) > 1 and len(state) >= len(parts) else ():
+        try:
+            policy = MlpPolicy(state, activation)
+            rows = torch.randn(64, policy.sizes[0], generator=torch.Generator().manual_seed(0))
+            rows = policy.mean + policy.std * rows
+            if torch.allclose(policy(rows), network(rows), rtol=1e-4, atol=1e-4):
+                return policy
+        except (KeyError, RuntimeError):
+            break
+    raise ValueError(
+        f"finetune needs a network of plain layers with one kind of activation, got another in {place}: give an rsl_rl "
+        "checkpoint or its TorchScript as the description's policy"
+    )
+
+
+def _check_std(actor: State, count: int, path: Path) -> None:
     std = actor.get(STD)
-    if std is not None and (std.shape != (robot.num_joints,) or not bool(((std > 0.0) & std.isfinite()).all())):
+    if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
         raise ValueError(
-            f"{path}: {STD}, the standard deviation of the actions, must be {robot.num_joints} numbers above 0, got "
+            f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0, got "
             f"{' '.join(str(std).split())}: leave it out, or give another controller"
         )
 

@@ -119,7 +119,7 @@ class Learner:
         self.ranks = Ranks.of_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-            self.runner = Runner(env, runner_settings(cfg), log_dir=None, device=str(env.device))
+            self.runner = Runner(env, runner_settings(cfg, env.controller), log_dir=None, device=str(env.device))
         self.alg: CapturedPPO = self.runner.alg  # pyright: ignore[reportAttributeAccessIssue] - as its settings say
         if self.ranks.size > 1:
             self.alg.broadcast_parameters()

@@ -6,21 +6,23 @@ import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
 
+from sim.policy.described import ControllerCfg
 from train.ppo.cfg import PpoCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels
 
 
-def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
+def runner_settings(cfg: PpoCfg, controller: ControllerCfg | None = None) -> dict[str, Any]:
     """Settings for ``OnPolicyRunner``; a new dict each call because rsl_rl writes into the one it is given."""
     network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": False}
+    actor = {**network, "activation": "elu" if controller is None else controller.activation}
     noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_noise_std, "std_type": "scalar"}
     return {
         "num_steps_per_env": cfg.steps_per_env,
         "save_interval": 10**9,
         "check_for_nan": False,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "obs_groups": {"actor": ["policy" if controller is None else "actor"], "critic": ["policy"]},
         "algorithm": {
             "class_name": CapturedPPO,
             "num_learning_epochs": cfg.epochs,
@@ -36,7 +38,7 @@ def runner_settings(cfg: PpoCfg) -> dict[str, Any]:
             "use_clipped_value_loss": True,
             "max_grad_norm": 1.0,
         },
-        "actor": {**network, "hidden_dims": list(cfg.hidden_dims), "distribution_cfg": noise},
+        "actor": {**actor, "hidden_dims": list(cfg.hidden_dims), "distribution_cfg": noise},
         "critic": {**network, "hidden_dims": list(cfg.hidden_dims)},
     }
 

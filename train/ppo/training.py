@@ -5,7 +5,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from threading import Event
 from typing import Any, Literal
@@ -20,18 +20,19 @@ from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.records import provenance, robot_digest
+from sim.policy.described import ControllerCfg, text_of
 from sim.policy.spec import is_same
 from sim.robots.robot import RobotCfg
 from train.cfg import TrainCfg
-from train.ppo.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
+from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, read_checkpoint, write_checkpoint
 from train.ppo.learner import Learner, Ranks
 from train.ppo.progress import Progress
 from train.task.curriculum import Tiles
 from train.task.task import CommandTask
 from train.task.vec_env import CommandVecEnv
 
-POLICY = "policy.pt"
-"""File of a training's directory with its controller."""
+DESCRIBED = "controller.toml"
+"""File of a training's directory that describes its controller, if it is described."""
 CONFIG = "config.json"
 SAVE_EVERY_S = 60.0
 _SEED_STEP = 1_000_003  # between the tasks of two processes
@@ -140,18 +141,19 @@ class Training:
         saved: dict[str, Any] | None,
         tiles: Tiles | None = None,
         random_ages: bool = True,
+        controller: ControllerCfg | None = None,
     ) -> None:
         """Begin, or go on from a checkpoint (:func:`read_saved`); without ``tiles`` on those of the curriculum.
 
         ``settings`` are what checkpoint and record say of it (:func:`settings_of`), ``random_ages`` as of
-        :class:`Learner`.
+        :class:`Learner`, ``controller`` as of :class:`CommandVecEnv`.
         """
         self._robot, self._cfg, self._run_dir, self._settings = robot, cfg, run_dir, settings
         ranks = Ranks.of_environment()
         self.task = CommandTask(
             robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
         )
-        self.learner = Learner(CommandVecEnv(self.task), cfg.ppo, seed=cfg.seed, random_ages=random_ages)
+        self.learner = Learner(CommandVecEnv(self.task, controller), cfg.ppo, seed=cfg.seed, random_ages=random_ages)
         if saved is not None:
             self.learner.resume(saved)
         self.progress = Progress(
@@ -181,6 +183,7 @@ class Training:
             "kind": self.kind,
             "settings": self._settings,
             "progress": self.progress.state(),
+            **({} if self.learner.env.controller is None else {DESCRIPTION: text_of(self.learner.env.controller)}),
             **self.facts(),
         }
 
@@ -202,7 +205,7 @@ class Training:
         if stop.is_set():
             done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
             raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
-        return self._run_dir / POLICY
+        return self._run_dir / (POLICY if self.learner.env.controller is None else DESCRIBED)
 
     def _iterate(self, stop: Event) -> None:
         learner = self.learner
@@ -236,6 +239,9 @@ class Training:
         record = {**self.progress.record(), "averaged": learner.averaged, **self.facts()}
         for path in (self._run_dir / POLICY, *([export] if export else [])):
             write_controller(path, learner, record)
+            if learner.env.controller is not None:
+                description = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
+                write_atomically(description, text_of(replace(learner.env.controller, policy=path.name)).encode())
             print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
 
 
@@ -248,7 +254,8 @@ def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> No
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
     actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.mean_actor_state().items()}
-    torch.save({"actor_state_dict": actor, "activation": "elu", "iter": learner.iteration, **marks}, buffer)
+    activation = "elu" if learner.env.controller is None else learner.env.controller.activation
+    torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))
 

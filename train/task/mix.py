@@ -10,6 +10,7 @@ from sim.bank import terrains_of
 from sim.ground import GroundMaps
 from sim.robots.training import Draw
 from sim.spaces.base import TerrainSpace
+from sim.spaces.registry import share_of_height
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from train.task.curriculum import Tiles
@@ -38,7 +39,8 @@ class Mix:
     seed: int
     device: str
     spaces: tuple[TerrainSpace, ...] = (SUPER_GAUSSIAN,)
-    """What the genes of each part mean; the first is that of hard-random terrains."""
+    """What the genes of each part mean; the first is that of hard-random terrains. Hand-crafted ones are as much lower
+    than usual as the lowest of them."""
     goal_rate: NDArray[np.float64] | None = None
     """Goal rate of each elite as its archive has it, shape (E,), which stands in until it is trained on; None: 0."""
     swap: int = -1
@@ -81,6 +83,7 @@ class Mix:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
         rng = self._rng(0)
         heights, numbers, _ = hand_crafted_crossings(self.num_hand_crafted, rng)
+        heights *= np.float32(min(map(share_of_height, self.spaces)))
         types = tuple(CROSSING_TYPES[number] for number in numbers)
         if self.kind == "hand-crafted":
             return Tiles(heights=heights, type_of_column=types)

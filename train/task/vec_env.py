@@ -8,21 +8,27 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from kernels.episode import Outcome
+from sim.policy.described import ControllerCfg, Described
 from train.task.task import CommandTask
 
 
 class CommandVecEnv(VecEnv):
     """rsl_rl's view of a :class:`CommandTask`: one observation group, ``policy``, for actor and critic.
 
+    The actor of a description has a group of its own, ``actor``, and acts through it.
+
     Every tensor handed out is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in
     the next step.
     """
 
-    def __init__(self, task: CommandTask) -> None:
-        """Wrap a task."""
-        self.task = task
+    def __init__(self, task: CommandTask, controller: ControllerCfg | None = None) -> None:
+        """Wrap a task; ``controller`` describes an actor that sees and does other things than the task's."""
+        self.task, self.controller = task, controller
+        self._described = None if controller is None else Described(controller, task.robot, "the controller")
         self.num_envs = task.num_envs
-        self.num_actions = task.robot.num_joints
+        self.num_actions = task.robot.num_joints if self._described is None else self._described.num_actions
+        if self._described is not None:
+            self._described.use(None, task.observation.device)
         self.max_episode_length = task.max_episode_steps
         self.device = str(task.observation.device)
         self.cfg = asdict(task.cfg)
@@ -37,8 +43,15 @@ class CommandVecEnv(VecEnv):
         self.task.episode_steps.copy_(steps)
 
     def get_observations(self) -> TensorDict:
-        """The present observations, ``policy``: shape (num_envs, observation_size)."""
-        return TensorDict({"policy": self.task.observation.clone()}, batch_size=[self.num_envs], device=self.device)
+        """The present observations, ``policy``: shape (num_envs, observation_size).
+
+        To be called where all episodes begin; :meth:`step` gives those after it, each once.
+        """
+        groups = {"policy": self.task.observation.clone()}
+        if self._described is not None:
+            self._described.reset(self.task.episode_steps == 0)
+            groups["actor"] = self._described.observe(groups["policy"])
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Make one control step with ``actions`` (num_envs, num_actions).
@@ -47,7 +60,7 @@ class CommandVecEnv(VecEnv):
             Observations after it (of the new episode where one ended), rewards (num_envs,), dones (num_envs,) and
             ``{"time_outs": (num_envs,)}``, the dones that no failure caused. No host synchronisation.
         """
-        self.task.step(actions)
+        self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end
         # A robot at its goal or out of the world did not fail: as with the clock, its value goes on.
         cut = (end == int(Outcome.TIME_OUT)) | (end == int(Outcome.GOAL)) | (end == int(Outcome.OUT))
