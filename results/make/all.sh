@@ -39,6 +39,9 @@ for robot in "${robots[@]}"; do
   make_file "$folder/speed.json" speed "$robot"                       # 12 min, 4 of them on the CPU
   make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
 done
+if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
+  "$python" -m results.make.public "$PUBLIC"                            # 20 min
+fi
 "$python" -m tests.bench                                              # 3 min
 "$python" -m results.make.pictures                                    # some minutes, a browser
 "$python" -m results.make.docs
