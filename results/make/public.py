@@ -1,7 +1,7 @@
 """What breaks published controllers, each by one import and one search: results/public.json.
 
-FOLDER holds the controllers and models of their publishers, as docs/controllers.md says where to get them. Everything
-but the network of mujoco_playground's Go1 is read from the publisher's files; of that nobody says what it sees.
+FOLDER holds go2, g1 and go1 with the controllers and models of rl_sar, unitree_rl_gym and mujoco_playground. Everything
+but what the network of Go1 sees, which its file does not say, is read from the publishers' files.
 """
 
 import argparse
