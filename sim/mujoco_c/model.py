@@ -18,7 +18,7 @@ from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
 from sim.maps.hfield import Margins, as_hfield
-from sim.robots.compiled import robot_spec
+from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -56,9 +56,7 @@ def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[A
     qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
     qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
     for k, quaternion in enumerate(qpos[:, 3:7]):
-        matrix = np.zeros(9)
-        _mj.mju_quat2Mat(matrix, quaternion)
-        to_world = matrix.reshape(3, 3)
+        to_world = rotation_matrix(quaternion)
         qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
         qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
     return Starts(qpos=qpos, qvel=qvel)

@@ -77,11 +77,11 @@ def read_robot_spec(robot: RobotCfg, wrong: Collection[str] = (), *, visuals: bo
             weak = joints_without_effort(files.root) if files.is_urdf and robot.effort_limit is None else []
             problems += _joint_value_problems(model, robot, weak, wrong)
             if {"stiffness", "damping"}.isdisjoint(wrong) and not problems:
-                problems += _drive_problems(drives, model, robot)
+                problems += _drive_problems(drives, robot)
     roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
     problems += _geom_problems(spec, [name for role in roles for name in getattr(robot, role)], robot)
     if not problems and not wrong:
-        _set_drives(spec, drives, model, robot)
+        _set_drives(spec, drives, robot)
         _set_contact(spec, robot)
     return spec, problems
 
@@ -118,13 +118,13 @@ def _of_urdf(root: ET.Element) -> Any:
 
 def _sum_masses(body: Any) -> list[Any]:
     """Gives a body what is fixed to it: its mass, and where its own and theirs are in it, [kg], [m], [kg m^2]."""
-    axes = _matrix(body.iquat)
+    axes = rotation_matrix(body.iquat)
     inertia = axes @ np.diag(body.inertia) @ axes.T
     if not np.isnan(body.fullinertia[0]):
         inertia = body.fullinertia[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
     parts = [(float(body.mass), np.array(body.ipos), inertia)] if body.mass > 0.0 else []
     for child in body.bodies:
-        of_child, turn = _sum_masses(child), _matrix(child.quat)
+        of_child, turn = _sum_masses(child), rotation_matrix(child.quat)
         if not child.joints:
             parts += [(mass, child.pos + turn @ at, turn @ own @ turn.T) for mass, at, own in of_child]
             child.mass, child.inertia, child.fullinertia = 0.0, np.zeros(3), np.full(6, np.nan)
@@ -160,7 +160,8 @@ def _of_point(at: NDArray[np.float64]) -> NDArray[np.float64]:
     return at @ at * np.eye(3) - np.outer(at, at)
 
 
-def _matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of a quaternion w x y z, shape (3, 3)."""
     matrix = np.zeros(9)
     _mj.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
     return matrix.reshape(3, 3)
@@ -285,6 +286,7 @@ class _Drives:
         joints, count = joint_names(model), model.njnt - 1
         self.stiffness, self.damping, self.effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
         self.control, self.problems = np.full((count, 2), np.nan), list[str]()
+        self.follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
         for k in np.flatnonzero(model.jnt_actfrclimited[1:]):
             self.effort[k] = self._least(model.jnt_actfrcrange[1 + k], f"actuatorfrcrange of {joints[k]}")
         taken: list[int] = []
@@ -337,30 +339,28 @@ class _Drives:
         return "an actuator that is neither <position> nor <motor>"
 
 
-def _drive_problems(drives: _Drives, model: Any, robot: RobotCfg) -> list[str]:
+def _drive_problems(drives: _Drives, robot: RobotCfg) -> list[str]:
     """What the joints lack, gains of the settings counted in; joints that follow another one need none."""
-    follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
     gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
-    limp = [name for k, name in enumerate(robot.joint_names) if not gains[k] > 0.0 and k not in follow]
+    limp = [name for k, name in enumerate(robot.joint_names) if not gains[k] > 0.0 and k not in drives.follow]
     if limp:
         return [f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"]
     return []
 
 
-def _set_drives(spec: Any, drives: _Drives, model: Any, robot: RobotCfg) -> None:
+def _set_drives(spec: Any, drives: _Drives, robot: RobotCfg) -> None:
     """One position actuator a joint, in the joints' order, with the gains of the settings if they have some."""
     for actuator in spec.actuators:
         spec.delete(actuator)
-    follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
     for k, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         if robot.armature is not None:
             joint.armature = robot.armature[k]
+        if k in drives.follow:
+            continue
         effort = min(drives.effort[k], np.inf if robot.effort_limit is None else robot.effort_limit[k])
         stiffness = drives.stiffness[k] if robot.stiffness is None else robot.stiffness[k]
         damping = drives.damping[k] if robot.damping is None else robot.damping[k]
-        if k in follow:
-            continue
         limits: dict[str, Any] = {
             "forcelimited": np.isfinite(effort),
             "ctrllimited": not np.isnan(drives.control[k, 0]),

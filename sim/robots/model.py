@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec
+from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -59,9 +59,7 @@ def _transform(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -
 
 def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     """Adds a body with its joint, whose number it returns."""
-    axes = np.zeros(9)
-    _mj.mju_quat2Mat(axes, model.body_iquat[body])
-    axes = axes.reshape(3, 3)
+    axes = rotation_matrix(model.body_iquat[body])
     inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
     place, joint = _transform(model.body_pos[body], model.body_quat[body]), int(model.body_jntadr[body])
     link = builder.add_link(

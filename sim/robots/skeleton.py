@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sim.robots.compiled import robot_spec as _compiled_spec
+from sim.robots.compiled import touching_geoms
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -35,13 +36,11 @@ def robot_spec(robot: RobotCfg) -> Any:
     """
     try:
         spec = _compiled_spec(robot, visuals=True)
-        spec.copy().compile()
     except ValueError:  # such as a mesh of too many faces, which only shows
         spec = _compiled_spec(robot)
     looks = _read_look(robot)
     for body in spec.bodies[1:]:
-        touching = [geom for geom in body.geoms if geom.contype or geom.conaffinity]
-        _dress(body, touching, looks.pop(body.name, []), robot)
+        _dress(body, touching_geoms(body), looks.pop(body.name, []), robot)
     if looks:
         raise ValueError(
             f"{_look_file(robot)} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
