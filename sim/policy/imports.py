@@ -15,8 +15,8 @@ import yaml
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.policy.loaders import PlainYaml, load_network
-from sim.robots.compiled import joint_names
-from sim.robots.own import PER_JOINT, compile_model, default_pose, per_joint
+from sim.robots.compiled import joint_names, read_robot_file
+from sim.robots.own import PER_JOINT, per_joint
 from sim.robots.robot import RobotCfg
 
 _FILES = {
@@ -54,6 +54,7 @@ class _Found:
     model_file: Path
     model: Any
     joints: tuple[str, ...]
+    home: list[float] | None
     settings: dict[str, Any] = field(default_factory=dict)
     """None where the user has to fill it in."""
     why: dict[str, str] = field(default_factory=dict)
@@ -119,8 +120,8 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
-    model = compile_model(model_file)
-    found = _Found(model_file=model_file, model=model, joints=joint_names(model))
+    of_file = read_robot_file(model_file)
+    found = _Found(model_file=model_file, model=of_file.model, joints=joint_names(of_file.model), home=of_file.home)
     kind, read = _reader_of(source)
     weights = read(source, found)
     out.mkdir(parents=True, exist_ok=True)
@@ -299,9 +300,8 @@ def _read_mjlab(source: Path, found: _Found) -> Path:
 def _read_weights(source: Path, found: _Found) -> Path:
     """Weights that say nothing but their widths."""
     (width, count), place = _widths(source), found.imu()
-    pose, keyframe = default_pose(found.model_file, found.model)
     asked = f"an angle of each joint [rad], its pose at action 0: {', '.join(found.joints)}"
-    found.put(default_joint_pos=pose if keyframe else None, why="" if keyframe else asked)
+    found.put(default_joint_pos=found.home, why="" if found.home else asked)
     if not found.model.nu or not found.model.actuator_biasprm[:, 1].any():
         for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad")):
             found.put(**{name: None}, why=f"a gain of each joint, or one number [{unit}]")

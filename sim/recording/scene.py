@@ -15,7 +15,7 @@ from sim.ground import GroundMaps
 from sim.maps.hfield import surface_of
 from sim.maps.picture import height_colors, tinted
 from sim.robots.robot import RobotCfg
-from sim.robots.skeleton import robot_model, robot_spec
+from sim.robots.skeleton import robot_model, shown_spec
 from sim.terrain import SPACING
 
 _mj: Any = mujoco  # its types are not written down
@@ -67,7 +67,7 @@ def scene_model(
 
     Images are at most of that width and height [pixels].
     """
-    spec = robot_spec(robot)
+    spec = shown_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)

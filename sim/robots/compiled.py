@@ -6,6 +6,8 @@ ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -13,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.files.command import with_traceback
-from sim.robots.model_files import joints_without_effort, read_model_files
+from sim.robots.model_files import read_model_files
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -34,6 +36,21 @@ _NEEDED = ("constraint", "equality", "frictionloss", "limit", "contact", "spring
            "actuation", "refsafe")  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True)
+class RobotFile:
+    """What a robot's file says, whatever its settings."""
+
+    spec: Any
+    """The ``MjSpec``, with what simulations take of it, under names."""
+    model: Any
+    """The same, compiled."""
+    drives: "_Drives"
+    """What its actuators do."""
+    home: list[float] | None
+    """Joint angles of its keyframe ``home`` [rad]; None without one."""
+    is_urdf: bool
+
+
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
 
@@ -41,49 +58,38 @@ def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
         robot: Robot settings; what they say of gains, torque limits, armature and contact counts.
         visuals: Whether a URDF keeps what it shows of its links.
     """
-    spec, problems = read_robot_spec(robot, visuals=visuals)
-    if problems:
+    of_file = read_robot_file(robot.model_file, visuals=visuals)
+    if problems := file_problems(robot, of_file):
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
-    return spec
+    _set_drives(of_file.spec, of_file.drives, robot)
+    for geom in touching_geoms(*of_file.spec.bodies):
+        if robot.friction is not None:
+            geom.friction[0] = robot.friction
+        if robot.contact_time_constant_s is not None:
+            geom.solref = robot.contact_time_constant_s, 1.0
+    return of_file.spec
 
 
-def read_robot_spec(robot: RobotCfg, wrong: Collection[str] = (), *, visuals: bool = False) -> tuple[Any, list[str]]:
-    """The same, with what is wrong, one line each; fields of the settings in ``wrong`` are not compared with it."""
+def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
+    """Reads a robot's file; an error says all that is wrong with it."""
+    files = read_model_files(model_file, visuals=visuals)
     try:
-        files = read_model_files(robot.model_file, visuals=visuals)
-    except ValueError as error:
-        return None, [str(error)]
-    if files.problems:
-        return None, list(files.problems)
-    try:
-        spec = _of_urdf(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(robot.model_file))
+        spec = _of_urdf(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(model_file))
+        home = next((list(key.qpos) for key in spec.keys if key.name == "home"), [])
         strange = _keep_robot(spec)
         spec.fuse_static()
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
         reason = " ".join(str(error).split())
-        return None, [with_traceback(error, f"{robot.model_file} cannot be read by MuJoCo: {reason}")]
+        raise ValueError(with_traceback(error, f"{model_file} cannot be read by MuJoCo: {reason}")) from None
     drives = _Drives(spec, model)
-    strange += drives.problems
     problems = _structure_problems(model)
-    if strange:
+    if strange := strange + drives.problems:
         problems.append(f"{', '.join(strange)} cannot be simulated: take it out, or write it otherwise")
-    problems = [f"{robot.model_file}: {problem}" for problem in problems]
     if problems:
-        return spec, problems
-    if "joint_names" not in wrong:
-        problems += _joint_name_problems(model, robot)
-        if not problems:
-            weak = joints_without_effort(files.root) if files.is_urdf and robot.effort_limit is None else []
-            problems += _joint_value_problems(model, robot, weak, wrong)
-            if {"stiffness", "damping"}.isdisjoint(wrong) and not problems:
-                problems += _drive_problems(drives, robot)
-    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
-    problems += _geom_problems(spec, [name for role in roles for name in getattr(robot, role)], robot)
-    if not problems and not wrong:
-        _set_drives(spec, drives, robot)
-        _set_contact(spec, robot)
-    return spec, problems
+        raise ValueError("; ".join(f"{model_file}: {problem}" for problem in problems))
+    pose = home[7:] if len(home) == model.nq else None
+    return RobotFile(spec=spec, model=model, drives=drives, home=pose, is_urdf=files.is_urdf)
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
@@ -209,81 +215,79 @@ def _structure_problems(model: Any) -> list[str]:
     alone = np.flatnonzero(model.body_jntnum != 1)[1:]
     crowded = [model.joint(k).name for k in range(1, model.njnt)
                if model.jnt_type[k] == _JOINT.mjJNT_FREE or model.jnt_bodyid[k] in alone]  # fmt: skip
-    if crowded:
-        return [f"every joint must be a hinge or slide on a body of its own, unlike that of {', '.join(crowded)}"]
     fixed = [model.geom(k).name for k in range(model.ngeom) if model.geom_bodyid[k] == 0 and model.geom_contype[k]]
-    if fixed:
-        return [f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out"]
     poses = np.hstack([model.body_pos, model.body_quat, model.body_ipos])[1:]
     lost = [model.body(1 + k).name for k in np.flatnonzero(~np.isfinite(poses).all(axis=1))]
-    if lost:
-        return [f"position and rotation must be numbers, unlike those of {', '.join(lost)}"]
     slight = [model.body(k).name for k in range(1, model.nbody)
               if model.body_inertia[k].min() < _LEAST_GYRATION**2 * model.body_mass[k]]  # fmt: skip
-    if slight:
-        return [f"inertia of {', '.join(slight)} is that of a point: give it that of a body [kg m^2]"]
-    return []
+    findings = [
+        (crowded, f"every joint must be a hinge or slide on a body of its own, unlike that of {', '.join(crowded)}"),
+        (fixed, f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out"),
+        (lost, f"position and rotation must be numbers, unlike those of {', '.join(lost)}"),
+        (slight, f"inertia of {', '.join(slight)} is that of a point: give it that of a body [kg m^2]"),
+    ]
+    return [text for names, text in findings if names]
 
 
-def _joint_name_problems(model: Any, robot: RobotCfg) -> list[str]:
-    joints = joint_names(model)
-    problems = _unknown("joint", robot.joint_names, joints, robot)
-    if not problems and joints != robot.joint_names:
-        problems.append(f"joint_names must follow the file's order {joints}, got {robot.joint_names}")
-    return problems
+def file_problems(robot: RobotCfg, of_file: RobotFile, wrong: Collection[str] = ()) -> list[str]:
+    """What of a robot's settings does not fit its file, one line each; fields in ``wrong`` are not compared with it."""
+    problems = [] if "joint_names" in wrong else _joint_problems(robot, of_file, wrong)
+    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
+    wanted, spec = [name for role in roles for name in getattr(robot, role)], of_file.spec
+    touching = [geom.name for geom in touching_geoms(*spec.bodies)]
+    sites = {site.name for site in spec.sites} - {*touching}
+    visual = {geom.name for geom in spec.geoms if not geom.contype} - {""}
+    for kind, names in (("a site", sites), ("a geom that touches nothing", visual)):
+        if got := [name for name in wanted if name in names]:
+            problems.append(f"{', '.join(got)} is {kind} in {robot.model_file}: name geoms that touch the ground")
+    known = [name for name in wanted if name not in sites | visual]
+    return problems + _unknown("geom", known, touching, robot)
 
 
 def _unknown(kind: str, wanted: Sequence[str], present: Sequence[str], robot: RobotCfg) -> list[str]:
-    missing = [name for name in wanted if name not in present]
-    if not missing:
-        return []
-    return [f"no {kind} named {', '.join(missing)} in {robot.model_file}: the file has {', '.join(present)}"]
+    missing = ", ".join(name for name in wanted if name not in present)
+    return [f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"] * bool(missing)
 
 
-def _geom_problems(spec: Any, wanted: Sequence[str], robot: RobotCfg) -> list[str]:
-    sites = {site.name for site in spec.sites} - {geom.name for geom in touching_geoms(*spec.bodies)}
-    visual = {geom.name for geom in spec.geoms if not geom.contype} - {""}
-    problems = []
-    for kind, names in (("a site", sites), ("a geom that touches nothing", visual)):
-        got = [name for name in wanted if name in names]
-        problems += [f"{', '.join(got)} is {kind} in {robot.model_file}: name geoms that touch the ground"] * bool(got)
-    known = [name for name in wanted if name not in sites | visual]
-    return problems + _unknown("geom", known, [geom.name for geom in touching_geoms(*spec.bodies)], robot)
-
-
-def _joint_value_problems(model: Any, robot: RobotCfg, weak: Sequence[str], wrong: Collection[str]) -> list[str]:
-    """What is wrong with the settings that have a value for each joint; of joints ``weak`` a URDF has no torque."""
-    count, problems = len(robot.joint_names), []
+def _joint_problems(robot: RobotCfg, of_file: RobotFile, wrong: Collection[str]) -> list[str]:
+    """What is wrong with the joints' names, and with the settings that have a value for each."""
+    model, drives, names = of_file.model, of_file.drives, robot.joint_names
+    if problems := _unknown("joint", names, joint_names(model), robot):
+        return problems
+    if names != joint_names(model):
+        return [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
     values = {name: getattr(robot, name) for name in _UNITS if name not in wrong}
-    short = {name: len(given) for name, given in values.items() if given is not None and len(given) != count}
-    for name, got in short.items():
-        problems.append(f"{name} needs {count} {_UNITS[name]}, got {got}")
-    numbers = {"armature": model.dof_armature, "damping": model.dof_damping, "frictionloss": model.dof_frictionloss}
-    for name, of_file in numbers.items():
-        beyond = [f"{joint} ({value:g})" for joint, value in zip(robot.joint_names, of_file[6:], strict=True)
-                  if not value >= 0.0]  # fmt: skip
-        problems += [f"{name} must be a number, 0 or more, got {', '.join(beyond)}"] * bool(beyond)
+    short = {name: len(given) for name, given in values.items() if given is not None and len(given) != len(names)}
+    problems = [f"{name} needs {len(names)} {_UNITS[name]}, got {got}" for name, got in short.items()]
+    for name in ("armature", "damping", "frictionloss"):
+        of_joints = zip(names, getattr(model, f"dof_{name}")[6:], strict=True)
+        if beyond := [f"{joint} ({value:g})" for joint, value in of_joints if not value >= 0.0]:
+            problems.append(f"{name} must be a number, 0 or more, got {', '.join(beyond)}")
     if "default_joint_pos" in values and "default_joint_pos" not in short:
-        problems += _range_problems(model, robot)
-    if weak:
-        problems.append(f"no <limit effort> above 0 for {', '.join(weak)}: give it, or effort_limit in the settings")
+        pose = robot.default_joint_pos
+        ranges = zip(names, pose, model.jnt_limited[1:], model.jnt_range[1:], strict=True)
+        beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, limited, (low, high) in ranges
+                  if limited and not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
+        if beyond:
+            degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in pose) else ""
+            problems.append(f"default_joint_pos is outside of the file's range for {', '.join(beyond)}{degrees}")
+    if of_file.is_urdf and robot.effort_limit is None and np.isinf(drives.effort).any():
+        weak = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
+        problems.append(f"no <limit effort> above 0 for {weak}: give it, or effort_limit in the settings")
+    if not problems and {"stiffness", "damping"}.isdisjoint(wrong):
+        gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
+        limp = [name for k, name in enumerate(names) if not gains[k] > 0.0 and k not in drives.follow]
+        if limp:
+            file = robot.model_file
+            problems.append(f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {file}")
     return problems
-
-
-def _range_problems(model: Any, robot: RobotCfg) -> list[str]:
-    """Default angles that the joints cannot take."""
-    ranges = zip(robot.joint_names, robot.default_joint_pos, model.jnt_limited[1:], model.jnt_range[1:], strict=True)
-    beyond = [f"{name} ({low:g} to {high:g}, got {angle:g})" for name, angle, limited, (low, high) in ranges
-              if limited and not low - _SLACK <= angle <= high + _SLACK]  # fmt: skip
-    degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in robot.default_joint_pos) else ""
-    return [f"default_joint_pos is outside of the file's range for {', '.join(beyond)}{degrees}"] if beyond else []
 
 
 class _Drives:
     """What the actuators of a compiled file do to each joint, and what no position actuator can do."""
 
     def __init__(self, spec: Any, model: Any) -> None:
-        joints, count = joint_names(model), model.njnt - 1
+        joints, count = joint_names(model), len(joint_names(model))
         self.stiffness, self.damping, self.effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
         self.control, self.problems = np.full((count, 2), np.nan), list[str]()
         self.follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
@@ -339,15 +343,6 @@ class _Drives:
         return "an actuator that is neither <position> nor <motor>"
 
 
-def _drive_problems(drives: _Drives, robot: RobotCfg) -> list[str]:
-    """What the joints lack, gains of the settings counted in; joints that follow another one need none."""
-    gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
-    limp = [name for k, name in enumerate(robot.joint_names) if not gains[k] > 0.0 and k not in drives.follow]
-    if limp:
-        return [f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"]
-    return []
-
-
 def _set_drives(spec: Any, drives: _Drives, robot: RobotCfg) -> None:
     """One position actuator a joint, in the joints' order, with the gains of the settings if they have some."""
     for actuator in spec.actuators:
@@ -361,25 +356,11 @@ def _set_drives(spec: Any, drives: _Drives, robot: RobotCfg) -> None:
         effort = min(drives.effort[k], np.inf if robot.effort_limit is None else robot.effort_limit[k])
         stiffness = drives.stiffness[k] if robot.stiffness is None else robot.stiffness[k]
         damping = drives.damping[k] if robot.damping is None else robot.damping[k]
-        limits: dict[str, Any] = {
-            "forcelimited": np.isfinite(effort),
-            "ctrllimited": not np.isnan(drives.control[k, 0]),
-        }
-        if limits["forcelimited"]:
-            limits["forcerange"] = (-effort, effort)
-        if limits["ctrllimited"]:
-            limits["ctrlrange"] = drives.control[k]
+        control, limited = drives.control[k], np.isfinite(effort)
         spec.add_actuator(
             name=name, target=name, trntype=_TRN, gear=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
             gaintype=_mj.mjtGain.mjGAIN_FIXED, gainprm=(stiffness, *(0.0,) * 9), dyntype=_mj.mjtDyn.mjDYN_NONE,
-            biastype=_BIAS.mjBIAS_AFFINE, biasprm=(0.0, -stiffness, -damping, *(0.0,) * 7), **limits,
+            biastype=_BIAS.mjBIAS_AFFINE, biasprm=(0.0, -stiffness, -damping, *(0.0,) * 7),
+            forcelimited=limited, forcerange=(-effort, effort) if limited else (0.0, 0.0),
+            ctrllimited=not np.isnan(control[0]), ctrlrange=np.nan_to_num(control),
         )  # fmt: skip
-
-
-def _set_contact(spec: Any, robot: RobotCfg) -> None:
-    """Friction and contact time constant of the settings."""
-    for geom in touching_geoms(*spec.bodies):
-        if robot.friction is not None:
-            geom.friction[0] = robot.friction
-        if robot.contact_time_constant_s is not None:
-            geom.solref = robot.contact_time_constant_s, 1.0

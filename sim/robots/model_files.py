@@ -8,10 +8,8 @@ from pathlib import Path
 
 _PACKAGE = "package://"
 _NUMBERS = """
-pos quat euler axisangle fromto size mass diaginertia fullinertia axis range armature damping stiffness frictionloss
-friction solref solimp margin kp kv gear forcerange ctrlrange actuatorfrcrange density scale
-xyz rpy ixx iyy izz ixy ixz iyz lower upper effort velocity radius length multiplier offset
-"""  # attributes of MJCF, and of URDF
+xyz rpy ixx iyy izz ixy ixz iyz lower upper effort velocity damping friction size radius length scale multiplier offset
+"""
 _MOVING = ("revolute", "prismatic", "continuous")
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf")  # .msh: MuJoCo's own
 
@@ -24,8 +22,6 @@ class ModelFiles:
     """Of the XML; in a URDF the meshes' file names are absolute."""
     files: tuple[Path, ...]
     """The model file, included files and meshes."""
-    problems: tuple[str, ...] = ()
-    """What an importer would stumble over: texts in place of numbers; in a URDF joints without parts that they need."""
 
     @property
     def is_urdf(self) -> bool:
@@ -45,10 +41,10 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
     _refuse_xacro(root, model_file)
-    problems = list(_number_problems(root))
     files = [model_file]
     if root.tag == "robot":
-        problems += _urdf_problems(root)
+        if problems := [f"{model_file}: {problem}" for problem in _urdf_problems(root)]:
+            raise ValueError("; ".join(problems))
         for mesh in root.iter("mesh"):
             if mesh.get("filename"):
                 files.append(_mesh_path(mesh, model_file))
@@ -61,8 +57,7 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     foreign = sorted({str(file) for file in files if file.suffix.lower() not in _SUFFIXES and file != model_file})
     if foreign:
         raise ValueError(f"{model_file}: meshes must be STL or OBJ files, got {', '.join(foreign)}: convert them")
-    every = tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files))
-    return ModelFiles(root=root, files=every, problems=tuple(f"{model_file}: {problem}" for problem in problems))
+    return ModelFiles(root=root, files=tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files)))
 
 
 def _refuse_xacro(root: ET.Element, file: Path) -> None:
@@ -75,18 +70,6 @@ def _refuse_xacro(root: ET.Element, file: Path) -> None:
             )
 
 
-def _number_problems(root: ET.Element) -> Iterator[str]:
-    """Attributes that hold something else than the numbers they are for."""
-    numbers = _NUMBERS.split()
-    for element in root.iter():
-        for name, value in element.attrib.items():
-            if not (name in numbers or (name == "value" and element.tag == "mass")):
-                continue
-            if not all(map(_is_number, value.split())):
-                comma = ": write a decimal point" if "," in value else ""
-                yield f'<{element.tag} {name}="{value}"> must be numbers{comma}'
-
-
 def _is_number(word: str) -> bool:
     try:
         float(word)
@@ -96,7 +79,16 @@ def _is_number(word: str) -> bool:
 
 
 def _urdf_problems(root: ET.Element) -> Iterator[str]:
-    """Links and joints that lack what a URDF's need."""
+    """Texts in place of numbers, and links and joints that lack what they need; MuJoCo would name no line of a URDF."""
+    numbers = _NUMBERS.split()
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            is_number = name in numbers or (name == "value" and element.tag == "mass")
+            if is_number and not all(map(_is_number, value.split())):
+                comma = ": write a decimal point" if "," in value else ""
+                yield f'<{element.tag} {name}="{value}"> must be numbers{comma}'
+            elif name == "effort" and value.strip().startswith("-"):
+                yield f'<{element.tag} {name}="{value}"> must be above 0'
     links = [link.get("name") for link in root.findall("link")]
     for link in root.findall("link"):
         if not link.get("name"):
@@ -117,17 +109,6 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
         if kind in _MOVING[:2] and (limit is None or len(lacking) == 1):  # of a limit without both it moves freely
             missing = "<limit>" if limit is None else lacking[0]
             yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
-
-
-def joints_without_effort(root: ET.Element) -> list[str]:
-    """Names of a URDF's moving joints whose limits say nothing of effort, or 0."""
-    joints = []
-    for joint in root.findall("joint"):
-        limit = joint.find("limit")
-        effort = "0" if limit is None else limit.get("effort", "0")
-        if joint.get("type") in _MOVING and _is_number(effort) and not float(effort) > 0.0:
-            joints.append(joint.get("name", ""))
-    return joints
 
 
 def _parse(file: Path, *, visuals: bool = False) -> ET.Element:

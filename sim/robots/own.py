@@ -17,7 +17,7 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import from_builtins, problems, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import joint_names, read_robot_spec
+from sim.robots.compiled import RobotFile, file_problems, joint_names, read_robot_file
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import extents, make_probes, start_height
@@ -25,8 +25,6 @@ from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
 _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
-
-
 INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
             "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
 """Settings that a robot.toml may leave out though there is no default."""
@@ -37,10 +35,10 @@ _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's
 
 def load_robot(path: Path) -> RobotCfg:
     """Reads a settings file, or runs one that is Python, and checks the robot that it sets against its model."""
-    if path.suffix == ".toml":
-        robot: Any = _read_toml(path)
-    else:
-        robot = getattr(run_file(path), "ROBOT", None)
+    file = path.resolve()  # of a link, the model lies beside what it points to
+    robot, of_file = (
+        _read_toml(path, file) if path.suffix == ".toml" else (getattr(run_file(path), "ROBOT", None), None)
+    )
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
@@ -48,20 +46,18 @@ def load_robot(path: Path) -> RobotCfg:
         robot = replace(robot, model_file=Path(robot.model_file))
     mistakes = settings_problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
-    file = path.resolve()  # of a link, the model lies beside what it points to
     if "model_file" not in wrong:
         robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
-        with wp.ScopedDevice(host_device()):
-            spec, of_model = read_robot_spec(robot, wrong)
-            mistakes += of_model
-            if spec is not None and not of_model:
-                builder = builder_of(spec.compile())
-                try:
-                    make_probes(builder)
-                except ValueError as error:
-                    mistakes.append(str(error))
+        try:
+            of_file = of_file or read_robot_file(robot.model_file)
+            mistakes += file_problems(robot, of_file, wrong)
+            with wp.ScopedDevice(host_device()):
+                builder = builder_of(of_file.model)
+                make_probes(builder)
                 if not mistakes and not robot.default_base_height:
                     robot = replace(robot, default_base_height=start_height(robot, builder))
+        except ValueError as error:
+            mistakes.append(str(error))
     if mistakes:
         raise ValueError(f"{path}: {'; '.join(mistakes)}")
     return robot
@@ -75,33 +71,18 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is no TOML: {error}") from None
 
 
-def _read_toml(path: Path) -> RobotCfg:
-    """The robot of a robot.toml; what it leaves out is inferred from its model."""
+def _read_toml(path: Path, file: Path) -> tuple[RobotCfg, RobotFile]:
+    """The robot of a robot.toml, and its model, from which is inferred what it leaves out."""
     given = read_toml(path)
     known = [field.name for field in fields(RobotCfg) if field.name != "settings_file"]
     if unknown := [name for name in given if name not in known]:
         raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(known)}")
     if not isinstance(given.get("model_file"), str):
         raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
-    file = path.resolve()
-    model = compile_model(file.parent / given["model_file"], f"{path}: ")
-    settings = given | {
-        name: per_joint(given[name], joint_names(model), f"{path}: {name}") for name in PER_JOINT if name in given
-    }
-    return from_builtins(RobotCfg, infer(settings, file, model), str(path))
-
-
-def compile_model(model_file: Path, what: str = "") -> Any:
-    """A robot's model, of which no setting is known yet; an error begins with ``what``."""
-    bare = RobotCfg(
-        name="", model_file=model_file, base_geoms=(), foot_geoms=(), limb_geoms=(), joint_names=(),
-        default_joint_pos=(), footprint=(1.0, 1.0), scan_x=(), scan_y=(), contact_force_limit=1.0, penalties=(),
-        collision_bit=False,
-    )  # fmt: skip
-    spec, mistakes = read_robot_spec(bare, [field.name for field in fields(RobotCfg)])
-    if mistakes:
-        raise ValueError(what + "; ".join(mistakes))
-    return spec.compile()
+    of_file = read_robot_file(file.parent / given["model_file"])
+    joints = joint_names(of_file.model)
+    given |= {name: per_joint(given[name], joints, f"{path}: {name}") for name in PER_JOINT if name in given}
+    return from_builtins(RobotCfg, infer(given, file, of_file), str(path)), of_file
 
 
 def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = False) -> list[Any]:
@@ -125,7 +106,7 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
     return [value[keys[0]] if keys else None for keys in matches]
 
 
-def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
+def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, Any]:
     """Settings of a robot.toml with those that it leaves out, as far as its compiled model says them.
 
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
@@ -135,10 +116,13 @@ def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
     Args:
         given: What the file says, one value a joint where a setting is of joints.
         file: The robot.toml, of whose folder the robot has its name; a controller.toml beside it says its scan.
-        model: The robot as :func:`sim.robots.compiled.read_robot_spec` reads it, compiled.
+        of_file: What the model's file says.
     """
+    model = of_file.model
+    low, high = model.jnt_range[1:].T
+    nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, low, high), 0.0).tolist()
     found: dict[str, Any] = {"name": file.parent.name, "joint_names": list(joint_names(model)), "collision_bit": False}
-    found |= {"default_joint_pos": default_pose(file.parent / given["model_file"], model)[0]} | given
+    found |= {"default_joint_pos": of_file.home or nearest} | given
     pose = found["default_joint_pos"]
     if len(pose) != model.njnt - 1 or not all(isinstance(angle, int | float) for angle in pose):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
@@ -157,17 +141,6 @@ def infer(given: dict[str, Any], file: Path, model: Any) -> dict[str, Any]:
     found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
     found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))
     return _scan(file.with_name("controller.toml")) | found
-
-
-def default_pose(model_file: Path, model: Any) -> tuple[list[float], bool]:
-    """Angles of the keyframe ``home`` of a robot's file, or those nearest to zero, and whether there is one [rad]."""
-    low, high = model.jnt_range[1:].T
-    zero = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, low, high), 0.0)
-    if read_model_files(model_file).is_urdf:
-        return zero.tolist(), False
-    keys = {key.name: list(key.qpos) for key in mujoco.MjSpec.from_file(str(model_file)).keys}  # type: ignore
-    home = keys.get("home", [])
-    return (home[7:], True) if len(home) == model.nq else (zero.tolist(), False)
 
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
@@ -202,45 +175,41 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     """What is wrong with settings by themselves, one line each."""
     mistakes = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
-
-    def fine(*names: str) -> bool:
-        return wrong.isdisjoint(names)
-
-    if fine("name"):
-        if not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
-            mistakes.append(
-                f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}"
-            )
-        elif robot.name in ROBOTS:
-            mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
-    if fine(*_NAMES):
+    if "name" not in wrong and not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
+        mistakes.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
+    if robot.name in ROBOTS:
+        mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
+    if wrong.isdisjoint(_NAMES):
         mistakes += _name_problems(robot)
     if (robot.stiffness is None) != (robot.damping is None):
         mistakes.append("stiffness and damping must be given together")
-    least = 2.0 * robot.physics_dt if fine("physics_dt") else 0.0
-    time_constant_s = robot.contact_time_constant_s
-    if fine("contact_time_constant_s") and time_constant_s is not None and time_constant_s < least * (1.0 - 1e-9):
-        mistakes.append(
-            f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {time_constant_s:g}"
-        )
+    given, least = robot.contact_time_constant_s, 2.0 * robot.physics_dt
+    if (
+        given is not None
+        and wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
+        and given < least * (1.0 - 1e-9)
+    ):
+        mistakes.append(f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {given:g}")
     return mistakes
 
 
 def _name_problems(robot: RobotCfg) -> list[str]:
-    mistakes = [f"{name} must name at least one" for name in ("base_geoms", "foot_geoms", "joint_names")
-             if not getattr(robot, name)]  # fmt: skip
-    mistakes += [f"{name} must hold each name once, got {', '.join(getattr(robot, name))}" for name in _NAMES
-              if len(set(getattr(robot, name))) < len(getattr(robot, name))]  # fmt: skip
-    roles = {role: set(getattr(robot, role)) for role in ("base_geoms", "limb_geoms", "foot_geoms")}
-    twice = sorted({name for a, b in itertools.combinations(roles.values(), 2) for name in a & b})
-    if twice:
-        mistakes.append(f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}")
-    if not set(robot.penalties) <= set(PENALTIES) or len(robot.penalties) < 2:
-        mistakes.append(f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}")
+    names = {field: getattr(robot, field) for field in _NAMES}
+    roles = {role: names[role] for role in ("base_geoms", "limb_geoms", "foot_geoms")}
+    twice = sorted({name for a, b in itertools.combinations(roles.values(), 2) for name in {*a} & {*b}})
     strange = [name for name in getattr(robot.training, "steady_joints", ()) if name not in robot.joint_names]
-    if strange:
-        mistakes.append(f"training.steady_joints: no joint named {', '.join(strange)} in joint_names")
-    return mistakes
+    known = set(robot.penalties) <= set(PENALTIES) and len(robot.penalties) >= 2
+    findings = [
+        *((field != "limb_geoms" and not names[field], f"{field} must name at least one") for field in _NAMES[:-1]),
+        *(
+            (len({*row}) < len(row), f"{field} must hold each name once, got {', '.join(row)}")
+            for field, row in names.items()
+        ),
+        (twice, f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}"),
+        (not known, f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}"),
+        (strange, f"training.steady_joints: no joint named {', '.join(strange)} in joint_names"),
+    ]
+    return [text for holds, text in findings if holds]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 For showing a robot, not for simulating one: forward kinematics and geometry are those of MuJoCo C.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec as _compiled_spec
-from sim.robots.compiled import touching_geoms
+from sim.robots.compiled import robot_spec, touching_geoms
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -27,7 +27,7 @@ _BASE, _LIMB, _FOOT = (0.27, 0.29, 0.33, 1.0), (0.47, 0.50, 0.55, 1.0), (0.30, 0
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
 
 
-def robot_spec(robot: RobotCfg) -> Any:
+def shown_spec(robot: RobotCfg) -> Any:
     """An ``MjSpec`` to look at, with the robot's joints in the robot's order behind that of its base.
 
     Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
@@ -35,15 +35,16 @@ def robot_spec(robot: RobotCfg) -> Any:
     those of its own that touch nothing, else all it has.
     """
     try:
-        spec = _compiled_spec(robot, visuals=True)
+        spec = robot_spec(robot, visuals=True)
     except ValueError:  # such as a mesh of too many faces, which only shows
-        spec = _compiled_spec(robot)
-    looks = _read_look(robot)
+        spec = robot_spec(robot)
+    look_file = robot.model_file.with_suffix(LOOK_SUFFIX)
+    looks = _read_look(look_file)
     for body in spec.bodies[1:]:
         _dress(body, touching_geoms(body), looks.pop(body.name, []), robot)
     if looks:
         raise ValueError(
-            f"{_look_file(robot)} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
+            f"{look_file} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
             f"{', '.join(body.name for body in spec.bodies[1:])}"
         )
     return spec
@@ -51,10 +52,7 @@ def robot_spec(robot: RobotCfg) -> Any:
 
 def robot_model(spec: Any, robot: RobotCfg) -> Any:
     """The ``MjModel`` of a specification of the robot, which may have been added to."""
-    try:
-        model = spec.compile()
-    except Exception as error:  # MuJoCo's own type has no name
-        raise _not_shown(robot.model_file, error) from None
+    model = _compiled(spec.compile, robot.model_file)
     visual = {columns for geom, columns in touches_of(model, robot).items() if model.geom_group[geom] == _VISUAL}
     for column, name in enumerate(robot.geom_names):
         if name in robot.foot_geoms and (column,) in visual:
@@ -81,8 +79,12 @@ def touches_of(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
     return touches
 
 
-def _not_shown(file: Path, error: Exception) -> ValueError:
-    return ValueError(f"{file} cannot be shown: {' '.join(str(error).split())}")
+def _compiled(compile_model: Callable[[], Any], file: Path) -> Any:
+    """A model of MuJoCo's; an error names its file."""
+    try:
+        return compile_model()
+    except Exception as error:  # MuJoCo's own type has no name
+        raise ValueError(f"{file} cannot be shown: {' '.join(str(error).split())}") from None
 
 
 def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: RobotCfg) -> None:
@@ -91,7 +93,7 @@ def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: Ro
     for geom in visual:
         geom.group = _HIDDEN if look else _VISUAL
     for shape in look:
-        _add_shape(body, group=_VISUAL, **shape)
+        body.add_geom(group=_VISUAL, mass=0.0, contype=0, conaffinity=0, **shape)
     for geom in touching:
         foot = geom.name in robot.foot_geoms
         geom.group = _HIDDEN if (visual or look) and not foot else _BARE
@@ -99,23 +101,12 @@ def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: Ro
             geom.rgba = _FOOT if foot else _BASE if geom.name in robot.base_geoms else _LIMB
 
 
-def _add_shape(body: Any, **shape: Any) -> None:
-    body.add_geom(mass=0.0, contype=0, conaffinity=0, **shape)
-
-
-def _look_file(robot: RobotCfg) -> Path:
-    return robot.model_file.with_suffix(LOOK_SUFFIX)
-
-
-def _read_look(robot: RobotCfg) -> dict[str, list[dict[str, Any]]]:
+def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
     """Shapes by the name of their body, as ``add_geom`` takes them."""
-    file, looks = _look_file(robot), dict[str, list[dict[str, Any]]]()
+    looks = dict[str, list[dict[str, Any]]]()
     if not file.is_file():
         return looks
-    try:
-        model = _mj.MjModel.from_xml_path(str(file))
-    except Exception as error:  # MuJoCo's own type has no name
-        raise _not_shown(file, error) from None
+    model = _compiled(lambda: _mj.MjModel.from_xml_path(str(file)), file)
     for k in range(model.ngeom):
         shape = {name: getattr(model, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
         looks.setdefault(model.body(model.geom_bodyid[k]).name, []).append(shape)
@@ -126,7 +117,7 @@ class Skeleton:
     """A robot's bodies; the world is none of them."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        self.model: Any = robot_model(robot_spec(robot), robot)
+        self.model: Any = robot_model(shown_spec(robot), robot)
         """The ``MjModel``, whose body 0 is the world."""
         self.touches = touches_of(self.model, robot)
         """What is seen of it, and what it shows (:func:`touches_of`)."""

@@ -1,5 +1,6 @@
 """What a robot's files hold, whether it stands, and how many contacts it needs when it lies."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,20 +40,12 @@ _MASSES = (0.1, 1000.0)  # [kg]
 class Standing:
     """How a robot stood in its default pose, and how the dropped ones lay."""
 
-    gap: float
-    """Height of its lowest foot over the ground at the start [m]; below 0 it starts in the ground."""
-    lowest: str
-    """The geom that was lowest then."""
-    right_height: float
-    """The lowest ``default_base_height`` at which no foot starts in the ground [m]."""
     height: tuple[float, float]
     """Of the base, at the start and at the end [m]."""
     tilt_deg: float
     """Of the base, at the end."""
     joint_error: float
     """Largest distance of a joint from its default angle at the end [rad]."""
-    roleless: tuple[str, ...]
-    """Geoms without a role that are hardly higher than the lowest one in the default pose."""
     carried: dict[str, float]
     """Share of the weight that each touching geom carries, on average over the last half second."""
     bounce: tuple[float, float]
@@ -77,7 +70,6 @@ class Standing:
 
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32, seed: int = 0) -> Standing:
     """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains."""
-    builder = build_robot(robot)
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
     genes = np.concatenate([np.zeros((1, SUPER_GAUSSIAN.num_genes)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
@@ -89,8 +81,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     q = np.zeros((1 + drops, 7 + robot.num_joints), dtype=np.float32)
     q[:, :3], q[:, 6], q[:, 7:] = (8.0, 4.0, robot.default_base_height), 1.0, robot.default_joint_pos
     sim.targets.assign(q)
-    ((bottoms, reach),) = extents(builder, [robot.default_joint_pos])
-    bottoms = {name: robot.default_base_height + bottom for name, bottom in bottoms.items()}
+    ((_, reach),) = extents(build_robot(robot), [robot.default_joint_pos])
     q[1:, :2] = rng.uniform([5.0, 2.0], [11.0, 6.0], (drops, 2))
     turn = rng.normal(size=(drops, 4))
     q[1:, 3:7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
@@ -105,14 +96,6 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
     carried = zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True)
     return Standing(
-        gap=min(bottoms[name] for name in robot.foot_geoms),
-        lowest=min(bottoms, key=lambda name: bottoms[name]),
-        right_height=start_height(robot, builder),
-        roleless=tuple(
-            name
-            for name, bottom in bottoms.items()
-            if name not in robot.geom_names and bottom < min(bottoms.values()) + _LOW
-        ),
         height=(robot.default_base_height, float(first[2])),
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
         joint_error=float(np.abs(first[7:] - robot.default_joint_pos).max(initial=0.0)),
@@ -162,13 +145,7 @@ def describe_model(robot: RobotCfg) -> str:
     builder: Any = build_robot(robot)
     sim = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
     model: Any = sim.solver.mj_model
-    lines = [
-        f"{robot.name}: {robot.model_file}",
-        f"  {model.body_subtreemass[0]:.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
-        f"{robot.observation_size} observations",
-        f"  {'joint':22}{'default':>9}{'range [rad]':>18}{'kp':>8}{'kd':>7}{'effort':>9}{'armature':>10}{'damping':>9}"
-        f"{'friction':>9}",
-    ]
+    joints = [("joint", "default", "range [rad]", "kp", "kd", "effort", "armature", "damping", "friction")]
     drive_of = {int(joint): k for k, (joint, _) in enumerate(model.actuator_trnid)}
     for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True), start=1):
         drive, (low, high), dof = drive_of.get(k), model.jnt_range[k], int(model.jnt_dofadr[k])
@@ -178,95 +155,91 @@ def describe_model(robot: RobotCfg) -> str:
             effort = min(effort, model.actuator_forcerange[drive, 1] if model.actuator_forcelimited[drive] else np.inf)
         most = "follows" if drive is None else f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
         span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[k] else "free"
-        lines.append(
-            f"  {name:22} {angle:8.3f} {span:>17} {kp:7g} {kd:6g} {most:>8} {model.dof_armature[dof]:9.3g} "
-            f"{model.dof_damping[dof]:8g} {model.dof_frictionloss[dof]:8g}"
-        )
-    lines.append(
-        f"  {'geom':22} {'role':>8}  {'body':18} {'shape':10} {'size [m]':20} {'friction':>8}  time constant [s]"
-    )
-    roles = (("base", robot.base_geoms), ("foot", robot.foot_geoms), ("limb", robot.limb_geoms))
-    geoms = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
+        passive = f"{model.dof_armature[dof]:.3g}", f"{model.dof_damping[dof]:g}", f"{model.dof_frictionloss[dof]:g}"
+        joints.append((name, f"{angle:.3f}", span, f"{kp:g}", f"{kd:g}", most, *passive))
+    geoms = [("geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]")]
+    numbers_of = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
     for k, name in enumerate(geom_names(builder)):
-        geom, kind = int(geoms[k]), newton.GeoType(builder.shape_type[k]).name.lower()
-        role = next((role for role, names in roles if name in names), "-")
-        sizes = model.geom_size[geom][: _SIZES_OF.get(kind, 3)]
-        size = " ".join(f"{length:.3g}" for length in sizes)
-        lines.append(
-            f"  {name:22} {role:>8}  {builder.body_label[builder.shape_body[k]]:18} {kind:10} {size:20} "
-            f"{model.geom_friction[geom, 0]:8g}  {model.geom_solref[geom, 0]:g}"
-        )
-    lines += [f"Warning: {text}" for text in unit_warnings(robot, builder)]
+        geom, kind = int(numbers_of[k]), newton.GeoType(builder.shape_type[k]).name.lower()
+        role = next((role for role in ("base", "foot", "limb") if name in getattr(robot, f"{role}_geoms")), "-")
+        size = " ".join(f"{length:.3g}" for length in model.geom_size[geom][: _SIZES_OF.get(kind, 3)])
+        contact = f"{model.geom_friction[geom, 0]:g}", f"{model.geom_solref[geom, 0]:g}"
+        geoms.append((name, role, builder.body_label[builder.shape_body[k]], kind, size, *contact))
+    lines = [
+        f"{robot.name}: {robot.model_file}",
+        f"  {model.body_subtreemass[0]:.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
+        f"{robot.observation_size} observations",
+        *(_columns(joints) + _columns(geoms)),
+        *(f"Warning: {text}" for text in _unit_warnings(robot, builder)),
+    ]
     return "\n".join(lines)
 
 
-def unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows as lines with columns of equal width, the first one to the left."""
+    first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return [f"  {name:{first}}  {'  '.join(map(str.rjust, cells, widths))}" for name, *cells in rows]
+
+
+def _unit_warnings(robot: RobotCfg, builder: newton.ModelBuilder) -> list[str]:
     """Numbers that no legged robot has in metres, kilograms and radians, one line each."""
-    masses, warnings = np.array(builder.body_mass), []
+    masses = np.array(builder.body_mass)
     ((_, reach),) = extents(builder, [robot.default_joint_pos])
-    if not _SIZES[0] <= reach <= _SIZES[1]:
-        warnings.append(f"it reaches {reach:.3g} m from its base: are lengths in the model in metres?")
-    if not _MASSES[0] <= masses.sum() <= _MASSES[1]:
-        warnings.append(f"it weighs {masses.sum():.3g} kg: are masses in the model in kilograms?")
     spread = np.sqrt([np.linalg.eigvalsh(np.reshape(inertia, (3, 3)))[-1] for inertia in builder.body_inertia] / masses)
     far = [f"{builder.body_label[k]} ({spread[k]:.3g} m)" for k in np.flatnonzero(spread > reach)]
-    if far:
-        warnings.append(
-            f"the radius of gyration of {', '.join(far)} is more than the robot's {reach:.3g} m: "
-            "are inertias in kg m^2?"
-        )
     turned = [f"{name} ({angle:g})" for name, angle in zip(robot.joint_names, robot.default_joint_pos, strict=True)
               if abs(angle) > _TURN]  # fmt: skip
-    if turned:
-        warnings.append(f"default_joint_pos is beyond a full turn for {', '.join(turned)}: is it in radians?")
     spans = zip(robot.joint_names, builder.joint_limit_lower[6:], builder.joint_limit_upper[6:], strict=True)
     wide = [f"{name} ({low:g} to {high:g})" for name, low, high in spans if 2.0 * _TURN < high - low < _FREE
             and max(abs(low), abs(high)) > 2.0 * _TURN]  # fmt: skip
-    if wide:
-        warnings.append(f"joints turn by more than two full turns: {', '.join(wide)}: are limits in radians?")
-    return warnings
+    findings = [
+        (not _SIZES[0] <= reach <= _SIZES[1],
+         f"it reaches {reach:.3g} m from its base: are lengths in the model in metres?"),
+        (not _MASSES[0] <= masses.sum() <= _MASSES[1],
+         f"it weighs {masses.sum():.3g} kg: are masses in the model in kilograms?"),
+        (far, f"the radius of gyration of {', '.join(far)} is more than the robot's {reach:.3g} m: are inertias in "
+              "kg m^2?"),
+        (turned, f"default_joint_pos is beyond a full turn for {', '.join(turned)}: is it in radians?"),
+        (wide, f"joints turn by more than two full turns: {', '.join(wide)}: are limits in radians?"),
+    ]  # fmt: skip
+    return [text for holds, text in findings if holds]
 
 
 def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
     """The findings in words, and whether nothing has to be mended."""
+    builder, (first, last) = build_robot(robot), standing.height
+    ((bottoms, _),) = extents(builder, [robot.default_joint_pos])
+    lowest, gap = min(bottoms, key=bottoms.__getitem__), first + min(bottoms[name] for name in robot.foot_geoms)
+    roleless = [name for name, bottom in bottoms.items()
+                if name not in robot.geom_names and bottom < bottoms[lowest] + _LOW]  # fmt: skip
+    right_height, stray = start_height(robot, builder), 1.0 - sum(standing.carried.values())
+    right = f"default_base_height {right_height:.3f} is right, got {first:g}"
+    least, most = standing.bounce
+    findings = [
+        (gap < -_SUNK, f"its feet start {-gap:.3f} m in the ground: {right}"),
+        (first > right_height + _FALL,
+         f"it starts with its feet {gap:.3f} m over the ground and falls: {right}"),
+        (lowest not in robot.foot_geoms, f"in the default pose {lowest} is lower than the feet"),
+        (standing.finite and last > 0.5 * first and stray > _STRAY,
+         f"geoms without a role carry {stray:.0%} of its weight: {', '.join(roleless)}?"),
+        (not standing.finite,
+         "states became not finite: gains too high for physics_dt, or too little armature?"),
+        (standing.stands and standing.restless > _RESTLESS,
+         f"its feet bounce at rest: the force on them changes from step to step, between {least:.1f} and {most:.1f} "
+         "times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 for a dog of 13 kg), or a longer "
+         "contact_time_constant_s"),
+        (standing.overflowed,
+         "a buffer of the solver was too small: raise nconmax and njmax above the numbers above"),
+    ]  # fmt: skip
+    mistakes = [f"To mend: {text}" for holds, text in findings if holds]
     carried = ", ".join(f"{name} {share:.0%}" for name, share in standing.carried.items()) or "nothing"
-    first, last = standing.height
+    falls = "It does not stand by itself. A biped may fall; of others check gains, effort and default pose."
     lines = [
         f"On flat ground: base from {first:.3f} to {last:.3f} m, tilt {standing.tilt_deg:.1f} degrees, joints at most "
         f"{standing.joint_error:.3f} rad off; its weight is on {carried}",
         f"Dropped on rough ground: at most {standing.contacts:.1f} contacts a robot on average (nconmax "
         f"{robot.nconmax}) and {standing.rows} constraint rows (njmax {robot.njmax})",
+        *mistakes,
+        "It stands." if standing.stands else falls,
     ]
-    mistakes = []
-    if standing.gap < -_SUNK:
-        mistakes.append(
-            f"its feet start {-standing.gap:.3f} m in the ground: default_base_height {standing.right_height:.3f} is "
-            f"right, got {first:g}"
-        )
-    if first > standing.right_height + _FALL:
-        mistakes.append(
-            f"it starts with its feet {standing.gap:.3f} m over the ground and falls: default_base_height "
-            f"{standing.right_height:.3f} is right, got {first:g}"
-        )
-    if standing.lowest not in robot.foot_geoms:
-        mistakes.append(f"in the default pose {standing.lowest} is lower than the feet")
-    stray = 1.0 - sum(standing.carried.values())
-    if standing.finite and standing.height[1] > 0.5 * standing.height[0] and stray > _STRAY:
-        mistakes.append(f"geoms without a role carry {stray:.0%} of its weight: {', '.join(standing.roleless)}?")
-    if not standing.finite:
-        mistakes.append("states became not finite: gains too high for physics_dt, or too little armature?")
-    if standing.stands and standing.restless > _RESTLESS:
-        mistakes.append(
-            f"its feet bounce at rest: the force on them changes from step to step, between {standing.bounce[0]:.1f} "
-            f"and {standing.bounce[1]:.1f} times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 "
-            "for a dog of 13 kg), or a longer contact_time_constant_s"
-        )
-    if standing.overflowed:
-        mistakes.append("a buffer of the solver was too small: raise nconmax and njmax above the numbers above")
-    lines += [f"To mend: {text}" for text in mistakes]
-    lines.append(
-        "It stands."
-        if standing.stands
-        else "It does not stand by itself. A biped may fall; of others check gains, effort and default pose."
-    )
     return "\n".join(lines), not mistakes
