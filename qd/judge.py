@@ -41,7 +41,7 @@ from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.records import identity
-from sim.policy.spec import ControllerSpec, certifier_hash, spec_of, weights_file
+from sim.policy.spec import ControllerSpec, controller_hash, spec_of, weights_file
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -169,7 +169,8 @@ def certifiers_of(search: Search) -> dict[str, str]:
 def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str) -> None:
     """Tries each certifier on the robot; refuses the searched controller, which cannot certify itself."""
     for name, policy in certifiers.items():
-        certifier_hash(name, policy)
+        if controller_hash(policy) is None:
+            raise ValueError(f"certifier {name} must have a file, by whose hash certificates name it, got {policy}")
         if is_searched(search.cfg, policy, search.robot):
             raise ValueError(f"certifier {name} must be another controller than the searched one, got {policy}")
         try:
@@ -199,7 +200,7 @@ def certify(
     resolved = dict(zip(faults.certifiers, faults.certifier_resolved_outcomes.swapaxes(0, 1), strict=True))
     hashes = dict(zip(faults.certifiers, faults.certifier_sha256, strict=True))
     for name, policy in certifiers.items():
-        digest = certifier_hash(name, policy)
+        digest = str(controller_hash(policy))
         if hashes.get(name) != digest:
             searched[name] = resolved[name] = np.zeros_like(faults.resolved_outcomes)
         counts = _cross(archive, rows, search, crossings, policy, "searched", _CERTIFY_STREAM, name)

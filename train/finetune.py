@@ -14,7 +14,7 @@ from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, s
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
-from sim.policy.described import ControllerCfg, parse_controller
+from sim.policy.described import ControllerCfg, read_controller
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash
@@ -58,7 +58,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             start = start.with_noise_of(read_start(Path(cfg.recipe.noise_of), robot))
     controller = start.controller if start else None
     if saved is not None and DESCRIPTION in saved:
-        controller = parse_controller(saved[DESCRIPTION], run_dir / CHECKPOINT)
+        controller = read_controller(run_dir / CHECKPOINT, saved[DESCRIPTION])
     hidden_dims = start.hidden_dims if start else saved["settings"]["ppo"]["hidden_dims"] if saved else ()
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=tuple(hidden_dims)))
     elites = elites_of(robot, cfg)

@@ -23,7 +23,7 @@ from qd.fitness import FAILING_GOAL_RATE
 from sim.files.atomic import read_json
 from sim.files.intervals import t_interval, wilson_interval
 from sim.files.records import check_robot
-from sim.policy.spec import controller_hash, firsts, kind_of
+from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 
 Tables = dict[str, Any]
@@ -101,7 +101,7 @@ def make_tables(
         "differences": {
             name: {
                 f"{first} -> {second}": difference(row[first], row[second], sets[name], seed)
-                for first, second in combinations(firsts(row), 2)
+                for first, second in combinations(_firsts(row), 2)
             }
             for name, row in crossed.items()
         },
@@ -198,10 +198,23 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
     for name, policy in controllers.items():
         if not re.fullmatch("[^@]+(@[^@]+)?", name):
             raise ValueError(f"a controller must be named KIND or KIND@SEED, as C-G@1, got '{name}'")
-        key = (kind_of(name), controller_hash(policy) or policy)
+        key = (_kind_of(name), controller_hash(policy) or policy)
         if key in known:
             raise ValueError(f"{known[key]} and {name} must be different trainings, got the same controller twice")
         known[key] = name
+
+
+def _kind_of(name: str) -> str:
+    """The kind of a controller by its name: C-G of C-G, and of C-G@1 and C-G@2, which have other seeds."""
+    return name.partition("@")[0]
+
+
+def _firsts(names: Iterable[str]) -> list[str]:
+    """The first controller of each kind, in order."""
+    first: dict[str, str] = {}
+    for name in names:
+        first.setdefault(_kind_of(name), name)
+    return list(first.values())
 
 
 def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -209,8 +222,8 @@ def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, 
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for measure in measures:
         for name, row in tables[measure].items():
-            for kind in dict.fromkeys(map(kind_of, row)):
-                values = [value for controller, value in row.items() if kind_of(controller) == kind]
+            for kind in dict.fromkeys(map(_kind_of, row)):
+                values = [value for controller, value in row.items() if _kind_of(controller) == kind]
                 if len(values) > 1:
                     summary = _mean_over_seeds(values, is_rate=measure in RATES)
                     summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary

@@ -7,13 +7,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import torch
 from msgspec import Meta
 
 from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, to_toml
 from sim.policy.adapters import Sensed, read_row
 from sim.policy.mlp import ACTIVATIONS
-from sim.policy.runner import with_rows_of_zeros
+from sim.policy.runner import is_graph_safe
 from sim.robots.robot import RobotCfg
 
 TERMS: dict[str, tuple[str, ...]] = {
@@ -49,11 +50,6 @@ class Term:
     """Left of it [m]; the robot's ``scan_y`` if None."""
     offset: float | None = None
     """What is taken off the height of the base over the ground [m]."""
-
-    @property
-    def name(self) -> str:
-        """Which of :data:`TERMS`."""
-        return self.term
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,19 +92,11 @@ class ControllerCfg:
     """Between the layers of an rsl_rl checkpoint, which does not say it."""
 
 
-def read_controller(path: Path) -> ControllerCfg:
-    """Reads a description; an error names the file and the field."""
+def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
+    """Reads a description, or its text, which is called ``path`` in errors; an error names the field too."""
     try:
-        return parse_controller(path.read_text(encoding="utf-8"), path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read as TOML: {error}") from None
-
-
-def parse_controller(text: str, path: Path) -> ControllerCfg:
-    """What the text of a description says, which is called ``path`` in errors."""
-    try:
-        content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = tomllib.loads(path.read_text(encoding="utf-8") if text is None else text)
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read as TOML: {error}") from None
     items = content.pop("observation", None)
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
@@ -128,13 +116,12 @@ def parse_controller(text: str, path: Path) -> ControllerCfg:
 
 
 def text_of(cfg: ControllerCfg) -> str:
-    """The description as TOML, which :func:`parse_controller` reads."""
-    content = _given(asdict(cfg)) | {"observation": [_given(asdict(term)) for term in cfg.observation]}
-    return "".join(f"{name} = {to_toml(value)}\n" for name, value in content.items())
+    """The description as TOML, which :func:`read_controller` reads."""
 
+    def given(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+        return {name: value for name, value in values if value is not None}
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
+    return "".join(f"{name} = {to_toml(value)}\n" for name, value in asdict(cfg, dict_factory=given).items())
 
 
 class _Memory(NamedTuple):
@@ -181,30 +168,29 @@ class Described(torch.nn.Module):
         self.network, self._device = network, device
         self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
 
-        def constant(values: Iterable[Any]) -> torch.Tensor:
-            return torch.tensor(list(values), dtype=torch.float32, device=device)
+        def constant(values: Any) -> torch.Tensor:
+            return torch.tensor(np.array(values), dtype=torch.float32, device=device)
 
         own = dict(enumerate(pose)) | dict(zip(self._moved, cfg.default or [pose[k] for k in self._moved], strict=True))
         minus, limits, scale = [], [], []
         for term, columns in zip(cfg.observation, self._picked, strict=True):
-            minus += [own[k] if term.name == "joint_pos" else term.offset or 0.0 for k in columns]
-            scale += _each(term.scale, len(columns))
-            ((lower, upper),) = _limits(term.clip, 1)
-            told = _each(math.inf if term.limit is None else term.limit, len(columns))
-            limits += [[min(max(limit, lower), upper) for limit in (-size, size)] for size in told]
+            minus += [own[k] if term.term == "joint_pos" else term.offset or 0.0 for k in columns]
+            scale += [*np.broadcast_to(term.scale, len(columns))]
+            told = np.broadcast_to(math.inf if term.limit is None else term.limit, len(columns))
+            limits += [np.clip((-size, size), *_limits(term.clip)) for size in told]
         self._index = [torch.tensor(columns, device=device) for columns in self._picked]
         self._at = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
         self._minus, self._limits, self._scale = constant(minus), constant(limits).T, constant(scale)
-        self._clip = constant(_limits(cfg.action_clip, count)).T
-        self._joints, self._pose = torch.tensor(self._moved, device=device), constant(pose[k] for k in self._moved)
+        self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (count, 2))).T
+        self._joints, self._pose = torch.tensor(self._moved, device=device), constant([pose[k] for k in self._moved])
         self._offset = constant(cfg.action_offset or [own[k] for k in self._moved])
-        self._radians = constant(_each(cfg.action_scale, count))
+        self._radians = constant(np.broadcast_to(cfg.action_scale, count))
 
     def _refuse(self, problem: str) -> None:
         raise ValueError(f"{self._place}: {problem}")
 
     def _check_limits(self, name: str, clip: Any) -> None:
-        if any(lower > upper for lower, upper in _limits(clip, 1)):
+        if any(lower > upper for lower, upper in np.reshape(_limits(clip), (-1, 2))):
             self._refuse(f"{name} must be above 0, or have its lower limit first, got {clip}")
 
     def _numbers(self, names: tuple[str, ...] | None) -> tuple[int, ...]:
@@ -219,10 +205,10 @@ class Described(torch.nn.Module):
 
     def _columns_of(self, term: Term) -> Sequence[int]:
         """Which columns a term takes of its quantity."""
-        if term.name.startswith("joint"):
+        if term.term.startswith("joint"):
             return self._moved if term.joints is None else self._numbers(term.joints)
-        if term.name != "scan":
-            return range({"last_action": self.num_actions, "clock": 2}.get(term.name, 3))
+        if term.term != "scan":
+            return range({"last_action": self.num_actions, "clock": 2}.get(term.term, 3))
         xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
         points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
         numbers = {(round(float(x), 4), round(float(y), 4)): k
@@ -246,13 +232,12 @@ class Described(torch.nn.Module):
     def columns(self) -> str:
         """What the network sees, in words."""
         terms = zip(self.cfg.observation, self.widths, self.lengths, strict=True)
-        return ", ".join(f"{term.name} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
+        return ", ".join(f"{term.term} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
 
     @property
     def graph_safe(self) -> bool:
         """Whether it may be captured as a CUDA graph, its ``reset`` too."""
-        plain = isinstance(self.network, torch.nn.Module) and not hasattr(self.network, "reset")
-        return plain or getattr(self.network, "graph_safe", False)
+        return is_graph_safe(self.network)
 
     def _memory_of(self, count: int) -> _Memory:
         if count not in self._memories:
@@ -272,10 +257,7 @@ class Described(torch.nn.Module):
     @torch.inference_mode()
     def forward(self, row: torch.Tensor) -> torch.Tensor:
         """The robot's actions, shape (num_envs, num_joints)."""
-        seen = self.observe(row)
-        if hasattr(self.network, "reset"):
-            return self.act(self.network(seen))
-        return self.act(self.network(with_rows_of_zeros(seen))[: len(row)])
+        return self.act(self.network(self.observe(row)))
 
     @torch.inference_mode()
     def observe(self, row: torch.Tensor) -> torch.Tensor:
@@ -303,14 +285,14 @@ class Described(torch.nn.Module):
 
     def _quantity(self, term: Term, sensed: Sensed, memory: _Memory, at: torch.Tensor) -> torch.Tensor:
         """What a term takes its columns from, shape (num_envs, any)."""
-        if term.name == "lin_vel":
+        if term.term == "lin_vel":
             return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, at.expand_as(sensed.ang_vel))
-        if term.name == "last_action":
+        if term.term == "last_action":
             return memory.action
-        if term.name == "clock":
+        if term.term == "clock":
             angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
             return torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
-        return getattr(sensed, term.name).flatten(1)
+        return getattr(sensed, term.term).flatten(1)
 
     def _with_history(self, now: torch.Tensor, memory: _Memory) -> torch.Tensor:
         history = self.cfg.history
@@ -326,12 +308,6 @@ class Described(torch.nn.Module):
         return torch.cat([(term.flip(1) if history.newest == "last" else term).flatten(1) for term in steps], dim=1)
 
 
-def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (value,) * count
-
-
-def _limits(clip: Any, count: int) -> Sequence[tuple[float, float]]:
-    """Lower and upper limits of so many columns, by one size, one pair, one pair each or None."""
-    if isinstance(clip, tuple):
-        return clip if isinstance(clip[0], tuple) else [clip] * count
-    return [(-math.inf, math.inf) if clip is None else (-clip, clip)] * count
+def _limits(clip: Any) -> Any:
+    """Lower and upper limit of all columns, by a size or None; a pair, or one a column, is that already."""
+    return clip if isinstance(clip, tuple) else (-math.inf, math.inf) if clip is None else (-clip, clip)

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from sim.files.command import command_line
 from sim.files.settings import to_toml
-from sim.policy.loaders import PlainYaml, load_network
+from sim.policy.loaders import activation_in, load_network, read_yaml
 from sim.robots.compiled import joint_names, read_robot_file
 from sim.robots.own import PER_JOINT, per_joint
 from sim.robots.robot import RobotCfg
@@ -157,7 +156,7 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
         return "a run of Isaac Lab", _read_isaac_lab
     if source.is_dir() or source.suffix in (".yaml", ".yml"):
         file = source / "config.yaml" if source.is_dir() else source
-        content = _read_yaml(file)
+        content = read_yaml(file)
         if "kps" in content:
             return "a deployment of unitree_rl_gym", _read_deployment
         if len(content) == 1 and "observations" in (next(iter(content.values())) or ()):
@@ -169,16 +168,6 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
     if source.suffix == ".onnx" and "observation_names" in _onnx_metadata(source):
         return "a controller of mjlab", _read_mjlab
     return "weights alone", _read_weights
-
-
-def _read_yaml(file: Path) -> dict[str, Any]:
-    try:
-        content = yaml.load(file.read_text(encoding="utf-8"), PlainYaml)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ValueError(f"{file} cannot be read as YAML: {error}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{file} must hold names with values, got {type(content).__name__}")
-    return content
 
 
 def _onnx_metadata(file: Path) -> Mapping[str, str]:
@@ -221,7 +210,7 @@ def _read_rl_sar(source: Path, found: _Found) -> Path:
     base = next((place for place in bases if place.is_file()), None)
     if base is None:
         raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
-    said = next(iter(_read_yaml(base).values())) | next(iter(_read_yaml(file).values()))
+    said = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
     needed = (*_RL_SAR, "model_name", "observations", "joint_names", "joint_mapping")
     more = (*_RL_SAR_MORE, *_RL_SAR_SCALES.values(), "observations_history", "observations_history_priority",
             "clip_actions_lower", "clip_actions_upper", "wheel_indices")  # fmt: skip
@@ -251,7 +240,7 @@ def _read_rl_sar(source: Path, found: _Found) -> Path:
 
 def _read_deployment(source: Path, found: _Found) -> Path:
     """A YAML of ``deploy_mujoco``, whose script has the observation: its order, and a clock if there is room for it."""
-    said = _read_yaml(source)
+    said = read_yaml(source)
     needed = (*_DEPLOYMENT, "policy_path", "ang_vel_scale", "dof_pos_scale", "dof_vel_scale", "cmd_scale",
               "num_actions", "num_obs")  # fmt: skip
     found.check(source, said, needed, (), "xml_path simulation_duration cmd_init")
@@ -332,7 +321,7 @@ def _widths(source: Path) -> tuple[int | None, int | None]:
 def _read_isaac_lab(source: Path, found: _Found) -> Path:
     """A run folder of Isaac Lab: params/env.yaml, params/agent.yaml, exported/ or checkpoints."""
     file, agent_file = source / "params" / "env.yaml", source / "params" / "agent.yaml"
-    env = _read_yaml(file)
+    env = read_yaml(file)
     try:
         _isaac_robot(env, file, found)
         order = _isaac_action(env["actions"], source, file, found)
@@ -344,16 +333,15 @@ def _read_isaac_lab(source: Path, found: _Found) -> Path:
         raise ValueError(f"{file} is not what Isaac Lab writes for a robot: {type(error).__name__}: {error}") from None
     found.stack(rows, lengths)
     found.put(observation=rows)
-    agent = _read_yaml(agent_file) if agent_file.is_file() else {}
+    agent = read_yaml(agent_file) if agent_file.is_file() else {}
     if agent.get("clip_actions") is not None:
         found.put(action_clip=agent["clip_actions"])
     exported = [place for name in ("policy.pt", "policy.onnx") if (place := source / "exported" / name).is_file()]
     checkpoints = sorted(source.glob("model_*.pt"), key=lambda place: int(re.sub(r"\D", "", place.stem) or 0))
     if not exported and not checkpoints:
         raise ValueError(f"{source} must have weights, exported/policy.pt or model_*.pt, got none")
-    activation = [part["activation"] for name in ("actor", "policy") if "activation" in (part := agent.get(name) or {})]
-    if not exported and activation:
-        found.put(activation=activation[0])
+    if not exported and activation_in(agent) is not None:
+        found.put(activation=activation_in(agent))
     return (*exported, *checkpoints[::-1])[0]
 
 
@@ -400,7 +388,7 @@ def _isaac_action(actions: dict[str, Any], source: Path, file: Path, found: _Fou
     why = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
     order = _breadth_first(found.model)
     for said in sorted(source.rglob("*IO_descriptors.yaml"))[:1]:
-        order, why = _read_yaml(said)["articulations"]["robot"]["joint_names"], ""
+        order, why = read_yaml(said)["articulations"]["robot"]["joint_names"], ""
     actions = {name: term for name, term in actions.items() if term is not None}
     kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items()}
     if list(kinds.values()) != ["JointPositionAction"]:

@@ -56,15 +56,6 @@ def prepare_torch(device: str) -> None:
         torch.set_num_threads(1)
 
 
-def reason_of(error: BaseException) -> str:
-    """What went wrong, in one line; of a refused file without torch's advice to load it as code."""
-    text = str(error).partition("WeightsUnpickler error: ")[2] or str(error)
-    lines = [line.strip() for line in text.splitlines() if line.strip()] or [""]
-    if lines[0].startswith("The following operation failed"):  # in TorchScript, whose own trace comes first
-        return lines[-1]
-    return f"{type(error).__name__}: {lines[0].partition('. Please')[0]}"
-
-
 def read_weights(path: Path) -> Any:
     """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
 
@@ -96,7 +87,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
         )
     named = ControllerSpec.parse(spec)
     policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
-    _try_policy(policy, robot, where, str(spec))
+    _try_rows(policy, (robot.observation_size, robot.num_joints), where, str(spec), f"robot '{robot.name}'")
     if named.file is not None:
         _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
@@ -125,17 +116,16 @@ def _print_once(line: str) -> None:
 
 
 def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
-    assert spec.place is not None and spec.name is not None
     try:
-        target: Any = find_named(spec.place, spec.name)
+        target: Any = find_named(str(spec.place), str(spec.name))
     except Exception as error:  # a module can fail with anything
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
     if spec.file is not None:
-        arguments = _load_file(Path(spec.file), robot, device, fits=False), robot
+        called, arguments = "controller, robot", (_load_file(Path(spec.file), robot, device, fits=False), robot)
     elif getattr(target, "faultline_factory", False):
-        arguments = robot, device
+        called, arguments = "robot, device", (robot, device)
     elif inspect.isclass(target):
         raise ValueError(
             f"policy '{spec}' is a class: mark it by `faultline_factory = True` to be called with (robot, device)"
@@ -145,7 +135,6 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
         policy = target(*arguments)
     except Exception as error:
-        called = "robot, device" if spec.file is None else "controller, robot"
         raise ValueError(f"policy '{spec}' failed, called with ({called}): {in_one_line(error)}") from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
@@ -174,7 +163,7 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
         raise ValueError(f"{path}: policy must be the name of a file, got {cfg.policy!r}")
     of = f"{path} ({policy.columns})"
     network = load_network(weights, device, sizes, of=of, activation=cfg.activation)
-    _try_rows(network, sizes, device, str(weights), of, reason_of)
+    _try_rows(network, sizes, device, str(weights), of)
     policy.use(network, torch.device(device))
     return policy
 
@@ -266,12 +255,7 @@ def _activation_of(content: dict[str, Any], path: Path) -> str:
     )
     said, agent = content.get("activation", "elu" if own else None), agent_file(path)
     if said is None and agent is not None:
-        try:
-            settings = yaml.load(agent.read_text(encoding="utf-8"), PlainYaml)
-            parts = [settings.get(name) or {} for name in ("actor", "policy")]
-            said = next((part["activation"] for part in parts if "activation" in part), None)
-        except (OSError, ValueError, AttributeError, TypeError, yaml.YAMLError) as error:
-            raise ValueError(f"{agent} cannot be read: {reason_of(error)}; put a copy of it back") from error
+        said = activation_in(read_yaml(agent))
     if said is None:
         raise ValueError(
             f"policy '{path}' does not say what is between its layers: put the agent.yaml of its training "
@@ -282,7 +266,13 @@ def _activation_of(content: dict[str, Any], path: Path) -> str:
     return said
 
 
-class PlainYaml(yaml.SafeLoader):
+def activation_in(agent: dict[str, Any]) -> Any:
+    """What an agent.yaml says to be between the actor's layers; None if it does not say it."""
+    parts = [part for name in ("actor", "policy") if isinstance(part := agent.get(name), dict)]
+    return next((part["activation"] for part in parts if "activation" in part), None)
+
+
+class _PlainYaml(yaml.SafeLoader):
     """Data alone: of what Python would make by a tag, lists, tables and texts remain."""
 
 
@@ -294,7 +284,18 @@ def _without_tag(loader: Any, suffix: str, node: yaml.Node) -> Any:
     return loader.construct_scalar(node) or suffix.partition(":")[2]
 
 
-PlainYaml.add_multi_constructor("tag:yaml.org,2002:python/", _without_tag)
+_PlainYaml.add_multi_constructor("tag:yaml.org,2002:python/", _without_tag)
+
+
+def read_yaml(file: Path) -> dict[str, Any]:
+    """Names and values of a YAML, as data alone; an error names the file."""
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), _PlainYaml)
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ValueError(f"{file} cannot be read as YAML: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} must hold names with values, got {type(content).__name__}")
+    return content
 
 
 class _Script(torch.nn.Module):
@@ -330,7 +331,7 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
     except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
-            f"or holding code): {reason_of(reason)}; expected {_FORMATS}"
+            f"or holding code): {in_one_line(reason)}; expected {_FORMATS}"
         ) from error
     if sizes is None:
         return module
@@ -383,14 +384,7 @@ def _memory_of_script(probe: Any, path: Path, width: int) -> tuple[dict[str, tor
     )
 
 
-def _try_policy(policy: Policy, robot: RobotCfg, device: str, spec: str) -> None:
-    reason = in_one_line if ControllerSpec.parse(spec).runs_code else reason_of
-    _try_rows(policy, (robot.observation_size, robot.num_joints), device, spec, f"robot '{robot.name}'", reason)
-
-
-def _try_rows(
-    policy: Any, sizes: tuple[int, int], device: str, spec: str, of: str, reason: Callable[[BaseException], str]
-) -> None:
+def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, of: str) -> None:
     """Asks a controller for actions of four robots that begin, of these observation and action sizes."""
     shape = (4, sizes[0])
     try:
@@ -398,7 +392,7 @@ def _try_rows(
             forget_all(policy, 4, device)
             action = policy(torch.zeros(shape, device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
-        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {of}: {reason(error)}") from error
+        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {of}: {in_one_line(error)}") from error
     problem = action_problem(action, (4, sizes[1]))
     if problem is not None:
         raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")

@@ -10,26 +10,36 @@ import onnx
 import onnxruntime
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from torch.nn import functional
 
 from sim.files.atomic import prepare_output, write_atomically
 from sim.policy.mlp import MlpPolicy
-from sim.policy.runner import Recurrent
+from sim.policy.runner import Recurrent, with_rows_of_zeros
 
 _OPSET, _IR_VERSION = 17, 8  # of 2022: what runs on robots is rarely new
 _OPERATORS = {"elu": "Elu", "selu": "Selu", "relu": "Relu", "lrelu": "LeakyRelu", "tanh": "Tanh", "sigmoid": "Sigmoid",
               "softplus": "Softplus", "identity": "Identity"}  # fmt: skip
 _ATTRIBUTES = {"elu": {"alpha": 1.0}, "lrelu": {"alpha": 0.01}}
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+_Run = Callable[[Sequence[torch.Tensor], Sequence[Sequence[int]]], list[torch.Tensor]]
 
 
 class _Session:
     """A graph run by onnxruntime: where the tensors are if it can, else on the CPU, with copies."""
 
     def __init__(self, data: bytes, device: torch.device) -> None:
-        self.session = _open_session(data, device)
-        self.device = (
-            device if device.type == "cpu" or self.session.get_providers()[0] == _CUDA else torch.device("cpu")
-        )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()  # one in worker processes, as prepare_torch has it
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what is wrong comes as an exception
+        options.add_session_config_entry("session.load_model_format", "ONNX")
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        providers: list[Any] = [_CPU]
+        if device.type == "cuda" and _CUDA in onnxruntime.get_available_providers():
+            # TF32 would round every product to 10 bits.
+            providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
+        self.session = onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
+        self.device = device if self.session.get_providers()[0] == _CUDA else torch.device("cpu")
 
     def run(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
         """Outputs of these shapes of the graph's inputs, in its order, on their device."""
@@ -50,25 +60,21 @@ class _Session:
         return [output.to(place) for output in outputs]
 
     def run_apart(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
-        """:meth:`run` with one robot at a time, of a graph that takes no more; states have robots along axis 1."""
-        axes = [1 if value.ndim == 3 else 0 for value in inputs]
-        outputs = [
-            self.run([value.narrow(axis, k, 1) for axis, value in zip(axes, inputs, strict=True)],
-                     [_resized(shape, 1) for shape in shapes])
-            for k in range(len(inputs[0]))
-        ]  # fmt: skip
-        return [torch.cat(parts, dim=1 if parts[0].ndim == 3 else 0) for parts in zip(*outputs, strict=True)]
+        """:meth:`run` with one robot at a time, of a graph that takes no more."""
+        alone = [_resized(shape, 1) for shape in shapes]
+        outputs = [self.run([value.narrow(-2, k, 1) for value in inputs], alone) for k in range(len(inputs[0]))]
+        return [torch.cat(parts, dim=-2) for parts in zip(*outputs, strict=True)]
 
 
 def _resized(shape: Sequence[int], count: int) -> list[int]:
     """The shape of so many robots' rows, or states, which have layers first."""
-    return [shape[0], count, shape[2]] if len(shape) == 3 else [count, shape[1]]
+    return [*shape[:-2], count, shape[-1]]
 
 
 class OnnxPolicy:
     """A controller that onnxruntime runs."""
 
-    def __init__(self, run: Callable[..., list[torch.Tensor]], sizes: tuple[int, int], device: torch.device) -> None:
+    def __init__(self, run: _Run, sizes: tuple[int, int], device: torch.device) -> None:
         """Of a graph of one float32 input and one output, of these observation and action sizes, on its device."""
         self.sizes, self.device, self._run = sizes, device, run
 
@@ -82,9 +88,7 @@ class _OnnxRecurrent(Recurrent):
 
     graph_safe = False
 
-    def __init__(
-        self, run: Callable[..., list[torch.Tensor]], sizes: tuple[int, int], states: Sequence[Sequence[int]]
-    ) -> None:
+    def __init__(self, run: _Run, sizes: tuple[int, int], states: Sequence[Sequence[int]]) -> None:
         super().__init__([torch.zeros(_resized(shape, 1)) for shape in states], 1)
         self.sizes, self._run = sizes, run
 
@@ -93,19 +97,67 @@ class _OnnxRecurrent(Recurrent):
         return action, after
 
 
-def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxPolicy | _OnnxRecurrent":
+class OnnxLayers(torch.nn.Module):
+    """A controller whose graph has plain layers alone: in torch's operators, so that it can be captured."""
+
+    def __init__(self, model: Any, session: _Session, sizes: tuple[int, int]) -> None:
+        """Of a graph of one float32 input and one output, of these sizes; a KeyError if it has another operator."""
+        super().__init__()
+        self.sizes = sizes
+        self._input, self._output = session.session.get_inputs()[0].name, session.session.get_outputs()[0].name
+        constants = {tensor.name: tensor for tensor in model.graph.initializer}
+        self._nodes: list[tuple[Callable[..., Any], list[str], list[str], dict[str, Any]]] = []
+        for node in model.graph.node:
+            given = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
+            if node.op_type == "Constant":
+                constants[node.output[0]] = given["value"]
+                continue
+            if node.op_type == "Split":
+                given["parts"] = len(node.output)
+            self._nodes.append((_LAYERS[node.op_type], [*node.input], [*node.output], given))
+        self._names = list(constants)
+        weights = [torch.tensor(numpy_helper.to_array(tensor)) for tensor in constants.values()]
+        self.weights = torch.nn.ParameterList(weights).requires_grad_(False)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints)."""
+        values = dict(zip(self._names, self.weights, strict=True)) | {self._input: with_rows_of_zeros(rows)}
+        for layer, inputs, outputs, given in self._nodes:
+            value = layer(*(values[name] for name in inputs), **given)
+            values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
+        return values[self._output][: len(rows)]
+
+    def run(self, inputs: Sequence[torch.Tensor], shapes: Any) -> list[torch.Tensor]:
+        """:meth:`_Session.run` of the same graph."""
+        return [self(*inputs)]
+
+
+_LAYERS: dict[str, Callable[..., Any]] = {
+    "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Div": torch.div, "MatMul": torch.matmul,
+    "Elu": functional.elu, "Selu": functional.selu, "Relu": functional.relu, "Tanh": torch.tanh,
+    "Sigmoid": torch.sigmoid, "Softplus": functional.softplus, "Identity": torch.clone,
+    "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **given: torch.addmm(
+        bias, rows, weight.T if given.get("transB") else weight, alpha=alpha, beta=beta
+    ),
+    "LeakyRelu": lambda value, alpha=0.01: functional.leaky_relu(value, alpha),
+    "Split": lambda value, *, parts, axis=0: value.chunk(parts, axis),
+}  # fmt: skip
+"""What a graph of plain layers may hold. What an operator means beyond this, comparing the outputs finds."""
+
+
+def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """Load a controller from an ONNX file.
 
     Nothing but that file is read and no code in it runs: weights beside it are refused, and onnxruntime knows only its
-    own operators. It is read by onnxruntime's C++, which a file made to harm can crash. A graph made for one robot is
-    changed into one for any number, if random rows of it come out as one after the other does; else it runs once a
-    robot.
+    own operators. It is read by onnxruntime's C++, which a file made to harm can crash. A graph of plain layers becomes
+    a torch module, if random rows of it come out as onnxruntime has them. Another that is made for one robot is changed
+    into one for any number, if it acts as one robot after the other does; else it runs once a robot.
 
     Args:
         path: The file; its graph takes observations (batch, observation_size) and gives actions (batch, num_joints),
             both float32; one that remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
         sizes: Observation and action size of the robot; None takes whatever the file has.
-        device: Torch device name; on CUDA the graph runs on the GPU if onnxruntime is built for it, else on the CPU.
+        device: Torch device name; on CUDA onnxruntime runs a graph on the GPU if it is built for it, else on the CPU.
     """
     where = torch.device(device)
     try:
@@ -113,9 +165,11 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxPo
         model = _check_all_inside(data)
         session = _Session(data, where)
         sizes, states, one = _checked_sizes(session.session, sizes)
-        run = session.run
-        if one:
-            run = _set_free(model, session, sizes, states, where)
+        run = session.run_apart if one else session.run
+        if layers := _made_alike(lambda: OnnxLayers(model, session, sizes), run, sizes, states, 1e-5):
+            return layers.to(where)
+        if one and (free := _made_alike(lambda: _Session(_set_free(model), where), run, sizes, states, 1e-4)):
+            run = free.run
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
     if where != session.device:
@@ -129,26 +183,33 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxPo
     return _OnnxRecurrent(run, sizes, states).to(where) if states else OnnxPolicy(run, sizes, session.device)
 
 
-def _set_free(
-    model: Any, session: _Session, sizes: tuple[int, int], states: Sequence[Sequence[int]], device: torch.device
-) -> Callable[..., list[torch.Tensor]]:
-    """Runs the same graph for any batch, or one robot after the other where its operators know of one alone."""
+def _made_alike(
+    make: Callable[[], Any], run: _Run, sizes: tuple[int, int], states: Sequence[Sequence[int]], near: float
+) -> Any:  # fmt: skip
+    """What ``make`` makes if its ``run`` answers random rows, and states, as ``run`` does to ``near``; else None."""
+    generator = torch.Generator().manual_seed(0)
+    try:
+        made = make()
+        for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
+            inputs = [size * torch.randn(_resized(shape, count), generator=generator)
+                      for shape in ((1, sizes[0]), *states)]  # fmt: skip
+            shapes = [_resized(shape, count) for shape in ((1, sizes[1]), *states)]
+            for value, expected in zip(made.run(inputs, shapes), run(inputs, shapes), strict=True):
+                most = near * max(1.0, float(expected.abs().max()))
+                torch.testing.assert_close(value, expected, rtol=0.0, atol=most)
+    except Exception:  # onnxruntime's errors have no base
+        return None
+    return made
+
+
+def _set_free(model: Any) -> bytes:
+    """A graph for one robot as one for any number."""
     constants = {tensor.name for tensor in model.graph.initializer}
     for port in (*model.graph.input, *model.graph.output):
-        dims = port.type.tensor_type.shape.dim
         if port.name not in constants:
-            dims[1 if len(dims) == 3 else 0].dim_param = "batch"
+            port.type.tensor_type.shape.dim[-2].dim_param = "batch"
     del model.graph.value_info[:]
-    generator = torch.Generator().manual_seed(0)
-    inputs = [torch.randn(_resized(shape, 5), generator=generator) for shape in ((1, sizes[0]), *states)]
-    shapes = [_resized(shape, 5) for shape in ((1, sizes[1]), *states)]
-    try:
-        free = _Session(model.SerializeToString(), device)
-        together, apart = free.run(inputs, shapes), session.run_apart(inputs, shapes)
-        same = all(torch.allclose(a, b, rtol=1e-4, atol=1e-4) for a, b in zip(together, apart, strict=True))
-    except Exception:  # onnxruntime's errors have no base
-        same = False
-    return free.run if same else session.run_apart
+    return model.SerializeToString()
 
 
 def _check_all_inside(data: bytes) -> Any:
@@ -173,48 +234,28 @@ def _tensors(message: Any) -> Iterator[Any]:
                 yield from _tensors(inner)
 
 
-def _open_session(data: bytes, device: torch.device) -> Any:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()  # one in worker processes, as prepare_torch has it
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what is wrong comes as an exception
-    options.add_session_config_entry("session.load_model_format", "ONNX")
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    providers: list[Any] = [_CPU]
-    if device.type == "cuda" and _CUDA in onnxruntime.get_available_providers():
-        # TF32 would round every product to 10 bits.
-        providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
-    return onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
-
-
 def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
     """Widths of observation and action, shapes of the states, and whether it takes one robot alone.
 
     Refuses a graph that is not one batch of float32 rows of these sizes to another.
     """
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    kept = [port.name.removesuffix("_in") for port in inputs[1:]]
-    if any(not port.name.endswith("_in") for port in inputs[1:]) or [p.name for p in outputs[1:]] != [
-        f"{name}_out" for name in kept
-    ]:
+    if [port.name for port in inputs[1:]] != [f"{port.name.removesuffix('_out')}_in" for port in outputs[1:]]:
         raise ValueError(
             "it must have one input and one output, and if it remembers the states X_in and X_out after them, got "
             f"{', '.join(port.name for port in inputs)} and {', '.join(port.name for port in outputs)}"
         )
-    widths: list[Any] = []
-    batches = []
-    for kind, port in (("input", inputs[0]), ("output", outputs[0])):
-        shape = list(port.shape or [None, None])  # an output's may be unknown: it is tried afterwards
+    shapes = [list(port.shape or [None, None]) for port in (inputs[0], outputs[0])]  # an output's may be unknown
+    for kind, port, shape in zip(("input", "output"), (inputs[0], outputs[0]), shapes, strict=True):
         if port.type != "tensor(float)" or len(shape) != 2:
             raise ValueError(f"its {kind} must be float32 of shape (batch, size), got {port.type} of shape {shape}")
-        batches.append(shape[0])
-        widths.append(shape[1])
     states = [list(port.shape) for port in inputs[1:]]
     if any(len(shape) != 3 or not isinstance(shape[0], int) or not isinstance(shape[2], int) for shape in states):
         raise ValueError(f"its states must have shape (layers, batch, size), got {states}")
-    batches = [size for size in (*batches, *(shape[1] for shape in states)) if isinstance(size, int)]
-    if any(size != 1 for size in batches):
-        raise ValueError(f"its batch must be free, or of one robot, got {batches[0]}: make its first axis dynamic")
+    batches = {shape[-2] for shape in (*shapes, *states) if isinstance(shape[-2], int)}
+    if batches - {1}:
+        raise ValueError(f"its batch must be free, or of one robot, got {max(batches)}: make its first axis dynamic")
+    widths: list[Any] = [shape[1] for shape in shapes]
     if sizes is None and not all(isinstance(width, int) for width in widths):
         raise ValueError(f"its rows must have known widths, got {widths}")
     expected = sizes or (widths[0], widths[1])

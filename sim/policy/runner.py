@@ -110,6 +110,11 @@ class Recurrent(torch.nn.Module):
         return action[: len(rows)]
 
 
+def is_graph_safe(policy: Any) -> bool:
+    """Whether a policy may be captured as a CUDA graph: a module without memory, or what says that it is."""
+    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and memory_of(policy) is Memory.NONE)
+
+
 class PolicyRunner:
     """Runs a policy between two Warp buffers.
 
@@ -135,7 +140,7 @@ class PolicyRunner:
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
-        if self._observation.is_cuda and (self._plain or getattr(policy, "graph_safe", False)):
+        if self._observation.is_cuda and is_graph_safe(policy):
             self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
 
     def reset(self) -> None:

@@ -8,7 +8,7 @@ import sys
 import sysconfig
 import tomllib
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -58,8 +58,13 @@ class ControllerSpec:
     @property
     def files(self) -> tuple[Path, ...]:
         """The Python file, the controller's file and what that needs beside itself, as far as there are such."""
-        code = [Path(self.place)] if self.place is not None and self.place.endswith(".py") else []
-        return (*code, *([] if self.file is None else _with_companions(Path(self.file))))
+        files = [Path(self.place)] if self.place is not None and self.place.endswith(".py") else []
+        if self.file is not None:
+            files.append(Path(self.file))
+            if files[-1].suffix == ".toml" and (weights := weights_file(files[-1])) is not None:
+                files.append(weights)
+            files += filter(None, [agent_file(files[-1])])
+        return tuple(files)
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
@@ -67,15 +72,6 @@ class ControllerSpec:
         if place is not None and place.endswith(".py"):
             place = str(folder / Path(place).name)
         return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
-
-
-def _with_companions(file: Path) -> list[Path]:
-    """A controller's file, the weights that a description names, and the settings of the training that made them."""
-    files = [file]
-    if file.suffix == ".toml" and (weights := weights_file(file)) is not None:
-        files.append(weights)
-    agent = agent_file(files[-1])
-    return files if agent is None else [*files, agent]
 
 
 def weights_file(path: Path) -> Path | None:
@@ -100,11 +96,6 @@ def agent_file(weights: Path) -> Path | None:
 def spec_of(policy: str, robot: RobotCfg) -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
-
-
-def name_of(policy: str | Path, robot: RobotCfg) -> str:
-    """How files of results name a controller, the inverse of :func:`spec_of`: :data:`SHIPPED` lies at no fixed path."""
-    return SHIPPED if is_same(str(policy), str(robot.policy_file)) else str(policy)
 
 
 def controller_hash(policy: str | Path) -> str | None:
@@ -142,7 +133,8 @@ _NOT_THE_USERS = (
 
 def in_one_line(error: BaseException) -> str:
     """Kind of an error, the first line of what it says, and the innermost line of the user's own code."""
-    lines = str(error).strip().splitlines()
+    advised = str(error).partition("WeightsUnpickler error: ")[2]  # by torch, to load the file as code
+    lines = (advised.partition(". Please")[0] or str(error)).strip().splitlines()
     first = -1 if lines and lines[0].startswith("The following operation failed") else 0  # TorchScript's trace
     text = ": ".join([type(error).__name__, *lines[first:][:1]])
     frames = [
@@ -186,23 +178,11 @@ def find_named(place: str, name: str) -> Any:
     return target
 
 
-def kind_of(name: str) -> str:
-    """The kind of a controller by its name: C-G of C-G, and of C-G@1 and C-G@2, which have other seeds."""
-    return name.partition("@")[0]
-
-
-def firsts(names: Iterable[str]) -> list[str]:
-    """The first controller of each kind, in order."""
-    first: dict[str, str] = {}
-    for name in names:
-        first.setdefault(kind_of(name), name)
-    return list(first.values())
-
-
 def about_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
     """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
+    own = str(robot.policy_file)
     return {
-        name: {"policy": name_of(policy, robot), "sha256": controller_hash(policy)}
+        name: {"policy": SHIPPED if is_same(policy, own) else policy, "sha256": controller_hash(policy)}
         for name, policy in controllers.items()
     }
 
@@ -228,14 +208,6 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "pol
             raise ValueError(f"{flag} must have different names, got '{name}' twice: rename one of them")
         controllers[name] = spec_of(policy, robot)
     return controllers
-
-
-def certifier_hash(name: str, policy: str) -> str:
-    """SHA-256 of a certifier, which its certificates name."""
-    digest = controller_hash(policy)
-    if digest is None:
-        raise ValueError(f"certifier {name} must have a file, by whose hash certificates name it, got {policy}")
-    return digest
 
 
 def label_suffix(policy: str) -> str:

@@ -8,7 +8,7 @@ import torch
 
 from qd.judge import controllers_in
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.policy.described import parse_controller, read_controller, text_of
+from sim.policy.described import read_controller, text_of
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.spaces.registry import get_space
@@ -109,7 +109,7 @@ def test_it_learns_goes_on_and_crosses(robot, tmp_path):
 
 def test_a_description_is_written_as_it_was_read(robot):
     cfg = read_controller(robot.policy_file)
-    assert parse_controller(text_of(cfg), robot.policy_file) == cfg
+    assert read_controller(robot.policy_file, text_of(cfg)) == cfg
 
 
 def test_other_networks_are_refused(robot, tmp_path):

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from sim.files.atomic import write_atomically
-from sim.policy.described import ControllerCfg, Described, parse_controller
-from sim.policy.loaders import load_described, load_policy, read_weights, reason_of
+from sim.policy.described import ControllerCfg, Described, read_controller
+from sim.policy.loaders import load_described, load_policy, read_weights
 from sim.policy.mlp import ACTIVATIONS, MlpPolicy
-from sim.policy.spec import weights_file
+from sim.policy.spec import in_one_line, weights_file
 from sim.robots.robot import RobotCfg
 
 FORMAT = "faultline training checkpoint 2"
@@ -42,7 +42,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = read_weights(path)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        raise ValueError(f"{path} must be the checkpoint of a training, got {reason_of(error)}") from error
+        raise ValueError(f"{path} must be the checkpoint of a training, got {in_one_line(error)}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{path} must be a '{FORMAT}', got another kind of file: name the directory of a training")
     return content
@@ -110,7 +110,7 @@ def _load_described(path: Path, robot: RobotCfg) -> Described | None:
         return policy
     if path.name != CHECKPOINT or not path.is_file() or DESCRIPTION not in (saved := read_checkpoint(path)):
         return None
-    return load_described(parse_controller(saved[DESCRIPTION], path), path, robot, "cpu", path)
+    return load_described(read_controller(path, saved[DESCRIPTION]), path, robot, "cpu", path)
 
 
 def _start_described(described: Described, path: Path, robot: RobotCfg) -> Start:

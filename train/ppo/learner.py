@@ -14,7 +14,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import distributed
 
-from sim.policy.loaders import reason_of
+from sim.policy.spec import in_one_line
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD, Start, State
 from train.ppo.ppo import CapturedPPO, runner_settings
@@ -218,7 +218,7 @@ class Learner:
             self.alg.load(content, None, True)
             self._restore(content)
         except Exception as error:  # torch answers states that do not fit with many types
-            raise ValueError(f"the checkpoint is damaged: {reason_of(error)}; put a copy of it back") from error
+            raise ValueError(f"the checkpoint is damaged: {in_one_line(error)}; put a copy of it back") from error
         self._begin()
 
     def _restore(self, content: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from sim.policy.adapters import read_row
 from sim.policy.loaders import load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import export_onnx
-from sim.policy.spec import ControllerSpec, controller_hash, controllers_of, label_suffix, name_of, spec_of
+from sim.policy.spec import ControllerSpec, about_controllers, controller_hash, controllers_of, label_suffix, spec_of
 from tests.builders import OBSERVATIONS, rsl_rl_actor, save_checkpoint
 
 JOINTS = 12
@@ -142,6 +142,7 @@ def test_controllers_have_names(anymal, tmp_path):
             controllers_of([wrong], anymal)
     copy = tmp_path / "C-G 1.pt"
     copy.write_bytes(anymal.policy_file.read_bytes())
-    assert name_of(copy, anymal) == "shipped" and spec_of("shipped", anymal) == shipped
-    assert name_of("a.pt", anymal) == spec_of("a.pt", anymal) == "a.pt"
+    about = about_controllers({"mine": str(copy), "other": "a.pt"}, anymal)
+    assert [about[name]["policy"] for name in about] == ["shipped", "a.pt"]
+    assert (spec_of("shipped", anymal), spec_of("a.pt", anymal)) == (shipped, "a.pt")
     assert label_suffix(str(copy)) == "-C-G-1"

@@ -130,7 +130,7 @@ def imported(source, tmp_path):
 
 
 def tags(controller):
-    return [term.name for term in controller.observation]
+    return [term.term for term in controller.observation]
 
 
 def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):

@@ -5,11 +5,13 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+import warp as wp
 from onnx import TensorProto, helper, numpy_helper
 
 from sim.policy.loaders import load_checkpoint, load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import export_onnx, load_onnx
+from sim.policy.runner import PolicyRunner, is_graph_safe
 from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor
 
 FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
@@ -38,6 +40,23 @@ def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=No
     return graph_model([node], *ports, weights)
 
 
+def chain(last):
+    """As mujoco_playground's exporter: normalised, a layer with swish, one with mean and spread, for one robot."""
+    rng = np.random.default_rng(5)
+    width = OBSERVATIONS
+    shapes = {"mean": width, "factor": width, "w0": (width, 16), "b0": 16, "w1": (16, 24), "b1": 24}
+    weights = {name: rng.normal(size=shape).astype(np.float32) / 5 for name, shape in shapes.items()}
+    steps = (
+        "Sub obs mean > centred", "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
+        "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
+    )  # fmt: skip
+    words = [(before.split(), after.split()) for before, after in (step.split(" > ") for step in steps)]
+    nodes = [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in words]
+    nodes[-2].attribute.append(helper.make_attribute("axis", -1))
+    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    return graph_model(nodes, [port("obs", [1, width])], [port("actions", [1, ACTIONS])], tensors), weights
+
+
 def save(path, model):
     path.write_bytes(model if isinstance(model, bytes) else model.SerializeToString())
     return path
@@ -47,19 +66,30 @@ def rows_of(count):
     return torch.randn(count, OBSERVATIONS, generator=torch.Generator().manual_seed(1))
 
 
-def test_it_acts_as_its_weights_say(tmp_path, anymal, device):
-    place = "cuda" if device.startswith("cuda") else "cpu"
-    policy = load_policy(str(save(tmp_path / "policy.onnx", linear())), anymal, device)
-    actions = policy(rows_of(33).to(place))
-    assert actions.device.type == place and actions.dtype == torch.float32
-    weight, bias = layer()
-    # Sums of 235 float32 products of order 0.1 in another order than NumPy's float64.
-    expected = rows_of(33).double().numpy() @ weight.T.astype(float) + bias
-    np.testing.assert_allclose(actions.cpu(), expected, rtol=1e-5, atol=1e-5)
+@pytest.mark.filterwarnings("ignore:policy.*runs on the CPU")
+@pytest.mark.parametrize(
+    ("last", "function"), [("Tanh", np.tanh), ("Softsign", lambda value: value / (1.0 + np.abs(value)))]
+)
+def test_it_acts_as_its_weights_say_captured_if_its_operators_are_known(tmp_path, anymal, device, last, function):
+    model, weights = chain(last)
+    policy = load_policy(str(save(tmp_path / "policy.onnx", model)), anymal, device)
+    assert is_graph_safe(policy) == (last == "Tanh")
+    observation, action = (wp.zeros((33, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
+    runner = PolicyRunner(policy, observation, action, wp.zeros(33, dtype=int, device=device))
+    for rows in (rows_of(33).numpy(), -rows_of(33).numpy()):
+        observation.assign(rows)
+        runner()
+        hidden = (rows - weights["mean"]) * weights["factor"] @ weights["w0"].astype(float) + weights["b0"]
+        out = hidden / (1.0 + np.exp(-hidden)) @ weights["w1"] + weights["b1"]
+        # Sums of 235 float32 products of order 0.1; on a GPU perhaps of TF32.
+        near = {"rtol": 2e-3, "atol": 5e-3} if device.startswith("cuda") else {"rtol": 1e-5, "atol": 1e-5}
+        np.testing.assert_allclose(action.numpy(), function(out[:, :ACTIONS]), **near)
 
 
-def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_path, anymal):
-    policy = load_policy(save(tmp_path / "policy.onnx", linear(columns="columns")), anymal, "cpu")
+@pytest.mark.parametrize("known", [True, False])
+def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_path, anymal, known):
+    model = linear(columns="columns") if known else chain("Softsign")[0]
+    policy = load_policy(save(tmp_path / "policy.onnx", model), anymal, "cpu")
     together = policy(rows_of(60))
     for size in (1, 4, 7, 20):
         assert torch.equal(torch.cat([policy(part) for part in rows_of(60).split(size)]), together), size
@@ -106,7 +136,7 @@ def test_weights_in_another_file_are_refused(tmp_path, anymal, deep):
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="this one can use a GPU")
 def test_without_cuda_in_onnxruntime_it_computes_on_the_cpu_and_says_so(tmp_path):
-    path = save(tmp_path / "policy.onnx", linear())
+    path = save(tmp_path / "policy.onnx", chain("Softsign")[0])
     with pytest.warns(UserWarning, match="onnxruntime-gpu"):
         policy = load_onnx(path, (OBSERVATIONS, ACTIONS), "cuda:0")
     assert policy.device == torch.device("cpu")
