@@ -167,11 +167,6 @@ class Archive(Evaluation):
         """Mean fitness of the elites; 0 without any."""
         return float(self.fitness.mean()) if len(self) else 0.0
 
-    def scores(self) -> dict[str, Any]:
-        """How good the archive is, as metrics have it."""
-        names = ("reachable_coverage", "qd_score", "mean_fitness")
-        return {"elites": len(self), **{name: getattr(self, name) for name in names}}
-
     @property
     def collided(self) -> NDArray[np.bool_]:
         """Whether any of the episodes that found an elite had a base collision, as the paper counts, shape (N,)."""
@@ -250,15 +245,7 @@ def write_archive(path: Path, archive: Archive) -> None:
 
 
 def read_archive(path: str | Path) -> Archive:
-    """Reads an archive; data only, nothing in the file can run.
-
-    Args:
-        path: ``archive.npz``, or the run directory that holds it.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        ValueError: If the file is damaged or no archive.
-    """
+    """Reads an archive, ``archive.npz`` or that of a run directory; data only, nothing in the file can run."""
     path = Path(path)
     file = path / ARCHIVE_FILE if os.path.isdir(path) else path
     if not os.path.isfile(file):  # False too for a name that no file can have

@@ -6,7 +6,6 @@ tuned on an archive.
 """
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from qd.run.directory import RUNS
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, origin_of
 from qd.workers.invalid import refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg
@@ -22,8 +21,8 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.base import MOST_HEIGHT, TerrainSpace
-from sim.spaces.registry import SPACES, at_height
+from sim.spaces.base import MOST_HEIGHT
+from sim.spaces.registry import at_height
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _ENOUGH = 200  # failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are
@@ -35,21 +34,19 @@ _CROSSED = 0.8  # share of episodes that should reach the goal
 _TRIED = 16, 4  # hard-random terrains, and episodes on each, at a height
 
 
-def fitting_height(
-    crossings: Crossings, policy: str, space: TerrainSpace, *, most: float = MOST_HEIGHT, seed: int = 0
-) -> float:
-    """The largest height, up to ``most`` [m], at which a controller crosses about 80 % of hard-random terrains.
+def fitting_height(crossings: Crossings, policy: str) -> float:
+    """The largest height [m] at which a controller crosses about 80 % of the paper's hard-random terrains.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
     ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
     """
     terrains, replicas = _TRIED
-    genes = space.hard_random(terrains, seed)
-    seeds = np.random.SeedSequence(seed).generate_state(terrains, np.uint32)
-    low, high = 0, sum(height <= most for height in _HEIGHTS)
+    genes = SUPER_GAUSSIAN.hard_random(terrains, 0)
+    seeds = np.random.SeedSequence(0).generate_state(terrains, np.uint32)
+    low, high = 0, len(_HEIGHTS)
     while low < high:  # those before low are crossed, those from high on are not; the highest first
         middle = high - 1 if high == len(_HEIGHTS) else (low + high) // 2
-        name, height = at_height(space, _HEIGHTS[middle]).name, _HEIGHTS[middle]
+        name, height = at_height(SUPER_GAUSSIAN, _HEIGHTS[middle]).name, _HEIGHTS[middle]
         label = f"hard-random terrains of height {height:g} m"
         result = crossings.cross(policy, genes, seeds, replicas=replicas, space=name, label=label)
         refuse_all_invalid(result)
@@ -59,42 +56,26 @@ def fitting_height(
     return _HEIGHTS[max(low - 1, 0)]
 
 
-def calibrate(
-    robot: RobotCfg,
-    policy: str | None = None,
-    *,
-    compute: Compute,
-    terrains: int = 1_000,
-    replicas: int = 20,
-    space: TerrainSpace = SUPER_GAUSSIAN,
-    seed: int = 0,
-    out: Path | None = None,
-    cache: Path | None = RUNS / "crossings",
-) -> dict[str, Any]:
+def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, replicas: int) -> dict[str, Any]:
     """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
 
-    Terrains of a user's robot are of the height that fits (:func:`fitting_height`), unless the space has one.
-    Hard-random ``terrains`` of a space are crossed to begin with. As many again are drawn until 200 episodes have
-    missed the goal, up to five times as many. With fewer failing episodes even then, all episodes give the scales.
+    Terrains of a user's robot are of the height that fits (:func:`fitting_height`). So many hard-random ``terrains``
+    are crossed to begin with. As many again are drawn until 200 episodes have missed the goal, up to five times as
+    many. With fewer failing episodes even then, all episodes give the scales.
 
     Returns:
         The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written;
         one of a robot.toml, whose penalties are all that could occur, has the scale 1.
     """
-    if policy is not None and out is None and robot.settings_file is None:
-        raise ValueError("out must name a file for the scales of another controller than the shipped one, got none")
-    if terrains < 1:
-        raise ValueError(f"terrains must be at least 1, got {terrains}")
-    policy, out, most = policy or str(robot.policy_file), out or robot.scales_file, _MOST * terrains
+    space, out, most = SUPER_GAUSSIAN, robot.scales_file, _MOST * terrains
     prepare_output(out)
-    check_policy(policy, robot, compute.device)
     # Both are drawn row by row: of 5,000 the first 1,000 are those that 1,000 would be.
-    genes = space.hard_random(most, seed)
-    seeds = np.random.SeedSequence(seed).generate_state(most, np.uint32)
+    genes = space.hard_random(most, 0)
+    seeds = np.random.SeedSequence(0).generate_state(most, np.uint32)
     results: list[RolloutResult] = []
-    with Crossings(robot, compute, cache=cache) as crossings:
-        if robot.settings_file is not None and space.name in SPACES:
-            space = at_height(space, fitting_height(crossings, policy, space, seed=seed))
+    with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
+        if robot.settings_file is not None:
+            space = at_height(space, fitting_height(crossings, policy))
         for first in range(0, most, terrains):
             rows, label = slice(first, first + terrains), f"hard-random terrains from {first + 1:,}"
             results.append(
@@ -104,7 +85,7 @@ def calibrate(
             if (count := _failing(result).sum()) >= _ENOUGH:
                 break
             print(f"{count} of {result.invalid.size} episodes did not reach the goal.", flush=True)
-    origin = {**origin_of(compute.device, seed, compute.workers), **identity(robot, policy), "space": space.name}
+    origin = {**origin_of(compute.device, 0, compute.workers), **identity(robot, policy), "space": space.name}
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
     report = {**origin, "crossing": crossing, **measured(result)}
     absent = [name for name in robot.penalties if name not in report["scales"]]

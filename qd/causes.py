@@ -128,11 +128,8 @@ def causes_at(
     results/ whose minimal terrain is known. Of the other half it names the kind of the minimal terrain's cause in six
     of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
 
-    Args:
-        genes: Shape (N, num_genes).
-        ends: World-local x and y of the places [m], shape (N, 2); NaN where they are not known.
-        space: What the genes mean.
-        half_width: Half the width of the robot's stance [m].
+    Genes have shape (N, num_genes). ``ends`` are world-local x and y of the places [m], shape (N, 2), NaN where they
+    are not known; ``half_width`` is that of the robot's stance [m].
     """
     return [_cause_at(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
 
@@ -176,11 +173,9 @@ def _ground_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: Ter
 
 
 def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
-    """The shape of a part under a robot on the straight way from start to goal.
+    """The shape of a part, which adds heights [m] of shape (nrow, ncol), under a robot on the straight way.
 
-    Args:
-        field: Heights that it adds [m], shape (nrow, ncol).
-        half_width: Half the width of the robot's stance [m].
+    ``half_width`` is that of the robot's stance [m].
     """
     heights = field.astype(np.float64)
     by_y, by_x = (np.gradient(heights, SPACING, axis=axis) for axis in (0, 1))

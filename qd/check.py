@@ -31,25 +31,16 @@ _MOST_ROWS = 2_000  # a robot that needs more constraint rows is refused
 _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
 
 
-def check(
-    robot: RobotCfg, policy: str | None = None, *, compute: Compute, seconds: float = 3.0, seed: int = 0,
-    anyway: bool = False,
-) -> bool:  # fmt: skip
-    """Prints what is read, whether it stands and walks, and what it gets over.
+def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anyway: bool = False) -> bool:
+    """Prints what is read, whether it stands and walks, and what it gets over; ``anyway`` also if it does not walk.
 
-    Args:
-        robot: Robot settings.
-        policy: The controller; the robot's own if None.
-        compute: Where.
-        seconds: How long it stands, and lies [s].
-        seed: Draws poses, terrains and starts.
-        anyway: Whether to go on although it does not walk.
+    The robot's own controller is taken if there is no other.
 
     Returns:
         Whether it stands as it should and walks alike in both simulators.
     """
     print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
-    robot, standing = _with_room(robot, compute.device, seconds, seed)
+    robot, standing = _with_room(robot, compute.device, 3.0)
     text, fine = describe_standing(robot, standing)
     print(text, flush=True)
     policy = policy or str(robot.policy_file)
@@ -58,12 +49,12 @@ def check(
         return fine
     check_policy(policy, robot, compute.device)
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
-        walks = _walks(robot, walk(crossings, policy, seed))
+        walks = _walks(robot, walk(crossings, policy))
         if walks or anyway:
-            height = fitting_height(crossings, policy, SUPER_GAUSSIAN, seed=seed)
+            height = fitting_height(crossings, policy)
     if walks or anyway:
         doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
-        dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=seed)
+        dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=0)
         stairs, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
         print(f"Half get over a kerb {kerb}, stairs {stairs}; 80 % cross hard-random terrains at --height {height:g}.")
     return fine and walks
@@ -83,20 +74,16 @@ def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCf
         policy = policy or str(robot.policy_file)
         check_policy(policy, robot, compute.device)
         print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
-        robot, _ = _with_room(robot, compute.device, 1.0, 0)
-        calibrate(robot, policy, compute=compute, terrains=_terrains(compute), replicas=4)
+        robot, _ = _with_room(robot, compute.device, 1.0)
+        terrains = 1_000 if compute.device.startswith("cuda") else 100
+        calibrate(robot, policy, compute=compute, terrains=terrains, replicas=4)
     return robot
 
 
-def _terrains(compute: Compute) -> int:
-    """Hard-random terrains of the scales to begin with; at most five times as many are crossed."""
-    return 1_000 if compute.device.startswith("cuda") else 100
-
-
-def _with_room(robot: RobotCfg, device: str, seconds: float, seed: int) -> tuple[RobotCfg, Standing]:
+def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, Standing]:
     """The robot with buffers in which the dropped ones fit, written into its settings where these are data."""
     wanted = robot
-    while (standing := stand(wanted, device=device, seconds=seconds, seed=seed)).overflowed:
+    while (standing := stand(wanted, device=device, seconds=seconds)).overflowed:
         if wanted.njmax >= _MOST_ROWS:
             raise ValueError(
                 f"robot '{robot.name}' needs more than {wanted.njmax} constraint rows, got no state without an "

@@ -235,10 +235,6 @@ class Check(ControllerFlags, WorkerFlags):
     if something must be mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
     """
 
-    seconds: Annotated[float, Meta(gt=0, le=60)] = 3.0
-    """How long it stands, and lies [s]."""
-    seed: NonNegativeInt = 0
-    """Draws poses, terrains and starts."""
     anyway: bool = False
     """Go on although it does not walk."""
 
@@ -249,8 +245,7 @@ class Check(ControllerFlags, WorkerFlags):
         from sim.robots.find import get_robot
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
-        flags = {"seconds": self.seconds, "seed": self.seed, "anyway": self.anyway}
-        return 0 if check(get_robot(self.robot), self.policy, compute=compute, **flags) else 1
+        return 0 if check(get_robot(self.robot), self.policy, compute=compute, anyway=self.anyway) else 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,35 +14,21 @@ _MAX_CELLS = 500_000  # an archive holds all of its cells in memory
 _SUM_TOLERANCE = 1e-9  # a mean over 20 episodes of ratios that sum to 1 is off by about 1e-16
 
 
-def episode_ratios(penalties: ArrayLike) -> NDArray[np.float64]:
-    """Share of each penalty in the sum of an episode's penalties.
-
-    Args:
-        penalties: Scaled penalties, not negative, shape (..., num_penalties).
-
-    Returns:
-        Ratios of the same shape; 1 / num_penalties each where all penalties are zero.
-    """
-    penalties = np.asarray(penalties, dtype=np.float64)
-    total = penalties.sum(axis=-1, keepdims=True)
-    equal = np.full_like(penalties, 1.0 / penalties.shape[-1])
-    return np.divide(penalties, total, out=equal, where=total > 0.0)
-
-
 def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64]:
-    """Mean over a terrain's valid episodes of the episodes' ratios.
+    """Mean over a terrain's valid episodes of each penalty's share in the sum of an episode's penalties.
 
     Args:
-        penalties: Scaled penalties, shape (num_terrains, num_replicas, num_penalties); anything in invalid
-            episodes.
+        penalties: Scaled penalties, not negative, shape (num_terrains, num_replicas, num_penalties); anything in
+            invalid episodes. An episode without any has equal ratios.
         valid: Whether an episode counts, shape (num_terrains, num_replicas).
 
     Returns:
         Ratios, shape (num_terrains, num_penalties), each row summing to 1; equal ones where no episode is valid.
     """
-    penalties = np.asarray(penalties, dtype=np.float64)
     valid = np.asarray(valid, dtype=bool)[..., None]
-    ratios = episode_ratios(np.where(valid, penalties, 0.0))
+    penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)
+    equal, sums = np.full_like(penalties, 1.0 / penalties.shape[-1]), penalties.sum(axis=-1, keepdims=True)
+    ratios = np.divide(penalties, sums, out=equal, where=sums > 0.0)
     count = valid.sum(axis=1)
     total = np.where(valid, ratios, 0.0).sum(axis=1)
     return np.divide(total, count, out=np.full_like(total, 1.0 / penalties.shape[-1]), where=count > 0)
@@ -102,14 +88,11 @@ class Cells:
         return np.asarray(np.ravel_multi_index(tuple(tuples.T), (self.intervals,) * self.num_ratios), dtype=np.int64)
 
     def cell_of(self, ratios: ArrayLike, collided: ArrayLike | None = None) -> NDArray[np.int64]:
-        """Cell of each row of ratios.
+        """Index of the reachable cell of each row of ratios, shape (batch,).
 
         Args:
             ratios: Float64 ratios, each row not negative and summing to 1, shape (batch, num_ratios).
             collided: Whether at least one episode had a base collision, shape (batch,); needed with a collision bit.
-
-        Returns:
-            Indices of reachable cells, shape (batch,).
         """
         ratios = np.asarray(ratios, dtype=np.float64)
         self._check_ratios(ratios)
@@ -130,11 +113,8 @@ class Cells:
             raise ValueError(f"ratios must not be negative and must sum to 1, got {ratios[row].tolist()} in row {row}")
 
     def _intervals_of(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Interval of each ratio: [i / intervals, (i + 1) / intervals), with 1.0 in the last.
-
-        Compared with the edges themselves, because floor(ratio * intervals) puts some edges, 1/49 of 49 for one, a
-        whole interval too low.
-        """
+        """Interval of each ratio: [i / intervals, (i + 1) / intervals), with 1.0 in the last."""
+        # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
         edges = np.arange(self.intervals + 1) / self.intervals
         return np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
 
@@ -151,14 +131,9 @@ class Cells:
         return tuples
 
     def are_neighbours(self, first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
-        """Whether cells are the same or neighbours: interval indices differ by at most 1, the collision bit agrees.
+        """Whether cells, by their indices, are the same or neighbours, all of shape (batch,).
 
-        Args:
-            first: Indices of cells, shape (batch,).
-            second: Indices of cells to compare with, shape (batch,).
-
-        Returns:
-            Shape (batch,).
+        Interval indices of neighbours differ by at most 1, and their collision bits agree.
         """
         bit_a, tuple_a = np.divmod(np.asarray(first), len(self.tuples))
         bit_b, tuple_b = np.divmod(np.asarray(second), len(self.tuples))

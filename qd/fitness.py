@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,19 +81,6 @@ class Evaluation:
         """Whether a terrain is valid and under half of these episodes reach the goal, shape (T,)."""
         return self.valid & (self.goal_rate < FAILING_GOAL_RATE)
 
-    def means(self) -> dict[str, Any]:
-        """What the terrains were like on the whole, as a row of metrics has it."""
-        return {
-            "terrains": len(self.fitness),
-            "episodes": int(self.episodes.sum()),
-            "invalid_episodes": int(self.invalid_episodes.sum()),
-            "invalid_terrains": int((~self.valid).sum()),
-            **{
-                f"batch_{name}": float(getattr(self, name).mean())
-                for name in ("fitness", "collision_rate", "goal_rate")
-            },
-        }
-
 
 def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
@@ -101,27 +88,12 @@ def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
 
 
-def _paper_fitness(
-    mean: NDArray[np.float64], std: NDArray[np.float64], collision_rate: NDArray[np.float64], cfg: FitnessCfg
-) -> NDArray[np.float64]:
-    """The paper's fitness, shape (T,): sum of means - alpha * sum of standard deviations - lambda * u.
-
-    u is the share of episodes without a base collision, and 0 where no episode has one.
-    """
-    inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
-    return mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
-
-
 def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Evaluation:
-    """Fitness, ratios, cells and rates of the terrains of a rollout.
+    """Fitness, ratios, cells and rates of the terrains of a rollout; ``cells`` have one ratio a penalty of ``cfg``.
 
-    Args:
-        result: Episodes of T terrains x R replicas.
-        cells: The archive's cells; one ratio a penalty of ``cfg``.
-        cfg: Penalties, their scales and the weights.
-
-    Returns:
-        The evaluation. An invalid terrain has fitness -20, equal ratios, no end position (NaN) and otherwise zeros.
+    The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
+    episodes without a base collision, and 0 where no episode has one. An invalid terrain has fitness -20, equal ratios,
+    no end position (NaN) and otherwise zeros.
     """
     penalties = _scaled_penalties(result, cfg)
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
@@ -130,8 +102,10 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
     std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted))
     collision_rate = _rate(result.base_collision, counted)
     ratios = terrain_ratios(penalties, counted)
+    inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
+    fitness = mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
     return Evaluation(
-        fitness=np.where(counted.any(axis=1), _paper_fitness(mean, std, collision_rate, cfg), FITNESS_FLOOR),
+        fitness=np.where(counted.any(axis=1), fitness, FITNESS_FLOOR),
         ratios=ratios,
         cell=cells.cell_of(ratios, collision_rate > 0.0),
         penalty_mean=mean,
@@ -149,14 +123,8 @@ def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray
     """Where the typical episode of each terrain ended: the median, by coordinate, of those that ended alike.
 
     Those are the episodes at the goal where at least half reach it. Else they are those that ended in the commonest of
-    the other ways, which are a base collision, the end of the time, and leaving the terrain.
-
-    Args:
-        result: Episodes of T terrains x R replicas.
-        counted: Which of them count, shape (T, R).
-
-    Returns:
-        World-local x and y [m], shape (T, 2); NaN where no episode counts.
+    the other ways, which are a base collision, the end of the time, and leaving the terrain. ``counted`` says which
+    episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
     ends = np.full((len(counted), 2), np.nan, np.float32)
     for row in np.flatnonzero(counted.any(axis=1)).tolist():

@@ -5,8 +5,7 @@ Causes: failing elites on which a part of the same kind stops the robot, such as
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +109,7 @@ class Elites:
 
     def rows(self, chosen: NDArray[np.int64]) -> "Elites":
         """The elites in some rows, in their order."""
-        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: v[chosen] for name, v in values.items() if isinstance(v, np.ndarray)})
+        return Elites(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     def place_of(self, number: int) -> int:
         """Row of an elite by its number in the archive."""
@@ -165,11 +163,8 @@ def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
 def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
     """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
 
-    Who descends from whom is not recorded. Terrains within :data:`KIN_M` are kin, and kin of kin are one family.
-
-    Args:
-        genes: Shape (N, num_genes).
-        space: What they mean.
+    Who descends from whom is not recorded. Terrains within :data:`KIN_M` are kin, and kin of kin are one family. Genes
+    have shape (N, num_genes).
     """
     if not len(genes):
         return np.zeros(0, np.int64)
@@ -180,11 +175,9 @@ def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.i
 
 
 def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean square distances of height maps to others [m], shape (T, N).
+    """Root mean square distances of height maps [m], shape (T, num_nodes), to others, (N, num_nodes): shape (T, N).
 
-    Args:
-        maps: Heights [m] as rows, shape (T, num_nodes); double, since their squares are subtracted from each other.
-        others: Heights [m] as rows, shape (N, num_nodes).
+    They are double, since their squares are subtracted from each other.
     """
     squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])

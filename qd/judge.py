@@ -14,27 +14,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import (
-    ARCHIVE_FILE,
-    Archive,
-    FaultCounts,
-    FreshValues,
-    goal_rates,
-    read_archive,
-    write_archive,
-)
+from qd.archive import ARCHIVE_FILE, Archive, FaultCounts, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
-from qd.run.directory import (
-    CONFIG_FILE,
-    METRICS_FILE,
-    SUMMARY_FILE,
-    RunDirectory,
-    check_space,
-    claimed,
-)
+from qd.run.directory import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, RunDirectory, check_space, claimed
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How

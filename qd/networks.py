@@ -27,11 +27,8 @@ class Networks(nn.ModuleList):
 
     They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
     depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
-    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does.
-
-    Args:
-        num_maps: Maps of a terrain that are given.
-        num_out: Numbers that each network says of a terrain.
+    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does. Of
+    ``num_maps`` maps of a terrain each network says ``num_out`` numbers.
     """
 
     def __init__(self, num_maps: int, num_out: int) -> None:
@@ -47,13 +44,9 @@ class Networks(nn.ModuleList):
         self.register_buffer("_where", waves.cos()[:, None].repeat(1, rows, 1), persistent=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """What each network says of the maps that it sees.
+        """What each network says of the maps that it sees, (batch, MEMBERS, num_maps, *SHAPE).
 
-        Args:
-            maps: Shape (batch, MEMBERS, num_maps, *SHAPE).
-
-        Returns:
-            Shape (batch, MEMBERS, num_out).
+        Shape (batch, MEMBERS, num_out).
         """
         if maps.is_cuda:
             return self._through(maps.flatten(1, 2), slice(None))
@@ -62,13 +55,9 @@ class Networks(nn.ModuleList):
         return torch.cat([self._through(maps[:, member].flatten(1, 2), member) for member in members], dim=1)
 
     def judge(self, maps: Tensor) -> Tensor:
-        """What each network says of the same maps; on CUDA in half precision, of which their words need no more.
+        """What each network says of the same maps, (batch, num_maps, *SHAPE); on CUDA half precision is enough.
 
-        Args:
-            maps: Shape (batch, num_maps, *SHAPE).
-
-        Returns:
-            Float32, shape (batch, MEMBERS, num_out).
+        Float32, shape (batch, MEMBERS, num_out).
         """
         if not maps.is_cuda:
             return self(maps[:, None].expand(-1, MEMBERS, -1, -1, -1))

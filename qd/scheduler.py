@@ -59,7 +59,7 @@ Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter | SurrogateE
 
 
 class Scheduler:
-    """The state of a search: ask for genes, tell what became of them.
+    """The state of a search, which a checkpoint holds: ask for genes, tell what became of them.
 
     ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what
     CMA-MAE's emitters are judged by: their own, with thresholds that lag behind. All others go by ``result``, and where
@@ -123,11 +123,7 @@ class Scheduler:
     def ask(self, group: int = 0) -> NDArray[np.float32]:
         """The next terrains of a group of emitters; the same ones until the group is told their results.
 
-        Args:
-            group: Number of the group.
-
-        Returns:
-            Clipped genes, shape (emitters of the group * batch_size, num_genes).
+        Clipped genes, shape (emitters of the group * batch_size, num_genes).
         """
         asked = self._asked[group]
         if asked is None:
@@ -156,12 +152,9 @@ class Scheduler:
             self.surrogate.compute_on(device)
 
     def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
-        """Tells a group of emitters what became of the terrains that it last asked for.
+        """Tells a group of emitters what became of the terrains that it last asked for, one row each in that order.
 
-        Args:
-            evaluation: One row a terrain, in the order asked.
-            iteration: Number of the iteration, from 1.
-            group: Number of the group.
+        Iterations are numbered from 1.
         """
         asked = self._asked[group]
         if asked is None:
@@ -207,20 +200,6 @@ class Scheduler:
         order = np.lexsort((data["index"], -data["objective"]))
         elites = {name: data[name][order] for name in _FIELDS}
         return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}
-
-    def state(self) -> dict[str, Any]:
-        """Everything a resumed search needs; what was asked for and not told stays asked for."""
-        return {"archive": self.archive, "result": self.result, "emitters": self.emitters, "asked": self._asked}
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> "Scheduler":
-        """A search that goes on where another stood."""
-        scheduler = cls.__new__(cls)
-        scheduler.archive, scheduler.result = state["archive"], state["result"]
-        scheduler.emitters, scheduler._asked = state["emitters"], state["asked"]
-        surrogates = [emitter.surrogate for emitter in scheduler.emitters if isinstance(emitter, SurrogateEmitter)]
-        scheduler.surrogate = surrogates[0] if surrogates else None
-        return scheduler
 
 
 _RATES = ("collision_rate", "goal_rate", "fallen_rate")

@@ -16,14 +16,7 @@ from qd.run.progress import SearchBar, clock, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
 from qd.show.figures import summary, write_figures
-from qd.workers.evaluator import (
-    Compute,
-    EvaluatorCfg,
-    Pipeline,
-    check_policy,
-    episode_seeds,
-    origin_of,
-)
+from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds, origin_of
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
@@ -36,6 +29,7 @@ from sim.spaces.registry import get_space, is_own
 
 _SAME = ("robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
          "collision_bit")  # fmt: skip
+_BATCH = ("fitness", "collision_rate", "goal_rate")
 
 
 def search(
@@ -72,7 +66,7 @@ def search(
         if saved is None:
             scheduler, metrics = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
         else:
-            scheduler, metrics = Scheduler.from_state(saved[0]), saved[1]
+            scheduler, metrics = saved
         scheduler.compute_on(compute.device)
         done = len(metrics)
         say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
@@ -144,7 +138,7 @@ def _run_iterations(
             row |= status._asdict()
         began = ended
         metrics.append(row)
-        run.save(cfg, scheduler.state(), metrics, archive)
+        run.save(cfg, scheduler, metrics, archive)
         bar.show(row, status)
 
 
@@ -157,8 +151,13 @@ def _metrics_row(archive: Archive, result: RolloutResult, evaluation: Evaluation
     """An iteration's row of metrics without the search's times."""
     return {
         "iteration": iteration,
-        **archive.scores(),
-        **evaluation.means(),
+        "elites": len(archive),
+        **{name: getattr(archive, name) for name in ("reachable_coverage", "qd_score", "mean_fitness")},
+        "terrains": len(evaluation.fitness),
+        "episodes": int(evaluation.episodes.sum()),
+        "invalid_episodes": int(evaluation.invalid_episodes.sum()),
+        "invalid_terrains": int((~evaluation.valid).sum()),
+        **{f"batch_{name}": float(getattr(evaluation, name).mean()) for name in _BATCH},
         "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
         "robot_steps": int(result.robot_steps),

@@ -104,11 +104,9 @@ class Surrogate:
         self._training = Training(self._networks.to(self.device), self._loss, self.device, moments)
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
-        """Remembers terrains, and trains for their share of an iteration's steps; draws from all that it remembers.
+        """Remembers terrains, of genes (N, num_genes), and trains for their share of an iteration's steps.
 
-        Args:
-            genes: Of the terrains told, shape (N, num_genes).
-            evaluation: What became of them; invalid ones are left out.
+        Invalid ones are left out; each step draws from all that it remembers.
         """
         valid = evaluation.valid
         if valid.any():
@@ -162,11 +160,7 @@ class Surrogate:
 
     @torch.inference_mode()
     def predict(self, genes: Tensor) -> Prediction:
-        """What each network says of terrains.
-
-        Args:
-            genes: In [-1, 1], on the surrogate's device, shape (N, num_genes).
-        """
+        """What each network says of terrains, of genes in [-1, 1] on the surrogate's device, (N, num_genes)."""
         parts = genes.split(_AT_ONCE[genes.device.type])
         columns = torch.cat([self._networks.judge(self._map_genes(part)) for part in parts])
         ratios, numbers, rates = self._split(columns.transpose(0, 1))
@@ -184,12 +178,8 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
-        Args:
-            count: How many.
-            elites: Genes of the elites, shape (E, num_genes).
-            cell: Their cells, shape (E,).
-            fitness: Their fitness, shape (E,).
-            under_way: Genes of terrains that robots are to cross already, shape (U, num_genes).
+        Genes of the ``elites`` have shape (E, num_genes), their cells and fitness (E,). ``under_way`` are genes of
+        terrains that robots are to cross already, shape (U, num_genes).
 
         Returns:
             Genes in [-1, 1], shape (count, num_genes).
@@ -297,14 +287,8 @@ def vary_elites(
     """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
 
     A share of them takes each of its parts, such as bumps, from a further elite with a chance of a half, where the
-    space has parts.
-
-    Args:
-        pool: Genes of the elites, shape (E, num_genes).
-        count: Number of children.
-        cfg: Step sizes and that share.
-        genes_per_part: As of :attr:`sim.spaces.base.TerrainSpace.genes_per_part`.
-        draw: What they are drawn from, on the pool's device.
+    space has parts (:attr:`sim.spaces.base.TerrainSpace.genes_per_part`). Elites' genes have shape (E, num_genes);
+    ``draw`` is on their device.
 
     Returns:
         Genes in [-1, 1], shape (count, num_genes).

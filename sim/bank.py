@@ -98,24 +98,21 @@ class TerrainBank:
         )
 
 
-def heights_of(
-    genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1, device: str | None = None
-) -> np.ndarray:
+def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
     """Height grids [m] of genes as a simulation has them, on the host.
 
     Args:
         genes: Shape (num_terrains, num_genes), at least one terrain.
         space: What the genes mean.
         every: Only every so many nodes of rows and columns, from the first: a divisor of the cells of both.
-        device: Warp device name; :func:`host_device` if None.
 
     Returns:
         Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), or fewer rows and columns.
     """
     if every == 1 or not space.any_spacing:
-        return terrains_of(genes, space, device=device)[0][:, ::every, ::every]
+        return terrains_of(genes, space)[0][:, ::every, ::every]
     shape = len(genes), (NUM_ROWS - 1) // every + 1, (NUM_COLS - 1) // every + 1
-    with wp.ScopedDevice(device or host_device()):  # the nodes in between are not worked out
+    with wp.ScopedDevice(host_device()):  # the nodes in between are not worked out
         heights: Any = wp.empty(shape, dtype=float)
         space.rasterise(wp.array(space.validate(genes), dtype=float), every * SPACING, heights)
         return np.array(heights.numpy())
@@ -124,10 +121,10 @@ def heights_of(
 def terrains_of(
     genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None
 ) -> tuple[np.ndarray, GroundMaps | None]:
-    """Height grids [m] of genes and their ground, if the space has any; arguments and errors of :func:`heights_of`.
+    """Height grids [m] of genes, shape (num_terrains, num_genes), and their ground, if the space has any.
 
-    Returns:
-        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), and maps.
+    Grids are float32, shape (num_terrains, NUM_ROWS, NUM_COLS); ``device`` is a Warp device, :func:`host_device` if
+    None.
     """
     device = device or host_device()
     bank = TerrainBank(len(genes), device=device, with_ground=bool(space.ground))

@@ -58,12 +58,9 @@ class GroundMaps:
 
 
 def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
-    """Row or column of the patch at each place along an axis; those at the edge go on beyond it.
+    """Row or column of the patch at each place along an axis, which ``count`` patches divide evenly.
 
-    Args:
-        places: Nodes or metres from the beginning of the axis.
-        length: Of the axis, likewise.
-        count: Patches that divide it evenly.
+    Places and length are in nodes or metres, from the beginning of the axis. Patches at the edge go on beyond it.
     """
     return np.clip(np.asarray(places) * count // length, 0, count - 1).astype(np.int64)
 

@@ -13,28 +13,10 @@ from sim.robots.training import TrainingCfg
 from sim.simulation import Simulation
 
 
-def soft_joint_limits(sim: Simulation, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper soft limits of the joints [rad], float32, shape (num_joints,) each.
-
-    They span a share of each joint's range about its middle; where there is none, they are far away.
-    """
-    joints = slice(6, 6 + sim.robot.num_joints)
-    lower, upper = (
-        np.asarray(limits.numpy(), dtype=np.float64)[joints]
-        for limits in (sim.model.joint_limit_lower, sim.model.joint_limit_upper)
-    )
-    middle, half = 0.5 * (lower + upper), 0.5 * share * (upper - lower)
-    return (middle - half).astype(np.float32), (middle + half).astype(np.float32)
-
-
 def make_motion(sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any) -> Motion:
-    """What rewards are computed from, as a kernel argument on the simulation's device.
+    """What rewards are computed from, as a kernel argument on the simulation's device, whose state is not copied.
 
-    Args:
-        sim: The robots; their state is referred to, not copied.
-        cfg: Which joints are to keep still, how soft their limits are, and how long feet are to be in the air.
-        command: Command the action answers, shape (num_envs, 3).
-        action: Clipped action of the step, shape (num_envs, num_joints).
+    ``command``, of shape (num_envs, 3), is what the clipped ``action`` of the step, (num_envs, num_joints), answers.
     """
     robot = sim.robot
     motion = Motion()
@@ -46,9 +28,12 @@ def make_motion(sim: Simulation, cfg: TrainingCfg, *, command: Any, action: Any)
     motion.force_limit = robot.contact_force_limit
     motion.dt = robot.control_dt
     motion.min_air_time_s = cfg.min_air_time_s
-    lower, upper = soft_joint_limits(sim, cfg.soft_joint_limit)
-    motion.joint_lower = wp.array(lower, dtype=float, device=sim.device)
-    motion.joint_upper = wp.array(upper, dtype=float, device=sim.device)
+    limits = (sim.model.joint_limit_lower, sim.model.joint_limit_upper)
+    lower, upper = (np.asarray(limit.numpy(), dtype=np.float64)[6 : 6 + robot.num_joints] for limit in limits)
+    # Soft limits span a share of each joint's range about its middle; where there is none, they are far away.
+    middle, half = 0.5 * (lower + upper), 0.5 * cfg.soft_joint_limit * (upper - lower)
+    motion.joint_lower = wp.array(middle - half, dtype=float, device=sim.device)
+    motion.joint_upper = wp.array(middle + half, dtype=float, device=sim.device)
     steady = [int(name in cfg.steady_joints) for name in robot.joint_names]
     motion.joint_is_steady = wp.array(steady, dtype=int, device=sim.device)
     return motion

@@ -101,13 +101,8 @@ def _check_positive(**counts: int) -> None:
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
 
-    Args:
-        kind: One of :data:`CROSSING_TYPES`.
-        level: 0 (nearly flat) to 9.
-        seed: For the random types.
-
-    Returns:
-        Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
+    ``kind`` is one of :data:`CROSSING_TYPES`; levels go from 0 (nearly flat) to 9. Heights [m], float32, shape
+    (NUM_ROWS, NUM_COLS).
     """
     d = _difficulty(kind, CROSSING_TYPES, level)
     rng = np.random.default_rng(seed)
@@ -127,10 +122,6 @@ def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
 
 def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Hand-crafted crossings: the types of :data:`CROSSING_TYPES` in turn (equal shares), levels uniform in 0..9.
-
-    Args:
-        count: Number of terrains.
-        seed: Int or Generator.
 
     Returns:
         Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
@@ -152,14 +143,8 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     The robot starts in the centre, on the platform: it walks down from a slope, up from ``stairs_up`` (a pit) and down
     from ``stairs_down``. The pyramids' faces are planes, so the gradient is the same everywhere on a flank.
 
-    Args:
-        kind: One of :data:`TILE_TYPES`.
-        level: 0 (nearly flat) to 9.
-        seed: For the random types.
-        inverted: Turn a slope into a pit; other types ignore it.
-
-    Returns:
-        Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
+    ``kind`` is one of :data:`TILE_TYPES`; levels go from 0 (nearly flat) to 9. ``inverted`` turns a slope into a pit,
+    and no other type. Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
     d = _difficulty(kind, TILE_TYPES, level)
     rng = np.random.default_rng(seed)
@@ -176,11 +161,8 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
 def training_tiles(num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray]:
     """The tiles of the training curriculum: a row a level from 0 up, a column a type.
 
-    Columns go to :data:`TILE_TYPES` in order, in shares .1, .1, .35, .25, .2; every other smooth slope is inverted.
-
-    Args:
-        num_columns: Number of columns; 20 and its multiples give the shares exactly.
-        seed: Int or Generator.
+    Columns go to :data:`TILE_TYPES` in order, in shares .1, .1, .35, .25, .2, which 20 and its multiples give exactly;
+    every other smooth slope is inverted.
 
     Returns:
         Heights [m] float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at

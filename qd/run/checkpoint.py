@@ -32,7 +32,7 @@ _ADMITTED = {
     "ribs.emitters._iso_line_emitter": ("IsoLineEmitter",),
     "ribs.emitters.opt._cma_es": ("CMAEvolutionStrategy", "DecompMatrix"),
     "ribs.emitters.rankers": ("ImprovementRanker", "TwoStageImprovementRanker"),
-    "qd.scheduler": ("RandomEmitter", "SurrogateEmitter"),
+    "qd.scheduler": ("RandomEmitter", "Scheduler", "SurrogateEmitter"),
     "qd.surrogate": ("Surrogate",),
 }
 """Classes that a state may hold, by their modules."""

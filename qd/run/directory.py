@@ -173,12 +173,13 @@ class RunDirectory:
         config["sessions"] = [*config["sessions"], session]
         write_atomically(self.path / CONFIG_FILE, to_json(config))
 
-    def save(self, cfg: SearchCfg, state: dict[str, Any], metrics: Metrics, archive: Archive) -> None:
+    def save(self, cfg: SearchCfg, scheduler: Any, metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it.
 
-        ``state`` is that of the scheduler after ``tell``. The settings let a checkpoint that strayed here be noticed.
+        The settings let a checkpoint that strayed here be noticed.
         """
-        save_checkpoint(self.path / CHECKPOINT_FILE, {"settings": as_settings(cfg), "metrics": metrics, **state})
+        state = {"settings": as_settings(cfg), "metrics": metrics, "scheduler": scheduler}
+        save_checkpoint(self.path / CHECKPOINT_FILE, state)
         self.write_derived(metrics, archive)
 
     def write_derived(self, metrics: Metrics, archive: Archive) -> None:
@@ -187,8 +188,8 @@ class RunDirectory:
         write_atomically(self.path / METRICS_FILE, rows.encode())
         write_archive(self.path / ARCHIVE_FILE, archive)
 
-    def load(self, cfg: SearchCfg) -> tuple[dict[str, Any], Metrics] | None:
-        """State of the scheduler and metrics of the search that is to go on, as its checkpoint has it.
+    def load(self, cfg: SearchCfg) -> tuple[Any, Metrics] | None:
+        """Scheduler and metrics of the search that is to go on, as its checkpoint has them.
 
         None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
         something else in the directory, is a ValueError.
@@ -204,15 +205,15 @@ class RunDirectory:
                 raise ValueError(f"{file} is lost: expected it beside {ARCHIVE_FILE}; {_REMEDY}")
             return None
         state = load_checkpoint(file)
-        settings, metrics = state.pop("settings", None), state.pop("metrics", None)
-        if not isinstance(settings, dict) or not isinstance(metrics, list):
-            raise ValueError(f"{file} is no checkpoint of a search: it lacks settings or metrics; {_REMEDY}")
+        settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
+        if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
+            raise ValueError(f"{file} is no checkpoint of a search: it must have settings, metrics, state; {_REMEDY}")
         self._check_settings(file, settings, cfg)
         if len(metrics) > cfg.iterations:
             raise ValueError(
                 f"iterations must be at least {len(metrics)}, as many as {self.path} has done, got {cfg.iterations}"
             )
-        return state, metrics
+        return scheduler, metrics
 
     @staticmethod
     def _check_settings(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:

@@ -281,13 +281,10 @@ class Pipeline:
     def in_lots(
         self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
     ) -> Iterator[tuple[slice, RolloutResult]]:
-        """Crosses each terrain once a replica, in lots; nothing else may be under way.
+        """Crosses each terrain once a replica, in lots of ``size``; nothing else may be under way.
 
-        Args:
-            terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol).
-            seeds: One a terrain, uint32.
-            size: Terrains of a lot.
-            progress: Called now and then with the share that is done.
+        Terrains are genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol), with an
+        uint32 seed each. ``progress`` is called now and then with the share that is done.
 
         Yields:
             Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import SearchCfg, preset
-from qd.scheduler import Scheduler
 from qd.search import search
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, open_evaluator
 from results.make.bare import bare_rates, kernel_shares
@@ -45,8 +44,7 @@ def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> t
     search(cfg, path, script.compute)
     saved = RunDirectory(path).load(cfg)
     assert saved is not None
-    state, metrics = saved
-    scheduler = Scheduler.from_state(state)
+    scheduler, metrics = saved
     return metrics[WARM_UP:], np.concatenate([scheduler.ask(group) for group in range(cfg.scheduler.num_groups)])
 
 

@@ -135,12 +135,8 @@ class Dose:
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Terrains of all values, ``count`` each: those of the first place, value by value, then those of the next.
 
-        An obstacle begins at places that are spread evenly over 1 m. A cross slope leans to a side that is drawn for
-        each place, rubble is another one at each. All else is the same, and equal for all values.
-
-        Args:
-            count: Places, at least 1.
-            rng: Draws sides and rubble.
+        An obstacle begins at ``count`` places that are spread evenly over 1 m. A cross slope leans to a side that is
+        drawn for each place, rubble is another one at each. All else is the same, and equal for all values.
 
         Returns:
             Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :data:`LEVEL_SPACE`.
@@ -241,9 +237,8 @@ DOSES: dict[str, Dose] = {
 def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     """Some of :data:`DOSES`, in their order, as a command line names them; all of them without ``words``.
 
-    Args:
-        words: ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces.
-        at: Other parameters of those that have them, ``tread=0.25``.
+    A word is ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces. ``at`` are
+    other parameters of those that have them, ``tread=0.25``.
     """
     elements: dict[str, Sequence[float] | None] = {}
     for word in " ".join(words).split():

@@ -136,16 +136,11 @@ class OnGround(TerrainSpace):
 
     def _values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
         """Frictions, or time constants [s], of one terrain, shape (32,)."""
-        return values_of(kind, row[self._columns(kind)])
-
-
-def values_of(kind: str, genes: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Frictions, or time constants [s], of genes in [-1, 1]."""
-    share = (genes.astype(np.float64) + 1.0) / 2.0
-    if kind == "friction":
-        return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
-    tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
-    return np.where(share > 0.0, tau, 0.0)
+        share = (row[self._columns(kind)].astype(np.float64) + 1.0) / 2.0
+        if kind == "friction":
+            return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
+        tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
+        return np.where(share > 0.0, tau, 0.0)
 
 
 def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:

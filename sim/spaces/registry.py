@@ -36,9 +36,8 @@ def identity(name: str, sha256: str | None) -> str:
 def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's own is run, and :func:`get_space` finds it from then on.
 
-    Args:
-        name: A shipped space's name, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, for
-            example ``course+friction+softness``; the paper's space if None.
+    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, as in
+    ``course+friction+softness``; None is the paper's space.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
     if is_own(base):
@@ -51,9 +50,7 @@ def load_space(name: str | None) -> TerrainSpace:
 def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     """A space that a record names; no code runs that :func:`load_space` did not run.
 
-    Args:
-        name: What the record calls it.
-        sha256: Hash of its code in the record, by which code that has moved is known.
+    By the hash of its code in the record, code that has moved is known.
     """
     base, kinds = split_name(name)
     root, at, height = base.rpartition("@")

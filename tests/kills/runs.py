@@ -11,7 +11,6 @@ from qd import search as searching
 from qd.archive import ARCHIVE_FILE
 from qd.run.checkpoint import load_checkpoint
 from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE
-from qd.scheduler import Scheduler
 from sim.robots.find import get_robot
 from tests.kills.faults import Steps
 from tests.qd.searches import crossing_by, rows_of
@@ -62,10 +61,10 @@ def search(path: Path, *, iterations: int, **watched: Any) -> int:
 
 def search_outcome(path: Path) -> tuple[Any, ...]:
     """What a search comes to: the archive's bytes, its metrics without a clock's, and what it would ask next."""
-    state = load_checkpoint(path / CHECKPOINT_FILE)
+    scheduler = load_checkpoint(path / CHECKPOINT_FILE)["scheduler"]
     rows = [{key: value for key, value in row.items() if key not in _OF_A_CLOCK} for row in rows_of(path)]
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
-    return (path / ARCHIVE_FILE).read_bytes(), rows, Scheduler.from_state(state).ask().tobytes()
+    return (path / ARCHIVE_FILE).read_bytes(), rows, scheduler.ask().tobytes()
 
 
 def saved_iterations(path: Path) -> int:

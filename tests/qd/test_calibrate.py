@@ -55,28 +55,33 @@ def failing(share):
     return change
 
 
-def calibrated(folder, opened, **changes):
-    values = {"compute": compute_by(opened), "out": folder / "scales.json", "cache": folder / "crossings", **changes}
-    return calibrate(ROBOT, **values)
+@pytest.fixture(autouse=True)
+def scales(tmp_path, monkeypatch):
+    """File of the robot's scales."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(RobotCfg, "scales_file", tmp_path / "scales.json")
+    return tmp_path / "scales.json"
 
 
-def test_the_file_is_what_the_robot_reads(tmp_path, monkeypatch):
-    out = tmp_path / "scales.json"
-    calibrated(tmp_path, robots(), terrains=12, replicas=4)
-    monkeypatch.setattr(RobotCfg, "scales_file", property(lambda self: out))
-    content = json.loads(out.read_text())
+def calibrated(opened, terrains, replicas=20):
+    return calibrate(ROBOT, str(ROBOT.policy_file), compute=compute_by(opened), terrains=terrains, replicas=replicas)
+
+
+def test_the_file_is_what_the_robot_reads(scales):
+    calibrated(robots(), 12, replicas=4)
+    content = json.loads(scales.read_text())
     assert read_penalty_scales(ROBOT) == tuple(content["scales"].values())
     assert (content["terrains"], content["episodes"], content["invalid_episodes"], content["seed"]) == (60, 240, 0, 0)
     assert identity(ROBOT, ROBOT.policy_file).items() <= content.items()
     assert (content["space"], content["crossing"]["speed"]) == ("super_gaussian", 0.75)
 
 
-def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing(tmp_path):
+def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing():
     # 8 terrains x 20 episodes, of which a quarter fails: 40 after 8 terrains, 200 after 40.
     stopped, rest = (robots(failing(0.25), stop_after=count) for count in (20, None))
     with pytest.raises(KeyboardInterrupt):
-        calibrated(tmp_path, stopped, terrains=8)
-    content = calibrated(tmp_path, rest, terrains=8)
+        calibrated(stopped, 8)
+    content = calibrated(rest, 8)
     assert len(stopped.seeds) + len(rest.seeds) == content["terrains"] == 40 and rest.seeds
     assert (content["failing_episodes"], content["scaled_by"]) == (200, "failing")
     genes = SUPER_GAUSSIAN.hard_random(40, 0)
@@ -85,30 +90,23 @@ def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing(t
     np.testing.assert_array_equal(list(content["scales"].values()), means)
 
 
-def test_a_controller_that_seldom_fails_is_scaled_by_all_episodes(tmp_path):
+def test_a_controller_that_seldom_fails_is_scaled_by_all_episodes():
     # One of 20 fails: 40 of the 800 episodes on five times 8 terrains.
-    content = calibrated(tmp_path, robots(failing(0.05)), terrains=8)
+    content = calibrated(robots(failing(0.05)), 8)
     assert (content["terrains"], content["failing_episodes"], content["scaled_by"]) == (40, 40, "all")
 
 
-def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are_kept(tmp_path):
+def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are_kept(scales):
     without = robots(lambda result: replace(result, penalties=result.penalties * (np.arange(6) > 0)))
     with pytest.raises(ValueError, match="yaw_rate"):
-        calibrated(tmp_path, without, terrains=20)
-    assert list(json.loads((tmp_path / "scales.json").read_text())["scales"]) == list(stand_in.PENALTIES[1:])
+        calibrated(without, 20)
+    assert list(json.loads(scales.read_text())["scales"]) == list(stand_in.PENALTIES[1:])
 
 
-@pytest.mark.parametrize(
-    ("named", "changes"),
-    [
-        ("/proc/missing", {"out": Path("/proc/missing/scales.json")}),
-        ("terrains", {"terrains": 0}),
-        ("out", {"policy": "mine.pt", "out": None}),
-    ],
-)
-def test_mistakes_are_found_before_the_work(tmp_path, named, changes):
-    with pytest.raises(ValueError, match=named):
-        calibrated(tmp_path, robots(stop_after=0), **changes)
+def test_a_file_that_cannot_be_written_is_found_before_the_work(monkeypatch):
+    monkeypatch.setattr(RobotCfg, "scales_file", Path("/proc/missing/scales.json"))
+    with pytest.raises(ValueError, match="/proc/missing"):
+        calibrated(robots(stop_after=0), 20)
 
 
 @pytest.mark.parametrize(("crossed_up_to", "expected"), [(0.30, 0.25), (0.11, 0.1), (0.04, 0.04), (0.001, 0.02)])
@@ -121,5 +119,5 @@ def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, e
             asked.append(height)
             return failing(0.0 if height <= crossed_up_to else 0.5)(stand_in.evaluate(genes, seeds, replicas))
 
-    assert fitting_height(Crosses(), "policy.pt", SUPER_GAUSSIAN) == expected
+    assert fitting_height(Crosses(), "policy.pt") == expected
     assert asked[0] == 0.25 and len(asked) <= 5

@@ -55,7 +55,7 @@ def test_a_controller_trained_with_the_robot_before_is_told_so(dog, capsys):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_shipped_scales_are_of_the_shipped_robot_and_controller(name):
-    """If this fails, a shipped file has changed: `faultline calibrate` measures its scales again."""
+    """If this fails, a shipped file has changed: its scales must be measured again."""
     robot = ROBOTS[name]
     content = json.loads(robot.scales_file.read_text())
     assert identity(robot, robot.policy_file).items() <= content.items()

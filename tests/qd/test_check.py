@@ -15,7 +15,7 @@ from tests.sim.dogs import CONTROLLER, write_dog, write_toml
 def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mended(tmp_path, capsys):
     file = write_dog(tmp_path)
     file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2, njmax=4, nconmax=2"))
-    assert run_command(Check, ["--robot", str(file), "--device", "cpu", "--seconds", "0.5"], name="check") == 1
+    assert run_command(Check, ["--robot", str(file), "--device", "cpu"], name="check") == 1
     text = capsys.readouterr().out
     assert "FL_hip" in text and "default_base_height" in text and "It stands" in text
     assert "Its buffers were too small: it needs njmax = " in text and "Without a controller" in text
@@ -33,7 +33,7 @@ def test_the_shipped_controller_walks_alike_in_both_simulators_and_gets_over_ker
 def test_a_controller_that_stands_still_does_not_walk(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     compute = Compute.resolve("cpu", "1", None)
-    assert not check(get_robot("anymal"), "tests.sim.policies:stand", compute=compute, seconds=0.5)
+    assert not check(get_robot("anymal"), "tests.sim.policies:stand", compute=compute)
     text = capsys.readouterr().out
     assert text.count("0 of 8 reach the goal") == 2 and "It does not walk" in text and "kerb" not in text
 

@@ -4,20 +4,15 @@ from itertools import product
 import numpy as np
 import pytest
 
-from qd.descriptors import Cells, episode_ratios, terrain_ratios
-
-
-def test_ratios_of_an_episode():
-    # 1 + 3 + 0 + 4 = 8; without penalties one nth each
-    assert episode_ratios([1.0, 3.0, 0.0, 4.0]).tolist() == [0.125, 0.375, 0.0, 0.5]
-    assert episode_ratios(np.zeros((2, 5))).tolist() == [[0.2] * 5] * 2
+from qd.descriptors import Cells, terrain_ratios
 
 
 def test_terrain_ratio_is_the_mean_of_the_valid_episodes_ratios():
     # episodes (1, 3) -> (1/4, 3/4) and (10, 0) -> (1, 0): mean (5/8, 3/8); the ratio of means would be (11/14, 3/14)
-    penalties = [[[1.0, 3.0], [np.nan, np.inf], [10.0, 0.0]], [[np.nan, 1.0]] * 3]
-    ratios = terrain_ratios(penalties, [[True, False, True], [False] * 3])
-    assert ratios.tolist() == [[0.625, 0.375], [0.5, 0.5]]
+    # (3, 1) -> (3/4, 1/4), and without penalties one half each
+    penalties = [[[1.0, 3.0], [np.nan, np.inf], [10.0, 0.0]], [[np.nan, 1.0]] * 3, [[3.0, 1.0], [0.0, 0.0], [3.0, 1.0]]]
+    ratios = terrain_ratios(penalties, [[True, False, True], [False] * 3, [True, True, False]])
+    assert ratios.tolist() == [[0.625, 0.375], [0.5, 0.5], [0.625, 0.375]]
 
 
 @pytest.mark.parametrize(

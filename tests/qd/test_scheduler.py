@@ -68,8 +68,8 @@ def test_a_saved_search_goes_on_bit_for_bit(method, tmp_path):
     straight, cut = make_search(cfg), make_search(cfg)
     advance(straight, 1, 16)
     advance(cut, 1, 7)
-    save_checkpoint(tmp_path / "saved", cut.state())
-    cut = Scheduler.from_state(load_checkpoint(tmp_path / "saved"))
+    save_checkpoint(tmp_path / "saved", {"scheduler": cut})
+    cut = load_checkpoint(tmp_path / "saved")["scheduler"]
     advance(cut, 8, 16)
     for name, rows in straight.elites().items():
         assert np.array_equal(rows, cut.elites()[name]), name
