@@ -171,7 +171,7 @@ def draw_crossing(crossed: Crossed, title: str) -> Figure:
     figure = new_figure(9.5, 6.4)
     figure.suptitle(title)
     top, profile = panels = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 0.9))
-    image = draw_heights(top, crossed.recording.heights[0], None, crossed.recording.ground)
+    image = draw_heights(top, crossed.recording.heights[0], crossed.recording.ground)
     figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
     handles = [*_draw_paths(top, crossed), *(Line2D([], [], **look) for look in (START, GOAL))]
     ground = crossed.recording.ground

@@ -116,7 +116,7 @@ class Simulation:
         """Recordings of all, in their order."""
         first = wanted[0]
         grounds = [crossing.ground for crossing in wanted if crossing.ground is not None]
-        _, recording = record(
+        recording = record(
             self.prepare(first, len(wanted)),
             np.stack([crossing.terrain for crossing in wanted]),
             np.array([crossing.terrain_seed for crossing in wanted], np.uint32),

@@ -169,7 +169,8 @@ def say(*parts: str | tuple[str, str], error: bool = False) -> None:
 def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
     """The command with its flags; what tyro says of wrong ones in a box is an error of one line."""
     if {"-h", "--help"} & {*argv}:
-        print(_wrapped(inspect.getdoc(cls) or ""), end="\n\n")
+        paragraphs, width = (inspect.getdoc(cls) or "").split("\n\n"), max(40, get_terminal_size().columns)
+        print("\n\n".join(textwrap.fill(paragraph, width) for paragraph in paragraphs), end="\n\n")
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -189,11 +190,6 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
             given = "".join(f", got {value}" for value in [_values(argv, flag)] if value)
             what = f"{flag} must be {form[2].strip('{}').replace('|', ' or ')}{given}"
         raise UserError(f"{what.rstrip('.')}; `faultline {name} --help` tells all flags") from None
-
-
-def _wrapped(text: str) -> str:
-    width = max(40, get_terminal_size().columns)
-    return "\n\n".join(textwrap.fill(paragraph, width) for paragraph in text.split("\n\n"))
 
 
 def _plain_help() -> ConstructorRegistry:

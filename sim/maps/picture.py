@@ -29,13 +29,13 @@ _LINES_EVERY, _LINE = 8, 2  # nodes from line to line, and of a line
 _FAINT, _STRONG, _WASH = 0.3, 0.75, 0.1  # opacity of lines over nearly usual and over the worst ground, and between
 
 
-def height_colors(heights: NDArray[np.floating], most: float | None = None) -> NDArray[np.float64]:
-    """RGB (0 to 1) of heights [m], the strongest at ``most``; a last axis of 3 more than theirs."""
-    return HEIGHTS(0.5 + 0.5 * heights / _range_of(heights, most))[..., :3]
+def height_colors(heights: NDArray[np.floating]) -> NDArray[np.float64]:
+    """RGB (0 to 1) of heights [m], the strongest at the one farthest from 0; a last axis of 3 more than theirs."""
+    return HEIGHTS(0.5 + 0.5 * heights / _range_of(heights))[..., :3]
 
 
-def _range_of(heights: NDArray[np.floating], most: float | None) -> float:
-    return max(float(np.abs(heights).max()) if most is None else most, _LEAST_RANGE)
+def _range_of(heights: NDArray[np.floating]) -> float:
+    return max(float(np.abs(heights).max()), _LEAST_RANGE)
 
 
 def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -> NDArray[np.float64]:
@@ -65,18 +65,12 @@ def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> 
     return colors + lines[..., 3:] * (lines[..., :3] - colors)
 
 
-def draw_heights(
-    axes: Axes,
-    heights: NDArray[np.float32],
-    most: float | None = None,
-    ground: GroundMaps | None = None,
-) -> Any:
+def draw_heights(axes: Axes, heights: NDArray[np.float32], ground: GroundMaps | None = None) -> Any:
     """Heights [m], shape (nrow, ncol), from above with start and goal, and the lines of its ground; returns the image.
 
-    Colours are those of the ground in other pictures, paler, so that paths are seen on them; ``most`` is the height of
-    the strongest [m], that of the terrain if left out.
+    Colours are those of the ground in other pictures, paler, so that paths are seen on them.
     """
-    most = _range_of(heights, most)
+    most = _range_of(heights)
     where: dict[str, Any] = {"origin": "lower", "extent": (0.0, LENGTH, 0.0, WIDTH)}
     image = axes.imshow(heights, cmap=HEIGHTS, vmin=-most, vmax=most, alpha=_PALE, **where)
     if ground is not None:

@@ -20,14 +20,14 @@ from sim.ground import PATCHES
 from sim.recording.recorder import FRAME_ARRAYS, Recording
 from sim.spaces.registry import get_space, is_own
 
-FORMAT = "faultline recording 2"
+FORMAT = "faultline recording 3"
 """Name and version in every file."""
 
 _TEXTS = ("robot", "joint_names", "foot_names", "penalty_names", "geom_names", "labels", "origin")
 _EACH = ("terrains", "episodes")
 _FRAME = (*_EACH, "frames")
 _SHAPES: dict[str, tuple[int | str, ...]] = {
-    "seeds": ("terrains",), "labels": ("terrains",), "replicas": ("episodes",), "joint_names": ("joints",),
+    "seeds": ("terrains",), "labels": ("terrains",), "joint_names": ("joints",),
     "foot_names": ("feet",), "penalty_names": ("penalties",), "geom_names": ("geoms",),
     "robot": (), "dt": (), "origin": (),
     **dict.fromkeys(("outcome", "invalidity", "fallen", "duration_s", "num_frames"), _EACH),
@@ -54,7 +54,7 @@ def read_recording(path: str | Path) -> Recording:
     """Reads what :func:`write_recording` wrote, as data; a ValueError if the file is damaged or of another kind."""
     path = Path(path)
     if not os.path.isfile(path):
-        raise FileNotFoundError(f"no recording at {path}: `faultline film` writes one beside its film")
+        raise FileNotFoundError(f"no recording at {path}: commands that show crossings keep theirs in runs/recordings")
     try:
         return _read(path)
     except Exception as error:  # zip, zlib, npy headers and JSON answer damage with a dozen types

@@ -53,8 +53,6 @@ class Recording:
     """Genes, shape (T, num_genes), of terrains that were given by them."""
     seeds: NDArray[np.uint32]
     """Seed of each terrain's episodes, shape (T,)."""
-    replicas: NDArray[np.int32]
-    """Number of each recorded episode among the terrain's, shape (K,)."""
     outcome: NDArray[np.uint8]
     """:class:`kernels.episode.Outcome` of each episode, shape (T, K)."""
     invalidity: NDArray[np.uint8]
@@ -90,14 +88,9 @@ class Recording:
     """Softness of the patches, with and without as ``friction`` (:class:`sim.ground.GroundMaps`)."""
 
     @property
-    def num_terrains(self) -> int:
-        """T."""
-        return len(self.seeds)
-
-    @property
     def num_episodes(self) -> int:
         """K."""
-        return len(self.replicas)
+        return self.outcome.shape[1]
 
     @property
     def ground(self) -> GroundMaps | None:
@@ -217,7 +210,7 @@ def record(
     labels: Sequence[str] | None = None,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> tuple[RolloutResult, Recording]:
+) -> Recording:
     """Runs a rollout's episodes and records them; the episodes are those that ``rollout.evaluate`` would run.
 
     On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
@@ -236,32 +229,27 @@ def record(
     result = rollout.evaluate(terrains, seeds, ground=ground, watcher=frames, progress=progress)
     maps = rollout.sim.bank.ground_maps()
     heights: Any = rollout.sim.bank.heights[: len(terrains)].numpy()
-    device = rollout.sim.device
     robot = rollout.robot
-    return (
-        result,
-        Recording(
-            robot=robot.name,
-            joint_names=robot.joint_names,
-            foot_names=robot.foot_geoms,
-            penalty_names=robot.penalties,
-            geom_names=robot.geom_names,
-            dt=robot.control_dt,
-            labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
-            heights=heights.copy(),  # on the CPU numpy() is a view
-            friction=None if maps is None else maps.friction[: len(terrains)],
-            time_constant_s=None if maps is None else maps.time_constant_s[: len(terrains)],
-            genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
-            seeds=seeds.astype(np.uint32),
-            replicas=np.arange(rollout.num_replicas, dtype=np.int32),
-            origin={
-                **identity(robot, str(policy)),
-                "policy": str(policy),
-                "space": rollout.space.name,
-                "space_sha256": rollout.space.sha256,
-                **provenance(device, seed),
-            },
-            **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
-            **frames.stacked(),
-        ),
+    return Recording(
+        robot=robot.name,
+        joint_names=robot.joint_names,
+        foot_names=robot.foot_geoms,
+        penalty_names=robot.penalties,
+        geom_names=robot.geom_names,
+        dt=robot.control_dt,
+        labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
+        heights=heights.copy(),  # on the CPU numpy() is a view
+        friction=None if maps is None else maps.friction[: len(terrains)],
+        time_constant_s=None if maps is None else maps.time_constant_s[: len(terrains)],
+        genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
+        seeds=seeds.astype(np.uint32),
+        origin={
+            **identity(robot, str(policy)),
+            "policy": str(policy),
+            "space": rollout.space.name,
+            "space_sha256": rollout.space.sha256,
+            **provenance(rollout.sim.device, seed),
+        },
+        **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
+        **frames.stacked(),
     )

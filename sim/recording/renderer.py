@@ -208,12 +208,9 @@ class Renderer:
         size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit
         if size < _LEAST_FORCE:
             return
-        color = _ALARMED if size > limit else _CALM
         tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
-        self._add_connector(_mj.mjtGeom.mjGEOM_ARROW.value, _ARROW_WIDTH, foot, tip, color)
-
-    def _add_connector(self, kind: int, width: float, begin: Any, end: Any, color: NDArray[np.float32]) -> None:
-        geom = self._scene.geoms[self._scene.ngeom]
+        geom, kind = self._scene.geoms[self._scene.ngeom], _mj.mjtGeom.mjGEOM_ARROW.value
+        color = _ALARMED if size > limit else _CALM
         _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-        _mj.mjv_connector(geom, kind, width, begin, end)
+        _mj.mjv_connector(geom, kind, _ARROW_WIDTH, foot, tip)
         self._scene.ngeom += 1

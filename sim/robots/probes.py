@@ -36,29 +36,16 @@ class Strip:
     """Farthest that a centre lies from the straight line between the first and the last one [m]."""
 
 
-MESH_TOLERANCE = 0.01
-"""Farthest that a point of a hull's surface may lie outside of the nearest probe [m], unless the mesh is small."""
-SMALL_MESH_SHARE = 1.0 / 12.0
-"""For a small mesh the tolerance is this share of its longest side."""
+_MESH_TOLERANCE = 0.01  # farthest that a point of a hull's surface may lie outside of the nearest probe [m]
+_SMALL_MESH_SHARE = 1.0 / 12.0  # of a small mesh's longest side, its tolerance
+_MAX_PROBE_RADIUS = 0.1  # [m]
 MAX_MESH_PROBES = 400
 """Probes of one mesh; one that would need more is covered as closely as these reach."""
-MAX_PROBE_RADIUS = 0.1
-"""Largest probe radius [m]."""
 _WIDE = 0.1  # a wider mesh lies on two rows of probes, left and right [m]
 _SAMPLES_PER_TOLERANCE = 2.0
 _GROWTH = 1.25
 
 _Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class HullProbes:
-    """The probes of one mesh."""
-
-    strips: tuple[Strip, ...]
-    """Rows of probes of one radius, in order along the mesh's longest side; not straight."""
-    tolerance: float
-    """Every point of the hull's surface lies at most this far outside of the nearest probe [m]; no probe sticks out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +111,7 @@ def _cover(hull: _Hull, tolerance: float) -> tuple[_Array, _Array] | None:
     spacing = tolerance / _SAMPLES_PER_TOLERANCE
     samples = _surface_samples(hull.triangles, spacing)
     goal = tolerance - spacing / np.sqrt(3.0)
-    largest = min(hull.inradius(), MAX_PROBE_RADIUS)
+    largest = min(hull.inradius(), _MAX_PROBE_RADIUS)
     radii = largest * 0.5 ** np.arange(max(1.0, np.ceil(np.log2(8.0 * largest / tolerance))))
     squares = (samples * samples).sum(axis=1)
     gap = np.full(len(samples), np.inf)
@@ -167,18 +154,21 @@ def _spread(row: _Array) -> float:
 
 
 @lru_cache(maxsize=64)
-def _probes_of(content: bytes) -> HullProbes:
+def _probes_of(content: bytes) -> tuple[list[Strip], float]:
     vertices = np.frombuffer(content).reshape(-1, 3)
     hull = _hull_of(vertices)
     corners = np.unique(hull.triangles.reshape(-1, 3), axis=0)
-    tolerance = min(MESH_TOLERANCE, SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
+    tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
     while (balls := _cover(hull, tolerance)) is None:
         tolerance *= _GROWTH
-    return HullProbes(strips=tuple(_rows(*balls, corners)), tolerance=tolerance)
+    return _rows(*balls, corners), tolerance
 
 
-def hull_probes(vertices: _Array) -> HullProbes:
-    """Probes of a mesh's convex hull; a mesh collides as its hull, so hollows are filled.
+def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
+    """Probes of a mesh's convex hull, and their tolerance; a mesh collides as its hull, so hollows are filled.
+
+    Rows are of one radius, in order along the mesh's longest side, and not straight. No probe sticks out; every point
+    of the hull's surface lies at most the tolerance outside of the nearest one [m].
 
     Args:
         vertices: Shape (num_vertices, 3) [m].
@@ -188,19 +178,17 @@ def hull_probes(vertices: _Array) -> HullProbes:
 
 MAX_SAG = 0.005
 """Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
-MAX_EDGE_RADIUS = 0.02
-"""Largest probe radius on boxes and cylinders, whose edges the probes round off [m]."""
-MAX_SIDE = 10.0
-"""Longest side of a shape [m]; a longer one is in other units."""
+_MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
+_MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 _MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
 
 
-def max_spacing(radius: float, sag: float = MAX_SAG) -> float:
-    """Largest distance of neighbouring probes between which a sharp ridge sinks at most ``sag`` [m].
+def _max_spacing(radius: float) -> float:
+    """Largest distance of neighbouring probes between which a sharp ridge sinks at most :data:`MAX_SAG` [m].
 
     Two spheres of radius r at distance s leave a dent of depth ``r - sqrt(r^2 - s^2 / 4)`` between them.
     """
-    sag = min(sag, radius)
+    sag = min(MAX_SAG, radius)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
 
 
@@ -217,16 +205,16 @@ def _along_z(x: float, y: float, z: np.ndarray) -> np.ndarray:
 
 def capsule_strips(radius: float, half_height: float) -> list[Strip]:
     """One strip along the axis (z); exact at the caps."""
-    return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, max_spacing(radius))), radius=radius)]
+    return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, _max_spacing(radius))), radius=radius)]
 
 
 def box_strips(half: tuple[float, float, float]) -> list[Strip]:
     """Parallel strips under the whole surface of a box, along its longest side (z of a cube).
 
-    Edges and corners are rounded by at most :data:`MAX_EDGE_RADIUS`; faces are exact at every probe.
+    Edges and corners are rounded by at most 2 cm; faces are exact at every probe.
     """
-    radius = min(MAX_EDGE_RADIUS, *half)
-    spacing = max_spacing(radius)
+    radius = min(_MAX_EDGE_RADIUS, *half)
+    spacing = _max_spacing(radius)
     # Contacts are made of the ends of a strip, so the fewer strips, the fewer contacts of a box that lies.
     order = [*np.argsort(half, kind="stable")]
     across, beside, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
@@ -243,8 +231,8 @@ def box_strips(half: tuple[float, float, float]) -> list[Strip]:
 
 def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
     """Strips along the axis (z) round the mantle, and rings of single probes on the two end faces."""
-    probe = min(MAX_EDGE_RADIUS, radius, half_height)
-    spacing = max_spacing(probe)
+    probe = min(_MAX_EDGE_RADIUS, radius, half_height)
+    spacing = _max_spacing(probe)
     z = _line(-half_height + probe, half_height - probe, spacing)
     strips = []
     for ring, ring_radius in enumerate(_line(0.0, radius - probe, spacing)[::-1]):
@@ -280,15 +268,15 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     if not (np.isfinite(vertices).all() and (sizes > 0.0).all()):
         raise ValueError(f"its sizes must be positive numbers, got {', '.join(f'{size:g}' for size in sizes)} m")
     longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
-    if not longest <= MAX_SIDE:
+    if not longest <= _MAX_SIDE:
         raise ValueError(
-            f"it is {longest:g} m long, at most {MAX_SIDE:g} m are taken: lengths are in metres, and a mesh in "
+            f"it is {longest:g} m long, at most {_MAX_SIDE:g} m are taken: lengths are in metres, and a mesh in "
             "millimetres has a scale"
         )
     if make_strips is not None:
         return make_strips(*map(float, sizes))
     if shape_type in _MESHES:
-        return list(hull_probes(vertices).strips)
+        return hull_probes(vertices)[0]
     raise ValueError(
         f"no probes for a {newton.GeoType(shape_type).name} collision shape: "
         "expected SPHERE, CAPSULE, BOX, CYLINDER or MESH; replace it in the robot's file"

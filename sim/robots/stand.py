@@ -48,8 +48,6 @@ class Standing:
     """Largest distance of a joint from its default angle at the end [rad]."""
     carried: dict[str, float]
     """Share of the weight that each touching geom carries, on average over the last half second."""
-    bounce: tuple[float, float]
-    """Least and most force of a physics step on all feet in that time, in weights."""
     restless: float
     """How much the forces on its feet change from one physics step to the next in that time, in weights."""
     contacts: float
@@ -100,7 +98,6 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
         joint_error=float(np.abs(first[7:] - robot.default_joint_pos).max(initial=0.0)),
         carried={name: float(share) for name, share in carried if share > 1e-3},
-        bounce=(float(on_feet.sum(axis=1).min()), float(on_feet.sum(axis=1).max())),
         restless=float(np.abs(np.diff(on_feet, axis=0)).sum(axis=1).mean()),
         contacts=contacts,
         rows=rows,
@@ -214,7 +211,6 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
                 if name not in robot.geom_names and bottom < bottoms[lowest] + _LOW]  # fmt: skip
     right_height, stray = start_height(robot, builder), 1.0 - sum(standing.carried.values())
     right = f"default_base_height {right_height:.3f} is right, got {first:g}"
-    least, most = standing.bounce
     findings = [
         (gap < -_SUNK, f"its feet start {-gap:.3f} m in the ground: {right}"),
         (first > right_height + _FALL,
@@ -225,8 +221,8 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
         (not standing.finite,
          "states became not finite: gains too high for physics_dt, or too little armature?"),
         (standing.stands and standing.restless > _RESTLESS,
-         f"its feet bounce at rest: the force on them changes from step to step, between {least:.1f} and {most:.1f} "
-         "times its weight: give the joints armature (a rotor's inertia, .01 kg m^2 for a dog of 13 kg), or a longer "
+         f"its feet bounce at rest: the force on them changes by {standing.restless:.0%} of its weight from step to "
+         "step: give the joints armature (a rotor's inertia, .01 kg m^2 for a dog of 13 kg), or a longer "
          "contact_time_constant_s"),
         (standing.overflowed,
          "a buffer of the solver was too small: raise nconmax and njmax above the numbers above"),

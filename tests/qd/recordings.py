@@ -36,7 +36,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frame
     return Recording(
         robot="anymal", joint_names=joints, foot_names=feet, penalty_names=PENALTIES, dt=0.02, labels=("made up",),
         heights=np.random.default_rng(seed).normal(0.0, 0.2, (1, 161, 321)).astype(np.float32), genes=None,
-        seeds=np.array([seed], np.uint32), replicas=np.arange(count, dtype=np.int32),
+        seeds=np.array([seed], np.uint32),
         outcome=np.array([outcomes], np.uint8), invalidity=np.zeros((1, count), np.uint8),
         fallen=np.array([[False] * count if fallen is None else fallen]),
         duration_s=np.full((1, count), 0.02 * (frames - 1), np.float32),

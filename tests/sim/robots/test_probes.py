@@ -81,24 +81,24 @@ MESHES = {
 @pytest.mark.parametrize("name", MESHES)
 def test_mesh(name):
     vertices, most = MESHES[name]
-    probes = hull_probes(vertices)
-    centres, radii = spheres(probes.strips)
-    assert probes.tolerance <= most * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
-    assert probes.tolerance == pytest.approx(most) or name == "base"
+    strips, tolerance = hull_probes(vertices)
+    centres, radii = spheres(strips)
+    assert tolerance <= most * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
+    assert tolerance == pytest.approx(most) or name == "base"
     hull = ConvexHull(vertices)
     faces, edges = (
         trimesh.convex.convex_hull(vertices).sample(6000, seed=1),
         hull.points[hull.simplices[:, [0, 1, 2, 0]]],
     )
     between = np.linspace(edges[:, :3], edges[:, 1:], 9).reshape(-1, 3)
-    gap = uncovered(np.vstack([faces, between]), probes.strips)
-    assert gap.max() <= probes.tolerance
-    assert gap.max() > 0.3 * probes.tolerance, "far more probes than it takes"
+    gap = uncovered(np.vstack([faces, between]), strips)
+    assert gap.max() <= tolerance
+    assert gap.max() > 0.3 * tolerance, "far more probes than it takes"
     sticking_out = centres @ hull.equations[:, :3].T + hull.equations[:, 3] + radii[:, None]
     assert sticking_out.max() < 1e-6
     # The contact kernel bounds a row by its ends, the radius and the spread, and makes three contacts of it at most.
-    assert len(probes.strips) <= 10
-    for strip in probes.strips:
+    assert len(strips) <= 10
+    for strip in strips:
         line = strip.centres[-1] - strip.centres[0]
         if name != "tetrahedron":  # which has no longest side
             longest = np.ptp(vertices, axis=0).argmax()
@@ -111,7 +111,7 @@ def test_mesh(name):
 def test_a_mesh_is_scaled_and_collides_as_its_hull():
     hollow = SimpleNamespace(vertices=np.vstack([CORNERS, CORNERS / 2]))
     strips = shape_strips(newton.GeoType.MESH, np.array([0.2, 0.1, 0.05]), hollow)
-    expected = hull_probes(CORNERS * [0.2, 0.1, 0.05]).strips
+    expected = hull_probes(CORNERS * [0.2, 0.1, 0.05])[0]
     np.testing.assert_array_equal(spheres(strips)[0], spheres(expected)[0])
 
 
