@@ -13,19 +13,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from qd.check import made_ready, walk
-from qd.judge import judge, panel_of
+from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.run.settings import preset
 from qd.search import search
+from qd.show.crossed import title_of, typical_episode
+from qd.show.elites import open_run
+from qd.show.film import Shot, pictures_of
+from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute
+from results.make.pictures import FOLDER
 from results.make.spaces import COUNTS, causes_of
 from sim.device import resolve_device
 from sim.files.atomic import write_atomically
 from sim.files.records import provenance, sources_sha256
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
+from train.cfg import FinetuneCfg, RunCfg
+from train.finetune import train_specialist
 
 CONTROLLERS = {  # source and model below FOLDER, and what is filled in behind the lines of controller and robot
     "go2-robot-lab": ("go2", "go2/model/urdf/go2.urdf", "", ""),
@@ -46,6 +56,12 @@ observation = [
 }
 ITERATIONS = 8
 """Of preset wide: 256,000 episodes."""
+WITH_SPECIALIST = "go2-robot-lab"
+"""Whose network is plain layers, and whose failures a specialist certifies."""
+PICTURES = ("go2-robot-lab", "go1-playground", "g1-unitree")
+"""Of whose worst failure the pages show a still."""
+SIZE = (640, 360)
+"""Of a still, width and height [pixels]."""
 
 
 def fill_in(file: Path, text: str) -> None:
@@ -71,11 +87,24 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     began = time.perf_counter()
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
     wall_s = time.perf_counter() - began
-    stages: Any = ("fresh",) if small else ("fresh", "resolved", *(["others"] if panel_of(robot) else []))
-    archive = judge(run, stages=stages, compute=compute, robot=robot.spec)
+    archive = judge(run, stages=("fresh",) if small else ("fresh", "resolved"), compute=compute, robot=robot.spec)
+    if name == WITH_SPECIALIST and not small:
+        train_specialist(robot, run, FinetuneCfg.specialist(robot), RunCfg(device=compute.device))
+        archive = judge(run, stages=("others",), compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
     counts = {count: summary.get(count) for count in COUNTS}
     return {"flat": walked, "space": cfg.space, **counts, "wall_s": wall_s, "causes": causes_of(archive)}
+
+
+def take_picture(name: str, runs: Path) -> None:
+    """A still of the worst failure that a search found, at its moment: needs no GPU, but a renderer."""
+    opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
+    source = source_of_run(opened)
+    (recording,) = source.record("cpu")
+    shot = Shot(recording=recording, episode=typical_episode(recording, source.scales), title=title_of(recording))
+    moment = shot.end if shot.moment is None else shot.moment
+    (picture,) = pictures_of(shot, source.robot, np.array([moment]), SIZE)
+    Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -85,14 +114,19 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pictures", action="store_true", help="stills of searches that are there, and nothing else")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
     compute = Compute(resolve_device(args.device))
     out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
     runs = out.parent / "public" if args.small else Path("runs/make") / sources_sha256()[:12] / "public"
-    if args.small:
+    if args.small and not args.pictures:
         shutil.rmtree(runs, ignore_errors=True)
+    if args.pictures:
+        for name in set(args.only) & set(PICTURES):
+            take_picture(name, runs)
+        return {}
     content = provenance(compute.device, args.seed) | {"controllers": {}}
     for name in args.only:
         numbers = measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
