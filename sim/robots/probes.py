@@ -350,6 +350,6 @@ def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str
             at = poses_of_bodies[:, :3] + Rotation.from_quat(poses_of_bodies[:, 3:]).apply(points)
             bottom = at[:, 2] - radius
             yield (
-                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names)},
+                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names.tolist())},
                 float((np.linalg.norm(at, axis=1) + radius).max()),
             )
