@@ -4,6 +4,7 @@ Training and figures read archives without the search's libraries.
 """
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,6 @@ class FreshValues(Evaluation):
     reproduced: NDArray[np.bool_]
     """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
 
-    def std(self) -> NDArray[np.float64]:
-        """Sum over penalties of the standard deviation over the episodes, of the valid elites, shape (num_valid,)."""
-        return self.penalty_std[self.valid].sum(axis=1)
-
     def corrected_elites(self) -> NDArray[np.int64]:
         """The archive that fresh episodes alone would make: of each cell that an elite lands in, its fittest.
 
@@ -41,10 +38,6 @@ class FreshValues(Evaluation):
         valid = np.flatnonzero(self.valid & (self.fitness > FITNESS_FLOOR))
         order = valid[np.lexsort((-self.fitness[valid], self.cell[valid]))]
         return order[np.unique(self.cell[order], return_index=True)[1]]
-
-    def rows(self, chosen: NDArray[np.int64]) -> "FreshValues":
-        """Those of some of the elites alone, in the order given."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in FRESH})
 
 
 FRESH = tuple(field.name for field in fields(FreshValues))
@@ -74,10 +67,6 @@ class FaultCounts:
         """Of elites that nobody has crossed yet."""
         none, nobody = np.zeros((num_elites, 4), np.int64), np.zeros((num_elites, 0, 4), np.int64)
         return cls(resolved_outcomes=none, certifier_outcomes=nobody, certifier_resolved_outcomes=nobody)
-
-    def rows(self, chosen: NDArray[np.int64]) -> "FaultCounts":
-        """Those of some of the elites alone, in the order given."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in COUNTS})
 
     def certificates(self) -> NDArray[np.bool_]:
         """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
@@ -141,7 +130,7 @@ class Archive(Evaluation):
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
-        return {name: getattr(self, name) for name in _OF_IDENTITY}
+        return {name: getattr(self, name) for name in ("robot", "robot_sha256", "policy_sha256", "penalty_definition")}
 
     def __len__(self) -> int:
         """Number of elites."""
@@ -175,7 +164,8 @@ class Archive(Evaluation):
     @property
     def failing(self) -> NDArray[np.bool_]:
         """Whether fresh episodes say that the controller fails an elite, shape (N,)."""
-        return np.zeros(len(self), bool) if self.fresh is None else self.fresh.not_crossed
+        fresh = self.fresh
+        return np.zeros(len(self), bool) if fresh is None else fresh.valid & (fresh.goal_rate < FAILING_GOAL_RATE)
 
     @property
     def confirmed(self) -> NDArray[np.bool_]:
@@ -198,18 +188,20 @@ class Archive(Evaluation):
 
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-        fresh = None if self.fresh is None else self.fresh.rows(chosen)
-        faults = None if self.faults is None else self.faults.rows(chosen)
+
+        def of(values: Any, names: Iterable[str]) -> Any:
+            return replace(values, **{name: getattr(values, name)[chosen] for name in names})
+
         known = [name for name in _JUDGED if getattr(self, name) is not None]
-        elites = {name: getattr(self, name)[chosen] for name in (*PER_ELITE, *known)}
-        return replace(self, fresh=fresh, faults=faults, **elites)
+        fresh = None if self.fresh is None else of(self.fresh, FRESH)
+        faults = None if self.faults is None else of(self.faults, COUNTS)
+        return replace(of(self, (*PER_ELITE, *known)), fresh=fresh, faults=faults)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-_OF_IDENTITY = ("robot", "robot_sha256", "policy_sha256", "penalty_definition")
 _JUDGED = ("family", "cause")  # of elites that were judged
 _BESIDE = ("fresh", "faults", *_JUDGED)
 _OPTIONAL = ("policy_sha256", "space_sha256", *_JUDGED)

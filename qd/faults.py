@@ -28,7 +28,7 @@ _INVALID = OUTCOMES.index("invalid")
 
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
     """What fresh episodes say of an archive, as reports have it."""
-    std, corrected = fresh.std(), fresh.corrected_elites()
+    std, corrected = fresh.penalty_std[fresh.valid].sum(axis=1), fresh.corrected_elites()
     return {
         "reevaluated": len(fresh.reproduced),
         "elites_reproduced": int(fresh.reproduced.sum()),

@@ -76,11 +76,6 @@ class Evaluation:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
 
-    @property
-    def not_crossed(self) -> NDArray[np.bool_]:
-        """Whether a terrain is valid and under half of these episodes reach the goal, shape (T,)."""
-        return self.valid & (self.goal_rate < FAILING_GOAL_RATE)
-
 
 def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""

@@ -137,14 +137,10 @@ class Elites:
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
 
-_FROM_FRESH = (
-    "fitness", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate", "end_position",
-)  # fmt: skip
-
-
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
     """The elites of an archive, in its order; ``judged`` leaves out those whose fresh episodes are invalid."""
-    values = {name: np.asarray(getattr(archive, name)) for name in _FROM_FRESH}
+    names = ("fitness", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate", "end_position")
+    values = {name: np.asarray(getattr(archive, name)) for name in names}
     is_fresh = np.zeros(len(archive), bool)
     if (fresh := archive.fresh) is not None:
         is_fresh = fresh.valid

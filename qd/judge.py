@@ -133,11 +133,6 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=space_now)
 
 
-def panel_of(robot: RobotCfg) -> dict[str, str]:
-    """The robot's fixed certifiers by name."""
-    return controllers_in(robot.panel)
-
-
 def controllers_in(folder: Path) -> dict[str, str]:
     """Certifiers of a folder by name: descriptions, ``<name>.toml``, and weights that are not of one, ``<name>.pt``."""
     described = sorted(folder.glob("*.toml"))
@@ -147,7 +142,7 @@ def controllers_in(folder: Path) -> dict[str, str]:
 
 def certifiers_of(search: Search) -> dict[str, str]:
     """Certifiers of a search by name: the robot's panel and the run's own, without the controller that was searched."""
-    certifiers = panel_of(search.robot) | controllers_in(search.run / CERTIFIERS_FOLDER)
+    certifiers = controllers_in(search.robot.panel) | controllers_in(search.run / CERTIFIERS_FOLDER)
     return {name: file for name, file in certifiers.items() if not is_searched(search.cfg, file, search.robot)}
 
 

@@ -104,13 +104,8 @@ class Training:
     """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
 
     The graph holds the memory of weights and moments. So networks that are moved need a new training, which captures
-    anew.
-
-    Args:
-        networks: What is trained, on the device.
-        loss: Loss of what the networks say and what they should, of shape (batch, MEMBERS, num_out) both.
-        device: Torch device.
-        moments: What Adam remembers from before, of each tensor of weights.
+    anew. ``loss`` is of what the networks say and what they should, both of shape (batch, MEMBERS, num_out).
+    ``moments`` are what Adam remembers from before, of each tensor of weights.
     """
 
     def __init__(

@@ -146,11 +146,6 @@ class Scheduler:
         )
         return iter(np.split(genes, np.cumsum(sizes)[:-1]))
 
-    def compute_on(self, device: str) -> None:
-        """Lets a surrogate work on a Warp device; all else works on the host."""
-        if self.surrogate is not None:
-            self.surrogate.compute_on(device)
-
     def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
         """Tells a group of emitters what became of the terrains that it last asked for, one row each in that order.
 

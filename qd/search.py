@@ -67,7 +67,8 @@ def search(
             scheduler, metrics = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
         else:
             scheduler, metrics = saved
-        scheduler.compute_on(compute.device)
+        if scheduler.surrogate is not None:
+            scheduler.surrogate.compute_on(compute.device)
         done = len(metrics)
         say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
         if note := scaled_by_another(robot, policy):

@@ -99,15 +99,10 @@ class TerrainBank:
 
 
 def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
-    """Height grids [m] of genes as a simulation has them, on the host.
+    """Height grids [m] of genes, shape (num_terrains, num_genes), as a simulation has them, on the host.
 
-    Args:
-        genes: Shape (num_terrains, num_genes), at least one terrain.
-        space: What the genes mean.
-        every: Only every so many nodes of rows and columns, from the first: a divisor of the cells of both.
-
-    Returns:
-        Float32, shape (num_terrains, NUM_ROWS, NUM_COLS), or fewer rows and columns.
+    Float32, shape (num_terrains, NUM_ROWS, NUM_COLS); of rows and columns only ``every`` so many from the first on, a
+    divisor of the cells of both.
     """
     if every == 1 or not space.any_spacing:
         return terrains_of(genes, space)[0][:, ::every, ::every]

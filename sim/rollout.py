@@ -76,30 +76,8 @@ class RolloutResult:
         return 1.0 - self.busy_steps / self.robot_steps if self.robot_steps else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class RolloutState:
-    """Device arrays (Warp) of a rollout between two control steps, not copied; one row an environment."""
-
-    joint_q: Any
-    """Joint coordinates, shape (num_envs, 7 + num_joints)."""
-    geom_force: Any
-    """Contact force on each geom of ``robot.geom_names`` in the last physics step, world frame [N], vectors of shape
-    (num_envs, num_geoms)."""
-    penalty_sums: Any
-    """Columns :data:`kernels.penalties.PENALTIES`, times the physics step, shape (num_envs, 6)."""
-    command: Any
-    """Command of the coming control step, zero once an episode has ended, shape (num_envs, 3)."""
-    episode: Any
-    """The episode that a robot runs: replica ``episode % num_replicas`` of terrain slot ``episode // num_replicas``, -1
-    for none; shape (num_envs,)."""
-    outcome: Any
-    """:class:`kernels.episode.Outcome`, shape (num_envs,)."""
-    steps: Any
-    """Physics steps up to the end, shape (num_envs,)."""
-
-
 class Watcher(Protocol):
-    """Looks at :attr:`Rollout.state` around every control step (:mod:`sim.recording.recorder`)."""
+    """Looks at a :class:`Rollout`'s arrays around every control step (:mod:`sim.recording.recorder`)."""
 
     def before_step(self) -> None:
         """Called before a control step: a robot that has just taken an episode stands at its start."""
@@ -132,6 +110,14 @@ class Rollout:
 
     An episode depends on its terrain, the terrain's seed and its replica alone, whichever robot runs it beside whatever
     others; on the CPU bit for bit, if its controller gives a row the same action in any batch.
+
+    Attributes:
+        sim: The robots' simulation.
+        penalty_sums: Columns :data:`kernels.penalties.PENALTIES`, times the physics step, shape (num_envs, 6).
+        command: Command of the coming control step, zero once an episode has ended, shape (num_envs, 3).
+        episode: The episode that a robot runs: replica ``episode % num_replicas`` of terrain slot
+            ``episode // num_replicas``, -1 for none; shape (num_envs,).
+        outcome: :class:`kernels.episode.Outcome` of it, shape (num_envs,).
     """
 
     def __init__(
@@ -206,17 +192,18 @@ class Rollout:
     def _allocate(self) -> None:
         num_envs, robot, sim = self.num_envs, self.robot, self.sim
         self._ranges = make_start_ranges(self.cfg, robot)
-        self._command = wp.zeros((num_envs, 3), dtype=float)
+        self.command = wp.zeros((num_envs, 3), dtype=float)
         self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
         self._last_action = wp.zeros_like(self._action)
         self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
         self._counter = wp.zeros(1, dtype=int)
-        self._sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
+        self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._queue = make_queue(
             num_envs, self.num_terrains, self.num_replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
         )
         self._task = make_task(self.cfg, robot)
         self._episode = self._stepped = make_episodes(num_envs)
+        self.episode, self.outcome = self._queue.episode_of_env, self._episode.outcome
         self._latches = [(self._task, self._episode)]
         self._reward = None
         if self.cfg.reward:
@@ -224,7 +211,7 @@ class Rollout:
 
             # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
-            io = {"command": self._command, "action": self._last_action}
+            io = {"command": self.command, "action": self._last_action}
             self._reward = Reward(sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
             self._stepped = make_episodes(num_envs)
             self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
@@ -243,15 +230,17 @@ class Rollout:
                     sim.contact_count, sim.contact_capacity, task, episode,
                 )  # fmt: skip
             add_penalties(
-                sim.joint_q, sim.joint_qd, sim.sensors.base_com, self._command, sim.geom_force, sim.geom_role,
-                robot.contact_force_limit, robot.physics_dt, self._episode.counted, self._sums,
+                sim.joint_q, sim.joint_qd, sim.sensors.base_com, self.command, sim.geom_force, sim.geom_role,
+                robot.contact_force_limit, robot.physics_dt, self._episode.counted, self.penalty_sums,
             )  # fmt: skip
         if self._reward is not None:
             self._reward.pay(self._stepped.outcome)
 
     def _launch_turn_over(self) -> None:
         sim, begins = self.sim, self._queue.begins
-        turn_over(self._stepped.outcome, self._rewards, self._episode, self._sums, sim.terrain_of_env, self._queue)
+        turn_over(
+            self._stepped.outcome, self._rewards, self._episode, self.penalty_sums, sim.terrain_of_env, self._queue
+        )
         restart_episodes(
             begins, sim.terrain_of_env, sim.bank.terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
             self._last_action, self._episode, self._rewards,
@@ -260,19 +249,10 @@ class Rollout:
             begin_episodes(begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         sim.clear_solver(begins)
-        command_goal(sim.joint_q, self._episode.outcome, self._task, self._command)
+        command_goal(sim.joint_q, self._episode.outcome, self._task, self.command)
         write_observation(
-            sim.joint_q, sim.joint_qd, self._command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
+            sim.joint_q, sim.joint_qd, self.command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
             sim.sensors, Noise(), self._counter, self._observation,
-        )  # fmt: skip
-
-    @property
-    def state(self) -> RolloutState:
-        """The rollout's present state, on the device."""
-        sim, episode = self.sim, self._episode
-        return RolloutState(
-            joint_q=sim.joint_q, geom_force=sim.geom_force, penalty_sums=self._sums, command=self._command,
-            episode=self._queue.episode_of_env, outcome=episode.outcome, steps=episode.steps,
         )  # fmt: skip
 
     @property
@@ -291,13 +271,9 @@ class Rollout:
     ) -> RolloutResult:
         """Run one crossing of every replica on every terrain; nothing else may be under way.
 
-        Args:
-            terrains: Genes, shape (count, num_genes), or heights [m], shape (count, nrow, ncol); at most
-                ``num_terrains`` of them.
-            seeds: One seed a terrain, shape (count,), uint32.
-            ground: Friction and softness of terrains that are given by heights.
-            watcher: Looks on.
-            progress: Called now and then with the share that is done.
+        Terrains, at most ``num_terrains`` of them, are genes, shape (count, num_genes), or heights [m], shape (count,
+        nrow, ncol), with ``ground`` where they have friction or softness. Each has a seed, uint32 of shape (count,).
+        ``progress`` is called now and then with the share that is done.
         """
         self.clear()
         try:

@@ -78,10 +78,7 @@ def solve_contacts(m: Any, d: Any) -> None:
 
 
 def _solve(m: Any, d: Any) -> None:
-    if fits(m, d):
-        solve_contacts(m, d)
-    else:
-        solve_theirs(m, d)
+    (solve_contacts if fits(m, d) else solve_theirs)(m, d)
 
 
 def use_own_solver(wanted: bool = True) -> None:

@@ -12,7 +12,7 @@ from qd.causes import UNCLEAR
 from qd.faults import certifier_of
 from qd.fitness import FitnessCfg
 from qd.groups import rank
-from qd.judge import CERTIFIERS_FOLDER, controllers_in, panel_of
+from qd.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy
@@ -107,7 +107,7 @@ class OpenedRun:
             return {}
         names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
         own = [*controllers_in(folder / CERTIFIERS_FOLDER).values(), str(folder.parent / f"{folder.name}.pt")]
-        files = [*panel_of(self.robot).values(), *own]
+        files = [*controllers_in(self.robot.panel).values(), *own]
         return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
 
     def certifier(self, number: int) -> str | None:

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kernels.episode import Outcome
 from qd.groups import way_to_end
-from qd.judge import panel_of
+from qd.judge import controllers_in
 from qd.run.progress import share_bar
 from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode
 from qd.show.replay import Source, save
@@ -285,7 +285,7 @@ def film_source(
     open_context(64, 64).free()
     others: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
-        others_known = panel_of(robot) | (run.certifiers() if run else {})
+        others_known = controllers_in(robot.panel) | (run.certifiers() if run else {})
         policy = others_known.get(beside, spec_of(beside, robot))
         try:
             check_policy(policy, robot, device)

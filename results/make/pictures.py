@@ -9,7 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from qd.judge import panel_of
+from qd.judge import controllers_in
 from qd.show.crossed import title_of, typical_episode
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import save, source_of_map
@@ -25,7 +25,7 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     robot = get_robot(named)
     source = source_of_map(FOLDER / file, robot)
     (recording,) = source.record("cpu")
-    other = (beside, source.record("cpu", panel_of(robot)[beside])[0]) if beside else None
+    other = (beside, source.record("cpu", controllers_in(robot.panel)[beside])[0]) if beside else None
     episode, title = typical_episode(recording, source.scales), title_of(replace(recording, labels=(words,)))
     shot = Shot(recording=recording, episode=episode, title=title, beside=other)
     return [*pictures_of(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]

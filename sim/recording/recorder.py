@@ -147,13 +147,12 @@ class _Frames:
 
     def before_step(self) -> None:
         """Add the present state of every robot on its way as a frame."""
-        outcome = self._rollout.state.outcome.numpy()
+        outcome = self._rollout.outcome.numpy()
         self._add(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
 
     def after_step(self) -> None:
         """Add the last frame of every episode that ended; where a step broke the state, there is none."""
-        state = self._rollout.state
-        outcome, episode = state.outcome.numpy(), state.episode.numpy()
+        outcome, episode = self._rollout.outcome.numpy(), self._rollout.episode.numpy()
         ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
         ended = ended[~self._ended[episode[ended]]]
         self._ended[episode[ended]] = True
@@ -162,26 +161,26 @@ class _Frames:
     def _add(self, envs: NDArray[Any], *, ended: bool) -> None:
         if len(envs) == 0:
             return
-        state = self._rollout.state
-        row = state.episode.numpy()[envs]
+        rollout = self._rollout
+        row = rollout.episode.numpy()[envs]
         frame = self._num_frames[row]
-        joint_q = state.joint_q.numpy()[envs]
-        force = state.geom_force.numpy()[envs]
+        joint_q = rollout.sim.joint_q.numpy()[envs]
+        force = rollout.sim.geom_force.numpy()[envs]
         force[frame == 0] = 0.0  # at the start there was no step yet, and what is there is of another episode
-        command = state.command.numpy()[envs]
+        command = rollout.command.numpy()[envs]
         values = {
             "base_position": joint_q[:, :3],
             "base_quaternion": joint_q[:, [6, 3, 4, 5]],
             "joint_position": joint_q[:, 7:],
             "foot_force": np.clip(force[:, self._feet], -_MAX_FORCE, _MAX_FORCE),
-            "penalties": state.penalty_sums.numpy()[envs][:, self._columns],
+            "penalties": rollout.penalty_sums.numpy()[envs][:, self._columns],
             "command": np.zeros_like(command) if ended else command,
         }
         with np.errstate(over="ignore", invalid="ignore"):  # of an episode that broke
             rounded = {name: values[name].astype(dtype) for name, dtype in FRAME_ARRAYS.items()}
             rounded["touching"] = np.linalg.norm(force, axis=-1) > COLLISION_FORCE
         if ended:  # the base may have touched in an earlier physics step of the last control step
-            hit = state.outcome.numpy()[envs] == Outcome.BASE_COLLISION
+            hit = rollout.outcome.numpy()[envs] == Outcome.BASE_COLLISION
             missed = hit & ~rounded["touching"][:, : self._num_base].any(axis=1)
             rounded["touching"][missed, : self._num_base] = True
         self._frames.append((row, frame, rounded))

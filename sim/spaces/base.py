@@ -61,12 +61,9 @@ class TerrainSpace(Protocol):
         return ()
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
-        """Turns genes into heights on the device.
+        """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
 
-        Args:
-            genes: Warp array of floats, shape (num_terrains, num_genes); clipped to [-1, 1].
-            spacing: Distance of neighbouring nodes [m].
-            heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+        Heights [m] have shape (num_terrains, nrow, ncol), row along y, column along x, at nodes ``spacing`` [m] apart.
         """
         ...
 

@@ -28,8 +28,8 @@ class Robots:
     """Opened like the real evaluator.
 
     ``rule(cfg, genes, seeds)`` says of each terrain whether all robots collide, or gives a result. ``opened`` notes the
-    settings of each simulation, ``crossed`` (cfg, seed) of each terrain. After ``stop_after`` terrains it is as
-    if somebody pressed Ctrl-C.
+    settings of each simulation, the last of which is ``pipeline``, ``crossed`` (cfg, seed) of each terrain. After
+    ``stop_after`` terrains it is as if somebody pressed Ctrl-C.
     """
 
     def __init__(
@@ -56,4 +56,5 @@ class Robots:
                 result = stand_in.make_result(np.ones((*collided.shape, 6)), base_collision=collided)
             return replace(result, reward=np.full(result.outcome.shape, 9.0)) if cfg.reward else result
 
-        yield stand_in.Stub(evaluate)
+        self.pipeline = stand_in.Stub(evaluate)
+        yield self.pipeline

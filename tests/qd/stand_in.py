@@ -74,10 +74,11 @@ class Stub(Pipeline):
 
     def __init__(self, evaluate) -> None:
         super().__init__(num_terrains=1_000_000)
-        self.evaluate, self.lots = evaluate, []
+        self.evaluate, self.lots, self.most_lots = evaluate, [], 0
 
     def put(self, terrains, seeds):
         self.lots.append((terrains, seeds))
+        self.most_lots = max(self.most_lots, len(self.lots))
 
     def take(self, progress=None):
         return self.evaluate(*self.lots.pop(0))

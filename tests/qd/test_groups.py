@@ -6,40 +6,11 @@ import numpy as np
 
 from kernels.super_gaussian import LOWER, UPPER
 from qd.archive import FaultCounts
-from qd.groups import (
-    KIN_M,
-    ORDERS,
-    elites_of,
-    families_of,
-    rank,
-    summary_of,
-)
+from qd.groups import KIN_M, ORDERS, elites_of, families_of, rank, summary_of
 from qd.minimise import MinimalTerrains
 from sim.bank import heights_of
-from sim.files.records import robot_digest
-from sim.robots.find import get_robot
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
-
-
-def grouped_archive(sizes=(6, 9, 5)):
-    """Elites of three kinds, far apart: stuck with the first penalty, collided with the second, across with both."""
-    centres = np.array([[0.9, 0.1, 0.0, 0.0], [0.1, 0.9, 0.0, 1.0], [0.5, 0.5, 1.0, 0.0]])
-    kinds = np.repeat(np.arange(3), sizes)
-    noise = np.random.default_rng(0).uniform(-0.01, 0.01, len(kinds))
-    values = centres[kinds]
-    archive = small_archive(len(kinds))
-    archive = dataclasses.replace(
-        archive,
-        robot_sha256=robot_digest(get_robot("anymal")),
-        ratios=np.column_stack([values[:, 0] + noise, values[:, 1] - noise]),
-        goal_rate=values[:, 2],
-        collision_rate=values[:, 3],
-        fallen_rate=np.zeros(len(kinds)),
-        fitness=np.linspace(9.0, 1.0, len(kinds)),
-        cell=np.arange(len(kinds)) % archive.cells.num_cells,
-    )
-    return archive, kinds
 
 
 def bump(*, x, sigma_x, height, y=4.0):
@@ -156,12 +127,13 @@ def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_th
 
 
 def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families():
-    archive, _ = grouped_archive()  # 6 stuck, 9 collided, 5 across
+    archive = small_archive(20)  # 6 stuck, 9 collided, 5 across
     genes = archive.genes.copy()
     genes[7] = genes[0] = genes[6]  # two collided and one stuck are the same terrain
-    goal_rate = archive.goal_rate.copy()
-    goal_rate[8:15], goal_rate[0:6] = 0.05, np.linspace(0.01, 0.06, 6)
-    archive = dataclasses.replace(archive, genes=genes, goal_rate=goal_rate)
+    archive = dataclasses.replace(
+        archive, genes=genes, goal_rate=np.array([*np.linspace(0.01, 0.06, 6), 0.0, 0.0, *[0.05] * 7, *[1.0] * 5]),
+        collision_rate=np.repeat([0.0, 1.0, 0.0], (6, 9, 5)), fallen_rate=np.zeros(20),
+    )  # fmt: skip
     ranking = rank(archive, SUPER_GAUSSIAN, minima_of({n: "drop" if n < 6 else "ridge" for n in range(15)}))
     order = ranking.order()
     assert sorted(order.tolist()) == list(range(20))

@@ -3,13 +3,11 @@
 import dataclasses
 import json
 import os
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.workers.evaluator import EvaluatorError
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from tests.builders import fresh_values
@@ -71,45 +69,20 @@ def in_groups(path, groups, *, opener=stand_in.open_stand_in, iterations=5):
     return run(path, scheduler=scheduler, iterations=iterations, opener=opener)
 
 
-class Lost(stand_in.Stub):
-    """The stand-in, which is lost when so many lots were taken."""
-
-    def __init__(self, left):
-        super().__init__(stand_in.evaluate)
-        self.left, self.most = left, 0
-
-    def put(self, terrains, seeds):
-        super().put(terrains, seeds)
-        self.most = max(self.most, len(self.lots))
-
-    def take(self, progress=None):
-        self.left -= 1
-        if self.left < 0:
-            raise EvaluatorError("a worker process died")
-        return super().take()
-
-    def clear(self):
-        assert not self.lots  # whatever is crossed anew finds nothing under way
-
-    @contextmanager
-    def opened(self, cfg):
-        yield self
-
-
-def test_a_search_in_groups_that_is_lost_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
+def test_a_search_in_groups_that_is_stopped_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
     """Five emitters make groups of one, two and two, which are put in ahead."""
-    pipeline = Lost(99)
-    whole = in_groups(tmp_path / "whole", 3, opener=pipeline.opened)
-    assert pipeline.most == 3 and not pipeline.lots
+    robots = Robots()
+    whole = in_groups(tmp_path / "whole", 3, opener=robots)
+    assert robots.pipeline.most_lots == 3 and not robots.pipeline.lots
     assert whole.iterations == 5 and len(whole) > 10
     expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
-    # Lost within the second iteration, at its end, and within the third, of five.
-    for lots in (4, 6, 8):
-        path = tmp_path / f"lost-{lots}"
-        with pytest.raises(EvaluatorError):
-            in_groups(path, 3, opener=Lost(lots).opened)
+    # Stopped within the second iteration, at its end, and within the third, of five, each of 3 + 6 + 6 terrains.
+    for count in (18, 30, 39):
+        path = tmp_path / f"stopped-{count}"
+        with pytest.raises(Interrupted):
+            in_groups(path, 3, opener=Robots(stop_after=count))
         in_groups(path, 3)
-        assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, lots
+        assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, count
 
 
 def never(cfg):

@@ -65,7 +65,7 @@ def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker,
 
     def break_one(share):
         step = round(30 * share)  # of 0.6 s
-        q, episode = np.array(rollout.sim.joint_q.numpy()), rollout.state.episode.numpy()
+        q, episode = np.array(rollout.sim.joint_q.numpy()), rollout.episode.numpy()
         if step == 10:
             q[episode == 0, 8] = np.nan  # still on its way
             q[episode == 2, :2] = 14.0, 4.0  # at the goal from now on

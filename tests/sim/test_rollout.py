@@ -83,7 +83,7 @@ def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
     tilt = np.deg2rad([0.0, 58.0, 62.0, 180.0])
 
     def turn(share):
-        q, own = positions(flyer.sim), tilt[flyer.state.episode.numpy()]  # of each robot's episode
+        q, own = positions(flyer.sim), tilt[flyer.episode.numpy()]  # of each robot's episode
         q[:, 2], q[:, 3:7] = 5.0, 0.0
         q[:, 3], q[:, 6] = np.sin(own / 2), np.cos(own / 2)
         put(flyer.sim, q)
@@ -97,7 +97,7 @@ def test_robots_that_are_done_wait_above_the_ground(anymal, device):
     # One starts at the goal, the other walks on: the first is over at once and touches nothing from then on.
     rollout = crossing(anymal, device, replicas=2, num_terrains=2, start=(2.0, 4.0), goal_radius=0.5)
     rollout.put(np.stack([FLAT, FLAT]), np.arange(2))
-    q, first = positions(rollout.sim), rollout.state.episode.numpy() == 0
+    q, first = positions(rollout.sim), rollout.episode.numpy() == 0
     q[first, :2] = 14.0, 4.0
     put(rollout.sim, q)
     for _ in range(25):
@@ -117,7 +117,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout):
 
     def break_one(share):
         values = np.array(rollout.sim.joint_qd.numpy())
-        values[rollout.state.episode.numpy() == 6, 8] = 3000.0  # terrain 1, replica 2
+        values[rollout.episode.numpy() == 6, 8] = 3000.0  # terrain 1, replica 2
         rollout.sim.joint_qd.assign(values)
 
     result = rollout.evaluate(grids, seeds, progress=break_one)
@@ -150,7 +150,7 @@ def test_penalties_equal_a_replay_on_the_host(robot, device):
     def record(observation):
         if not starts:
             starts.append((positions(sim), velocities(sim)))
-            robots.extend(np.argsort(recorder.state.episode.numpy()))  # on a GPU they take episodes in any order
+            robots.extend(np.argsort(recorder.episode.numpy()))  # on a GPU they take episodes in any order
         action = stretch(observation)
         rows.append(np.array(observation.cpu().numpy(), dtype=np.float64))
         actions.append(np.array(action.cpu().numpy(), dtype=np.float32))

@@ -47,7 +47,7 @@ def test_recorded_episodes_are_those_of_an_evaluation(rollout, recording):
 
 def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
     rollout.put(np.stack([spike(), SLOPE]), SEEDS)
-    robots = np.argsort(rollout.state.episode.numpy())  # on a GPU they take episodes in any order
+    robots = np.argsort(rollout.episode.numpy())  # on a GPU they take episodes in any order
     start = np.array(rollout.sim.joint_q.numpy())[robots].reshape(2, 4, -1)
     np.testing.assert_array_equal(recording.base_position[:, :, 0], start[..., :3])
     np.testing.assert_array_equal(recording.base_quaternion[:, :, 0], start[..., [6, 3, 4, 5]])
@@ -86,7 +86,7 @@ def test_geoms_that_touch_are_those_that_are_pushed(recording, anymal):
 def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
     def break_joint(share):
         values = np.array(rollout.sim.joint_q.numpy())
-        values[rollout.state.episode.numpy() == 6, 8] = np.nan  # terrain 1, replica 2
+        values[rollout.episode.numpy() == 6, 8] = np.nan  # terrain 1, replica 2
         rollout.sim.joint_q.assign(values)
 
     terrains = np.stack([FLAT, FLAT])
