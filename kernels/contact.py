@@ -124,12 +124,7 @@ def _collide_strips_kernel(
     if first < 0:
         return
     shape = layout.first_shape + env * layout.shapes_per_env + probes.strip_shape[strip]
-    wanted = int(1)
-    if first != deepest:
-        wanted += 1
-    if last != deepest:
-        wanted += 1
-    slot = wp.atomic_add(contacts_out.count, 0, wanted)
+    slot = wp.atomic_add(contacts_out.count, 0, 1 + int(first != deepest) + int(last != deepest))
     ground = layout.ground_shape
     _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[deepest], radius)
     if first != deepest:

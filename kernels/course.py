@@ -133,9 +133,7 @@ def _decode(gene: float, low: float, high: float, whole: float) -> float:
 @wp.func
 def _sign(turn: float) -> float:
     """1 for up (or left), -1 for down."""
-    if turn >= 0.0:
-        return 1.0
-    return -1.0
+    return wp.where(turn >= 0.0, 1.0, -1.0)
 
 
 @wp.func

@@ -11,6 +11,7 @@ from kernels.state import (
     base_rotation,
     base_yaw,
     is_too_fast,
+    make_zeros,
     projected_gravity,
     row_is_finite,
     wrap_angle,
@@ -75,7 +76,7 @@ class Task:
 
 @wp.struct
 class Episodes:
-    """Progress of each environment's episode, shape (num_envs,) unless said otherwise."""
+    """Progress of each environment's episode, shape (num_envs,)."""
 
     outcome: wp.array[int]
     """:class:`Outcome`, 0 while it runs."""
@@ -97,14 +98,8 @@ class Episodes:
 
 def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
     """Allocate episodes of which none runs."""
-    episodes = Episodes()
-    for name in ("outcome", "invalidity", "steps", "counted"):
-        setattr(episodes, name, wp.zeros(num_envs, dtype=int, device=device))
+    episodes = make_zeros(Episodes, device, **dict.fromkeys(Episodes.vars, num_envs))
     episodes.outcome.fill_(int(Outcome.TIME_OUT))
-    episodes.base_force = wp.zeros(num_envs, dtype=float, device=device)
-    episodes.start = wp.zeros(num_envs, dtype=wp.vec2, device=device)
-    episodes.final_pose = wp.zeros(num_envs, dtype=wp.transform, device=device)
-    episodes.rng = wp.zeros(num_envs, dtype=wp.uint32, device=device)
     return episodes
 
 
@@ -141,19 +136,6 @@ def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
         task.speed * wp.sin(error),
         wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate),
     )
-
-
-@wp.func
-def is_at_goal(position: wp.vec3, task: Task) -> bool:
-    """Whether a base there, world-local [m], has reached the goal."""
-    return wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius
-
-
-@wp.func
-def is_out(position: wp.vec3, task: Task) -> bool:
-    """Whether a base there, world-local [m], has left the world."""
-    beside = position[1] < task.lower[1] or position[1] > task.upper[1]
-    return beside or position[0] < task.lower[0] or position[0] > task.upper[0]
 
 
 @wp.kernel
@@ -204,9 +186,10 @@ def judge_state(
     if projected_gravity(joint_q, env)[2] > task.max_gravity_z:
         return int(Outcome.TILT)
     position = base_position(joint_q, env)
-    if is_at_goal(position, task):
+    if wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius:
         return int(Outcome.GOAL)
-    if is_out(position, task):
+    beside = position[1] < task.lower[1] or position[1] > task.upper[1]
+    if beside or position[0] < task.lower[0] or position[0] > task.upper[0]:
         return int(Outcome.OUT)
     if steps >= task.max_steps:
         return int(Outcome.TIME_OUT)

@@ -173,14 +173,8 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
     point = SurfacePoint()
     point.normal = wp.vec3(0.0, 0.0, 1.0)
     point.distance = _FAR
-    if searched:
-        point = _sign_distance(terrain, t, p, reach, nearest)
-    return point
-
-
-@wp.func
-def _sign_distance(terrain: Terrain, t: int, p: wp.vec3, reach: float, nearest: wp.vec3) -> SurfacePoint:
-    point = SurfacePoint()
+    if not searched:
+        return point
     distance = wp.length(p - nearest)
     point.distance = distance
     height = height_at(terrain, t, p[0], p[1])

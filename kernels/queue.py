@@ -13,6 +13,7 @@ import warp as wp
 
 from kernels.episode import Episodes, Outcome
 from kernels.rewards import Rewards
+from kernels.state import make_zeros
 
 _TAKEN = wp.constant(0)
 _READY = wp.constant(1)
@@ -55,23 +56,13 @@ def make_queue(
 ) -> EpisodeQueue:
     """Allocate an empty queue for ``num_slots`` terrains at once; ``rewarded`` queues keep rewards too."""
     rows = num_slots * num_replicas
-    queue = EpisodeQueue()
+    shapes = {"counts": 2, "penalty_sums": (rows, num_penalties), "reward": rows if rewarded else 0}
+    shapes |= dict.fromkeys(("seed", "num_ended"), num_slots)
+    shapes |= dict.fromkeys(("episode_of_env", "begins", "busy"), num_envs)
+    shapes |= dict.fromkeys(("outcome", "invalidity", "steps", "final_pose"), rows)
+    queue = make_zeros(EpisodeQueue, device, **shapes)
     queue.num_replicas = num_replicas
-    queue.counts = wp.zeros(2, dtype=int, device=device)
-    queue.seed = wp.zeros(num_slots, dtype=wp.uint32, device=device)
-    queue.num_ended = wp.zeros(num_slots, dtype=int, device=device)
-    queue.episode_of_env = wp.full(num_envs, -1, dtype=int, device=device)
-    for name, size in {
-        "begins": num_envs,
-        "busy": num_envs,
-        "outcome": rows,
-        "invalidity": rows,
-        "steps": rows,
-    }.items():
-        setattr(queue, name, wp.zeros(size, dtype=int, device=device))
-    queue.final_pose = wp.zeros(rows, dtype=wp.transform, device=device)
-    queue.penalty_sums = wp.zeros((rows, num_penalties), dtype=float, device=device)
-    queue.reward = wp.zeros(rows if rewarded else 0, dtype=float, device=device)
+    queue.episode_of_env.fill_(-1)
     return queue
 
 

@@ -12,7 +12,7 @@ import warp as wp
 
 from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, FOOT, LIMB, excess_contact_force, is_stumbling
-from kernels.state import base_ang_vel_b, base_lin_vel_b, projected_gravity
+from kernels.state import base_ang_vel_b, base_lin_vel_b, make_zeros, projected_gravity
 
 TRACKING_VARIANCE = wp.constant(0.25)
 TOUCH_FORCE = wp.constant(1.0)
@@ -284,14 +284,10 @@ def make_weights(weights: dict[str, float], *, only_positive: bool, falls: Colle
 
 def make_rewards(num_envs: int, num_joints: int, num_geoms: int, device: str | None = None) -> Rewards:
     """Allocate the rewards of episodes that have not begun."""
-    rewards = Rewards()
-    rewards.running = wp.ones(num_envs, dtype=int, device=device)
-    rewards.step = wp.zeros(num_envs, dtype=float, device=device)
-    rewards.total = wp.zeros(num_envs, dtype=float, device=device)
-    rewards.touched = wp.zeros((num_envs, num_geoms), dtype=int, device=device)
-    widths = {"terms": len(REWARDS), "air_time": num_geoms, "previous_action": num_joints}
-    for name, width in {**widths, "previous_joint_vel": num_joints}.items():
-        setattr(rewards, name, wp.zeros((num_envs, width), dtype=float, device=device))
+    shapes = dict.fromkeys(("running", "step", "total"), num_envs) | {"terms": (num_envs, len(REWARDS))}
+    shapes |= dict.fromkeys(("previous_action", "previous_joint_vel"), (num_envs, num_joints))
+    rewards = make_zeros(Rewards, device, **shapes | dict.fromkeys(("air_time", "touched"), (num_envs, num_geoms)))
+    rewards.running.fill_(1)
     return rewards
 
 

@@ -4,7 +4,17 @@ Row layout of ``joint_q``: base position (3), base quaternion xyzw (4), joints; 
 centre of mass (3) and angular velocity (3), both in the world frame, joints.
 """
 
+from typing import Any
+
 import warp as wp
+
+
+def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...]) -> Any:
+    """A kernel argument whose arrays have these shapes, with zeros of the types that its struct names."""
+    made = struct()
+    for name, shape in shapes.items():
+        setattr(made, name, wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device))
+    return made
 
 
 @wp.func

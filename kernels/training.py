@@ -10,23 +10,14 @@ import warp as wp
 
 from kernels.episode import Episodes, Outcome, Task, goal_command
 from kernels.rewards import Rewards
-from kernels.state import base_ang_vel_b, base_lin_vel_b, base_yaw, wrap_angle
+from kernels.state import base_ang_vel_b, base_lin_vel_b, base_yaw, make_zeros, wrap_angle
 
 STATISTICS = (
     "steps", "episodes", *(outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING), "overflow",
     "episode_steps", "episode_reward", "lin_vel_error", "yaw_rate_error",
 )  # fmt: skip
 """Columns of the sums that training progress is read from; the outcomes count episodes."""
-
-# Columns of STATISTICS as a kernel needs them.
-_STEPS = wp.constant(STATISTICS.index("steps"))
-_EPISODES = wp.constant(STATISTICS.index("episodes"))
-_OUTCOMES = wp.constant(STATISTICS.index("goal") - int(Outcome.GOAL))
-_OVERFLOW = wp.constant(STATISTICS.index("overflow"))
-_EPISODE_STEPS = wp.constant(STATISTICS.index("episode_steps"))
-_EPISODE_REWARD = wp.constant(STATISTICS.index("episode_reward"))
-_LIN_VEL_ERROR = wp.constant(STATISTICS.index("lin_vel_error"))
-_YAW_RATE_ERROR = wp.constant(STATISTICS.index("yaw_rate_error"))
+_COLUMN = {name: column for column, name in enumerate(STATISTICS)}
 
 _STREAM_LEVEL = wp.constant(0)
 _STREAM_START = wp.constant(1)
@@ -92,15 +83,13 @@ def make_training(
 ) -> Training:
     """Allocate what training keeps, zero but for terrain columns and levels, (num_envs,), and the first count."""
     num_envs = len(columns)
-    training = Training()
+    widths = {"command": 3, "observation": observation_size, "statistics": len(STATISTICS)}
+    widths |= {"action": num_joints, "last_action": num_joints}
+    shapes = {name: (num_envs, width) for name, width in widths.items()}
+    training = make_zeros(Training, device, ended=num_envs, heading=num_envs, **shapes)
     training.counter = wp.array([first_count], dtype=int, device=device)
     training.column = wp.array(columns, dtype=int, device=device)
     training.level = wp.array(levels, dtype=int, device=device)
-    training.ended = wp.zeros(num_envs, dtype=int, device=device)
-    training.heading = wp.zeros(num_envs, dtype=float, device=device)
-    widths = {"command": 3, "observation": observation_size, "statistics": len(STATISTICS)}
-    for name, width in {**widths, "action": num_joints, "last_action": num_joints}.items():
-        setattr(training, name, wp.zeros((num_envs, width), dtype=float, device=device))
     return training
 
 
@@ -119,20 +108,21 @@ def _record_steps_kernel(
     env = wp.tid()
     outcome = episodes.outcome[env]
     training_out.ended[env] = outcome
-    training_out.statistics[env, _STEPS] += 1.0
+    training_out.statistics[env, wp.static(_COLUMN["steps"])] += 1.0
     if outcome != Outcome.RUNNING:
-        training_out.statistics[env, _EPISODES] += 1.0
-        training_out.statistics[env, _OUTCOMES + outcome] += 1.0
-        training_out.statistics[env, _EPISODE_STEPS] += float(episodes.steps[env])
-        training_out.statistics[env, _EPISODE_REWARD] += rewards.total[env]
+        training_out.statistics[env, wp.static(_COLUMN["episodes"])] += 1.0
+        training_out.statistics[env, wp.static(_COLUMN["goal"] - int(Outcome.GOAL)) + outcome] += 1.0
+        training_out.statistics[env, wp.static(_COLUMN["episode_steps"])] += float(episodes.steps[env])
+        training_out.statistics[env, wp.static(_COLUMN["episode_reward"])] += rewards.total[env]
     if (overflow[env] & rules.overflow_mask) != 0:
-        training_out.statistics[env, _OVERFLOW] += 1.0
+        training_out.statistics[env, wp.static(_COLUMN["overflow"])] += 1.0
     if outcome != Outcome.INVALID:
         lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
         ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
         error = wp.vec2(lin_vel[0] - training_out.command[env, 0], lin_vel[1] - training_out.command[env, 1])
-        training_out.statistics[env, _LIN_VEL_ERROR] += wp.length(error)
-        training_out.statistics[env, _YAW_RATE_ERROR] += wp.abs(ang_vel[2] - training_out.command[env, 2])
+        training_out.statistics[env, wp.static(_COLUMN["lin_vel_error"])] += wp.length(error)
+        error_yaw = wp.abs(ang_vel[2] - training_out.command[env, 2])
+        training_out.statistics[env, wp.static(_COLUMN["yaw_rate_error"])] += error_yaw
 
 
 def record_steps(

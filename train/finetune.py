@@ -14,7 +14,6 @@ from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, s
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
-from sim.policy.described import ControllerCfg, read_controller
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash
@@ -22,7 +21,7 @@ from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import identity, load_space, space_at
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
-from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, Start, read_start
+from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
 from train.ppo.training import (
     DESCRIBED,
@@ -50,17 +49,15 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     if Ranks.of_environment().size > 1:
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
-    saved = read_saved(run_dir, "finetune", robot.name) if (run_dir / CHECKPOINT).exists() else None
-    start = None
-    if saved is None:  # else the first controller may be gone
-        start = read_start(Path(cfg.policy or robot.policy_file), robot)
-        if cfg.recipe.noise_of is not None:
-            start = start.with_noise_of(read_start(Path(cfg.recipe.noise_of), robot))
-    controller = start.controller if start else None
-    if saved is not None and DESCRIPTION in saved:
-        controller = read_controller(run_dir / CHECKPOINT, saved[DESCRIPTION])
-    hidden_dims = start.hidden_dims if start else saved["settings"]["ppo"]["hidden_dims"] if saved else ()
-    cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=tuple(hidden_dims)))
+    checkpoint = run_dir / CHECKPOINT
+    saved = read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
+    # Where it goes on, the first controller may be gone.
+    start = read_start(Path(cfg.policy or robot.policy_file) if saved is None else checkpoint, robot)
+    if saved is None and cfg.recipe.noise_of is not None:
+        noise = read_start(Path(cfg.recipe.noise_of), robot).actor
+        start = replace(start, actor=start.actor | {key: noise[key] for key in noise if key == STD})
+    controller = start.controller
+    cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
     elites = elites_of(robot, cfg)
     settings = {
         **settings_of(cfg, robot),
@@ -82,17 +79,16 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
         training = FineTuning(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start,
-            controller=controller,
-        )  # fmt: skip
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
+        )
         policy = training.run(run.export)
     if controller is None:
         export_onnx(load_checkpoint(policy, robot), policy.with_suffix(".onnx"))
     return policy
 
 
-def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> Path:
-    """Trains a search's own specialist and puts it with the certifiers of its run; returns its file.
+def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
+    """Trains a search's own specialist and puts it with the certifiers of its run.
 
     It is the controller of the search, trained further on the elites that it fails, all of them: a certificate is a
     proof of existence, so it may have trained on the terrain. The training works in ``<run>/specialist``.
@@ -109,8 +105,6 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, device_of(options.device), **SPECIALIST)
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
-    described = specialist.with_suffix(".toml")
-    return described if described.exists() else specialist
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,33 +178,30 @@ class FineTuning(Training):
         settings: dict[str, Any],
         saved: dict[str, Any] | None,
         elites: Elites,
-        start: Start | None,
-        controller: ControllerCfg | None = None,
+        start: Start,
     ) -> None:
         """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
         self.mix = Mix(
             kind=cfg.mix, num_terrains=cfg.terrains, draw=cfg.recipe.draw, genes=elites.genes, spaces=elites.spaces,
             seed=cfg.seed, device=device, goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
         )  # fmt: skip
-        if start is not None:
+        if saved is None:
             before = recorded_marks(str(cfg.policy or robot.policy_file))
-            iterations = cfg.recipe.critic_iterations
-            if iterations is None:
-                iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
-            self._alone = iterations if start.critic is None else 0
-            self._trained_on = sorted({*chain(*map(marks_of, elites.genes)), *before})
-            tiles = self.mix.next()
+            alone = 0
+            if start.critic is None:
+                most = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+                alone = most if cfg.recipe.critic_iterations is None else cfg.recipe.critic_iterations
+            marks = sorted({*chain(*map(marks_of, elites.genes)), *before})
+            facts, tiles = {TRAINED_ON: marks, "critic_iterations": alone}, self.mix.next()
         else:
-            assert saved is not None
-            self._alone, self._trained_on = saved["critic_iterations"], saved[TRAINED_ON]
+            facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
             tiles = self.mix.restore(saved["mix"])
         self._swap_every = cfg.recipe.swap_every
-        # Every episode is whole, at the beginning as after an exchange: who crossed which terrain is counted.
         super().__init__(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, random_ages=False,
-            controller=controller,
+            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, facts=facts,
+            controller=start.controller,
         )  # fmt: skip
-        if start is not None:
+        if saved is None:
             self.learner.start_from(start)
 
     def before_iteration(self) -> None:
@@ -218,19 +209,10 @@ class FineTuning(Training):
         iteration = self.learner.iteration
         if iteration // self._swap_every > self.mix.swap:
             self.task.exchange(self.mix.next(self.task.counts()))
-            self.learner.begin_again()
-        self.learner.alg.let_actor_learn(iteration >= self._alone)
-        if iteration == self._alone:
+            self.learner.begin()
+        self.learner.alg.let_actor_learn(iteration >= self.critic_iterations)
+        if iteration == self.critic_iterations:
             self.learner.alg.begin_actor()
-
-    @property
-    def averaged_from(self) -> int:
-        """The iteration after which actors count into the controller; while the critic learns alone, none does."""
-        return max(super().averaged_from, self._alone)
-
-    def facts(self) -> dict[str, Any]:
-        """Marks of all elites that the controller has been trained on in the end, and how long its critic was alone."""
-        return {TRAINED_ON: self._trained_on, "critic_iterations": self._alone}
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps, the terrains among it."""

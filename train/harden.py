@@ -192,7 +192,7 @@ class _Hardening:
         sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, part=part))
         for run in searches:
             archive = read_elites(run, self.robot, self.space.name)
-            sets[run.name] = replace(generated_set(archive, terrains, 0, part), name=run.name)
+            sets[run.name] = generated_set(archive, terrains, 0, part)
         return sets
 
     def search(self, number: int) -> None:

@@ -58,7 +58,7 @@ def measure_dose(
     out = out or RUNS / f"{robot.name}-dose" / ("dose-resolved.json" if resolved else "dose.json")
 
     def measure() -> dict[str, Any]:
-        sets = {name: dose_set(name, dose, count, seed) for name, dose in doses.items()}
+        sets = {name: dose_set(dose, count, seed) for name, dose in doses.items()}
         results = cross_sets(
             controllers, sets, robot=robot, compute=compute, episodes=episodes,
             how="resolved" if resolved else "searched", cache=crossings_folder(robot),
@@ -84,7 +84,7 @@ def measure_dose(
     return publish(out, measure, show_dose, draw=lambda report: as_png(draw_dose(report)))
 
 
-def dose_set(name: str, dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
+def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     """The terrains of a dose, those of all values at one place behind each other, so that workers share the hard ones.
 
     There are ``num_terrains`` a value. The seed draws their episodes, the same ones for all doses.
@@ -92,7 +92,6 @@ def dose_set(name: str, dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     rng = set_rng("dose", seed)
     seeds = rng.integers(2**32, size=num_terrains, dtype=np.uint32).repeat(len(dose.values))
     return TerrainSet(
-        name=name,
         terrains=dose.terrains(num_terrains, rng),
         seeds=seeds,
         numbers=np.arange(len(seeds)),

@@ -37,8 +37,6 @@ from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 EPISODES = 20
 """Episodes a terrain on a GPU."""
-RATE_TERRAINS = 300
-"""Terrains a set of the published rates; tables take the paper's (:func:`qd.evaluate.sets.paper_terrains`)."""
 _SMALL = (24, 4)  # terrains a set and episodes a terrain on a machine without a GPU
 
 
@@ -142,10 +140,17 @@ def evaluate_tables(
     terrains, episodes = sizes_for(
         compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL
     )
-    archive = None if cfg.archive is None else read_elites(cfg.archive, robot, cfg.space)
-    independent = None
+    archive = independent = None
+    about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
+    if cfg.archive is not None:
+        archive = read_elites(cfg.archive, robot, cfg.space)
+        split = split_elites(archive)
+        parts = {"train": len(split.train), "validation": len(split.validation), "test": len(split.test)}
+        about |= {"archive": _about(cfg.archive, archive) | parts, "archive_sha256": _file_sha256(cfg.archive)}
     if cfg.independent is not None:
         independent = read_independent(cfg.independent, cfg.archive, robot, cfg.space)
+        search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
+        about["independent"] = _about(cfg.independent, independent) | search
     space = load_space(cfg.space or SUPER_GAUSSIAN.name)
     check_seeds(controllers)
     for policy in controllers.values():
@@ -158,14 +163,6 @@ def evaluate_tables(
         check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for the test")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
         check_untrained(controllers, independent.genes, str(cfg.independent))
-    about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}  # before they change
-    if cfg.archive is not None and archive is not None:
-        split = split_elites(archive)
-        parts = {"train": len(split.train), "validation": len(split.validation), "test": len(split.test)}
-        about |= {"archive": _about(cfg.archive, archive) | parts, "archive_sha256": _file_sha256(cfg.archive)}
-    if cfg.independent is not None and independent is not None:
-        search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
-        about["independent"] = _about(cfg.independent, independent) | search
     file, show = ("compared.json", show_comparison) if COMPARED in sets else ("tables.json", show_tables)
 
     def make() -> dict[str, Any]:
@@ -216,7 +213,7 @@ def evaluate_rates(
     Without ``terrains`` (a set) and ``episodes`` (a terrain) there are as many as suit the device; without ``out`` the
     file lies under runs/. Returns what ``base.json`` has.
     """
-    count, episodes = sizes_for(compute, terrains, episodes, full=(RATE_TERRAINS, EPISODES), small=_SMALL)
+    count, episodes = sizes_for(compute, terrains, episodes, full=(300, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)
     drawn_in = load_space(space or SUPER_GAUSSIAN.name)
     sets = {name: plain_set(name, count, seed, drawn_in) for name in ("hand_crafted", "hard_random", "flat")}

@@ -29,8 +29,7 @@ def recorded_marks(policy: str) -> set[str]:
     marks: set[str] = set()
     for file in ControllerSpec.parse(policy).files:
         record = file.with_suffix(".train.json")
-        contents = [read_json(record)] if record.is_file() else []
-        for content in (*contents, *_parts_of_weights(file)):
+        for content in (read_json(record) if record.is_file() else {}, _content_of(file)):
             recorded = content.get(TRAINED_ON, [])
             if not isinstance(recorded, list) or not all(isinstance(mark, str) for mark in recorded):
                 raise ValueError(f"{file} or the record beside it is damaged at {TRAINED_ON}: put a copy of it back")
@@ -38,16 +37,15 @@ def recorded_marks(policy: str) -> set[str]:
     return marks
 
 
-def _parts_of_weights(file: Path) -> list[dict[str, Any]]:
-    """Where marks may stand in a file of weights: itself, and what a checkpoint has beside the networks."""
+def _content_of(file: Path) -> dict[str, Any]:
+    """What a file of weights holds; nothing of another kind of file."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of TorchScript files, which have none
             content = read_weights(file)
     except Exception:  # another kind of file, which has no marks
-        return []
-    parts = [content, content.get("extra")] if isinstance(content, dict) else []
-    return [part for part in parts if isinstance(part, dict)]
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:

@@ -56,6 +56,8 @@ _RATES = ("goal", "success", "fallen")
 
 About = dict[str, Any]
 """What is known of one terrain, as JSON values; ``rates`` by controller."""
+Candidate = tuple[About, NDArray[np.float32]]
+"""What is known of a terrain that a pack may have, and its genes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,10 +77,6 @@ class Pack:
         """What is known of each."""
         return self.content["terrains"]
 
-    def __len__(self) -> int:
-        """N."""
-        return len(self.heights)
-
 
 def evaluate_pack(
     pack: Pack,
@@ -96,10 +94,10 @@ def evaluate_pack(
     ``terrains`` are the first of the pack. Without it and ``episodes`` (a terrain) there are as many as suit the
     device. Without ``out`` the file lies under runs/.
     """
-    full = (len(pack), EPISODES)
-    count, episodes = sizes_for(compute, terrains, episodes, full=full, small=(min(24, len(pack)), 4))
+    size = len(pack.terrains)
+    count, episodes = sizes_for(compute, terrains, episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
-    chosen = pack_set(pack.heights, min(count, len(pack)), seed)
+    chosen = pack_set(pack.heights, min(count, size), seed)
     known = pack.terrains[: len(chosen)]
     controller = crosser_name(robot, policy)
 
@@ -114,7 +112,7 @@ def evaluate_pack(
             **origin_of(compute.device, seed, compute.workers),
             **identity(robot, policy),
             "episodes": episodes,
-            "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": len(pack)},
+            "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": size},
             "rates": rates_over_all(abouts, "this", seed),
             "beside": {name: rates_over_all(known, name, seed) for name in pack.content["rates"]},
             "by": {group: failing_by(group, abouts, "this") for group in GROUPS},
@@ -172,15 +170,21 @@ def make_pack(
         controllers = {"searched": searched, **controllers}
     for other in controllers.values():
         check_policy(other, body, compute.device)
-    _check_judged(archive, run)
+    faults = archive.faults or FaultCounts.none_of(len(archive))
+    crossed = faults.resolved_outcomes.any(axis=1) & faults.certifier_outcomes.any(axis=(1, 2))
+    if archive.fresh is None or (archive.failing & ~crossed).any():
+        raise ValueError(
+            f"{run} must have its failing elites crossed with contact resolved and by other controllers, got "
+            f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}: run `faultline judge` on it first"
+        )
     candidates, not_passable = candidates_of(archive, run)
-    chosen = choose_terrains([about for about, _ in candidates], size)
+    chosen = choose_terrains(candidates, size)
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
     print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
     if drawn_in.ground:
         raise ValueError(f"a pack holds heights alone, got terrains of {drawn_in.name}, which have ground of their own")
-    genes = np.array([candidates[place][1] for place in chosen], np.float32)
+    genes = np.array([genes for _, genes in chosen], np.float32)
     heights = round_heights(heights_of(genes, drawn_in))
     out = out or RUNS / f"{body.name}-pack"
     prepare_output(out / TERRAINS_FILE)
@@ -190,7 +194,7 @@ def make_pack(
             controllers, {"pack": pack_set(heights, len(heights), seed)}, robot=body, compute=compute,
             episodes=episodes, cache=crossings_folder(body),
         )["pack"]  # fmt: skip
-        abouts = with_rates([candidates[place][0] for place in chosen], crossed)
+        abouts = with_rates([about for about, _ in chosen], crossed)
         return {
             **origin_of(compute.device, seed, compute.workers),
             **identity(body, searched),
@@ -199,7 +203,7 @@ def make_pack(
             "episodes": episodes,
             "searched": next(name for name, other in controllers.items() if is_same(other, searched)),
             "iterations": archive.iterations,
-            "certifiers": list(archive.faults.certifiers) if archive.faults else [],
+            "certifiers": list(faults.certifiers),
             "candidates": len(candidates),
             "not_known_to_be_passable": not_passable,
             "controllers": about_controllers(controllers, body),
@@ -211,19 +215,7 @@ def make_pack(
     return publish(out / PACK_FILE, measure, show_pack)
 
 
-def _check_judged(archive: Archive, run: Path) -> None:
-    if archive.fresh is None:
-        raise ValueError(f"{run} must be judged, got no fresh episodes: run `faultline judge` on it first")
-    faults, failing = archive.faults or FaultCounts.none_of(len(archive)), archive.failing
-    crossed = faults.resolved_outcomes.any(axis=1) & faults.certifier_outcomes.any(axis=(1, 2))
-    if (failing & ~crossed).any():
-        raise ValueError(
-            f"{run} must have its {failing.sum()} failing elites crossed with contact resolved and by other "
-            f"controllers, got {(failing & crossed).sum()}: run `faultline judge` on it first"
-        )
-
-
-def candidates_of(archive: Archive, run: Path) -> tuple[list[tuple[About, NDArray[np.float32]]], int]:
+def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
     Returns:
@@ -237,8 +229,11 @@ def candidates_of(archive: Archive, run: Path) -> tuple[list[tuple[About, NDArra
     families = dict(zip(near.tolist(), families_of(archive.genes[near], space).tolist(), strict=True))
     causes = rank(archive, space, minima).causes if len(near) else ()
 
-    def about(number: int, parts: list[int] | None, verdict: str, **known: Any) -> About:
-        return {
+    candidates: list[Candidate] = []
+    not_passable = 0
+
+    def add(number: int, parts: list[int] | None, genes: NDArray[np.float32], verdict: str, **known: Any) -> None:
+        about = {
             "name": f"elite-{number}{'' if parts is None else '-minimal'}",
             "kind": "elite" if parts is None else "minimal",
             "elite": number,
@@ -248,14 +243,13 @@ def candidates_of(archive: Archive, run: Path) -> tuple[list[tuple[About, NDArra
             "verdict": "fault" if verdict == "fault" else "near-fault",
             "cause": causes[number] or None,
             "family": families[number],
-            **known,
         }
+        candidates.append((about | known, genes))
 
-    candidates, not_passable = [], 0
     for number in near.tolist():
         if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
             known = {"searched": rate_of(fresh_counts(archive, number)), **judgement(archive, number)}
-            candidates.append((about(number, None, verdict_of(archive, number), **known), archive.genes[number]))
+            add(number, None, archive.genes[number], verdict_of(archive, number), **known)
         else:
             not_passable += 1
     for entry in minima.numbers["elites"] if minima else ():
@@ -265,38 +259,37 @@ def candidates_of(archive: Archive, run: Path) -> tuple[list[tuple[About, NDArra
         if minima and entry["certificates"]:
             searched = {name: entry[name] for name in ("goal_rate", "goal_interval", "valid_episodes")}
             known = {"searched": searched, "resolved": entry["resolved"], "certificates": entry["certificates"]}
-            candidates.append((about(number, entry["bumps"], entry["verdict"], **known), minima.genes[number]))
+            add(number, entry["bumps"], minima.genes[number], entry["verdict"], **known)
         else:
             not_passable += 1
     return candidates, not_passable
 
 
-def choose_terrains(abouts: Sequence[About], size: int) -> list[int]:
-    """Places of some candidates, so that each beginning of the list is spread as well as can be.
+def choose_terrains(candidates: Sequence[Candidate], size: int) -> list[Candidate]:
+    """Some candidates, so that each beginning of the list is spread as well as can be.
 
     Next comes a fault before a near-fault, then one of the family that was chosen least often, of the cause that was,
     of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
     """
-    left, chosen = list(range(len(abouts))), list[int]()
-    counts = {name: Counter[Any]() for name in ("family", "cause", "kind")}
+    left, chosen = list(candidates), list[Candidate]()
+    counts = Counter[Any]()
 
     def turn(place: int) -> tuple[Any, ...]:
-        about = abouts[place]
-        often = (count[about[name]] for name, count in counts.items())
+        about, _ = left[place]
+        often = (counts[name, about[name]] for name in ("family", "cause", "kind"))
         return about["verdict"] != "fault", *often, about["searched"]["goal_rate"], about["elite"], about["kind"]
 
     while left and len(chosen) < size:
-        chosen.append(min(left, key=turn))
-        left.remove(chosen[-1])
-        for name, count in counts.items():
-            count[abouts[chosen[-1]][name]] += 1
+        about, _ = candidate = left.pop(min(range(len(left)), key=turn))
+        chosen.append(candidate)
+        counts.update((name, about[name]) for name in ("family", "cause", "kind"))
     return chosen
 
 
 def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     """The first terrains of a pack, with episodes that nothing else has."""
     seeds = set_rng("pack", seed).integers(2**32, size=len(heights), dtype=np.uint32)
-    return TerrainSet(name="pack", terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
+    return TerrainSet(terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
 
 
 def with_rates(abouts: Sequence[About], crossed: Mapping[str, RolloutResult]) -> list[About]:

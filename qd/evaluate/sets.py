@@ -33,8 +33,6 @@ Part = Literal["test", "validation"]
 """What terrains are for: to be reported, or to choose settings by."""
 MIN_ELITES = 5
 """Fewest elites that can be split: a fifth of them is one."""
-_PAPER_TERRAINS = {"anymal": 300, "cassie": 180}  # of each of its test sets
-_OTHER_TERRAINS = 300  # of a robot that the paper does not have
 _TRAINING_ELITES = 750  # the paper's
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
@@ -70,7 +68,7 @@ class Certificates(NamedTuple):
     @property
     def certified(self) -> NDArray[np.bool_]:
         """Whether anybody certifies each elite, shape (T,)."""
-        return np.any(self.given, axis=1).reshape(len(self.given))
+        return np.any(self.given, axis=1)
 
 
 def certificates_of(archive: Archive, rows: NDArray[np.int64]) -> Certificates | None:
@@ -85,7 +83,6 @@ def certificates_of(archive: Archive, rows: NDArray[np.int64]) -> Certificates |
 class TerrainSet:
     """T terrains with the seeds of their episodes."""
 
-    name: str
     terrains: NDArray[np.float32]
     """Genes, shape (T, num_genes), or heights [m], shape (T, NUM_ROWS, NUM_COLS)."""
     seeds: NDArray[np.uint32]
@@ -119,7 +116,7 @@ class TerrainSet:
 
 def paper_terrains(robot: str) -> int:
     """Terrains a set of the published tables of a robot; 300 of one that the paper does not have."""
-    return _PAPER_TERRAINS.get(robot, _OTHER_TERRAINS)
+    return 180 if robot == "cassie" else 300
 
 
 def split_elites(archive: Archive) -> EliteSplit:
@@ -207,10 +204,8 @@ def plain_set(
         terrains = space.hard_random(count, rng)
     else:
         terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
-    return TerrainSet(
-        name=name, terrains=terrains, seeds=_episode_seeds(rng, count), numbers=np.arange(count), types=types,
-        levels=levels, space=space.name,
-    )  # fmt: skip
+    seeds, numbers = _episode_seeds(rng, count), np.arange(count)
+    return TerrainSet(terrains=terrains, seeds=seeds, numbers=numbers, types=types, levels=levels, space=space.name)
 
 
 def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") -> TerrainSet:
@@ -218,7 +213,7 @@ def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") 
     split = split_elites(archive)
     held_out = split.test if part == "test" else split.validation
     seeds = _episode_seeds(set_rng("generated", seed, part), len(held_out))
-    return _set_of_elites("generated", archive, held_out[:count], seeds[:count])
+    return _set_of_elites(archive, held_out[:count], seeds[:count])
 
 
 def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on: Set[str] = frozenset()) -> TerrainSet:
@@ -227,13 +222,13 @@ def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on
     rows = _in_order_of_genes(archive)[rng.permutation(len(archive))]
     seeds = _episode_seeds(rng, len(archive))
     untrained = ~np.isin(marks_of(archive.genes[rows]), [*trained_on])
-    return _set_of_elites(name, archive, rows[untrained][:count], seeds[untrained][:count])
+    return _set_of_elites(archive, rows[untrained][:count], seeds[untrained][:count])
 
 
-def _set_of_elites(name: str, archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
+def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
     genes, space = archive.genes[rows], space_of(archive)
     return TerrainSet(
-        name=name, terrains=genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(genes, space),
+        terrains=genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(genes, space),
         certificates=certificates_of(archive, rows),
     )  # fmt: skip
 
@@ -248,8 +243,7 @@ def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
 
     ``distance`` of each terrain to its nearest training terrain has shape (T,).
     """
-    places = np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)])
-    return replace(whole.rows(places), name="generated_far")
+    return whole.rows(np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)]))
 
 
 def nearest_distance(

@@ -115,20 +115,17 @@ def _statistics(
     tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
     for name, row in crossed.items():
         families, certificates = sets[name].families, sets[name].certificates
-        of_set = {key: {controller: row[controller].values[key] for controller in row} for key in MEASURES}
-        for key in MEASURES:
-            tables[key][name] = {controller: statistic(values, families) for controller, values in of_set[key].items()}
-        tables["penalties"][name] = {
-            controller: {key: statistic(values, families) for key, values in measured.penalties.items()}
-            for controller, measured in row.items()
-        }
+        everywhere = np.ones(len(sets[name]), bool)
+        groups = [(key, key, everywhere) for key in MEASURES]
         if certificates is not None:
-            member = certificates.certified
+            groups += [(key, measure, certificates.certified) for key, measure in CERTIFIED.items()]
+        for key, measure, member in groups:
             kin = of_terrains(families, member)
-            for key, measure in CERTIFIED.items():
-                tables[key][name] = {
-                    controller: statistic(values[member], kin) for controller, values in of_set[measure].items()
-                }
+            tables[key][name] = {who: statistic(measured.values[measure][member], kin) for who, measured in row.items()}
+        tables["penalties"][name] = {
+            who: {key: statistic(values, families) for key, values in measured.penalties.items()}
+            for who, measured in row.items()
+        }
     return tables
 
 

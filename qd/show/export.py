@@ -86,7 +86,7 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
     folder = pack_folder(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
-    names = {pack.terrains[row]["name"]: row for row in chosen_elites(places, len(pack), folder)}
+    names = {pack.terrains[row]["name"]: row for row in chosen_elites(places, len(pack.terrains), folder)}
     return Source(
         folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
         about={name: {"robot": of_robot.name, "place": row, **pack.terrains[row]} for name, row in names.items()},

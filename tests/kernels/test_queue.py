@@ -17,6 +17,7 @@ class Robots:
     def __init__(self, num_envs):
         self.queue = make_queue(num_envs, SLOTS, REPLICAS, 1, rewarded=False, device=str(wp.get_device()))
         self.episodes = make_episodes(num_envs)
+        self.queue.seed.assign(np.arange(7, 7 + SLOTS, dtype=np.uint32))
         self.sums, self.terrain = wp.zeros((num_envs, 1)), wp.zeros(num_envs, dtype=int)
 
     def turn(self):
@@ -33,16 +34,18 @@ class Robots:
 
 @pytest.mark.parametrize("num_envs", [1, 5, 12])
 def test_every_episode_is_run_once(num_envs):
-    robots, taken, rng = Robots(num_envs), [], np.random.default_rng(num_envs)
+    robots, taken, starts, rng = Robots(num_envs), [], {}, np.random.default_rng(num_envs)
     make_ready(SLOTS * REPLICAS, robots.queue)
     for _ in range(200):
         rows = robots.turn()
+        starts |= dict(zip(rows.tolist(), robots.episodes.rng.numpy().tolist(), strict=True))
         taken += rows[robots.queue.begins.numpy() != 0].tolist()
         running = np.flatnonzero(rows >= 0)
         if len(running) == 0:
             break
         robots.end(rng.choice(running, rng.integers(1, len(running) + 1), replace=False))
     assert sorted(taken) == list(range(12))
+    assert len({starts[row] for row in taken}) == 12  # each start is drawn from another state
     assert robots.queue.num_ended.numpy().tolist() == [4, 4, 4]
     assert (robots.queue.outcome.numpy() == Outcome.GOAL).all()
 

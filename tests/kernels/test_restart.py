@@ -6,7 +6,6 @@ import warp as wp
 
 from kernels.episode import Outcome, make_episodes
 from kernels.observation import Sensors
-from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import clear_rows, restart_episodes
 from kernels.rewards import Rewards, make_rewards
 from sim.crossing import CrossingCfg, make_start_ranges
@@ -16,21 +15,9 @@ from tests.kernels.states import filled, make_terrain, rough
 BASE_COM = (-0.02, 0.01, 0.03)
 
 
-def starts_of(seeds, replicas):
-    """What each start is drawn from, as a queue hands it out: replica by replica, terrain by terrain."""
-    num_envs = len(seeds) * replicas
-    queue = make_queue(num_envs, len(seeds), replicas, 1, rewarded=False, device=str(wp.get_device()))
-    waiting = make_episodes(num_envs)
-    queue.seed.assign(np.uint32(seeds))
-    make_ready(num_envs, queue)
-    sums, terrain_of_env = wp.zeros((num_envs, 1)), wp.zeros(num_envs, dtype=int)
-    turn_over(waiting.outcome, Rewards(), waiting, sums, terrain_of_env, queue)
-    return wp.array(waiting.rng.numpy()[np.argsort(queue.episode_of_env.numpy())])
-
-
-def start(seeds, replicas, grids, anymal, outcome=None, rewards=None):
+def start(grids, replicas, anymal, outcome=None, rewards=None):
     """Joint coordinates and velocities and the episodes after a restart; all have ended unless ``outcome`` is given."""
-    num_envs, joints = len(seeds) * replicas, anymal.num_joints
+    num_envs, joints = len(grids) * replicas, anymal.num_joints
     q = wp.full((num_envs, 7 + joints), 3.0, dtype=float)
     qd = wp.full((num_envs, 6 + joints), 3.0, dtype=float)
     action = wp.full((num_envs, joints), 3.0, dtype=float)
@@ -38,10 +25,10 @@ def start(seeds, replicas, grids, anymal, outcome=None, rewards=None):
     state.steps.fill_(77)
     ended = np.full(num_envs, 1) if outcome is None else np.int32(outcome) != Outcome.RUNNING
     mask = wp.array(ended, dtype=int)
-    terrain_of_env = wp.array(np.repeat(np.arange(len(seeds)), replicas), dtype=int)
+    terrain_of_env = wp.array(np.repeat(np.arange(len(grids)), replicas), dtype=int)
     sensors = filled(Sensors, base_com=BASE_COM, default_joint_pos=anymal.default_joint_pos)
     ranges = make_start_ranges(CrossingCfg(), anymal)
-    state.rng = starts_of(seeds, replicas)
+    state.rng.assign(np.random.default_rng(0).integers(2**32, size=num_envs, dtype=np.uint32))
     terrain = make_terrain(grids)
     restart_episodes(mask, terrain_of_env, terrain, ranges, sensors, q, qd, action, state, rewards or Rewards())
     assert (action.numpy() == np.where(q.numpy()[:, :1] == 3.0, 3.0, 0.0)).all()
@@ -53,7 +40,7 @@ def test_running_episodes_are_left_alone(anymal):
     for array in (rewards.running, rewards.total, rewards.air_time, rewards.touched, rewards.terms):
         array.fill_(5)
     outcome = [Outcome.TILT, Outcome.RUNNING, Outcome.TIME_OUT]
-    q, qd, state = start([7], 3, np.zeros((1, 161, 321)), anymal, outcome=outcome, rewards=rewards)
+    q, qd, state = start(np.zeros((1, 161, 321)), 3, anymal, outcome=outcome, rewards=rewards)
     assert (q[1] == 3.0).all() and (qd[1] == 3.0).all()
     assert (q[[0, 2], 0] != 3.0).all() and not qd[[0, 2], 6:].any()
     assert state.steps.numpy().tolist() == [0, 77, 0]
@@ -65,7 +52,7 @@ def test_running_episodes_are_left_alone(anymal):
 
 
 def test_starts_fill_their_ranges(anymal):
-    q, qd, state = start(range(40), 20, np.zeros((40, 161, 321)), anymal)
+    q, qd, state = start(np.zeros((1, 161, 321)), 800, anymal)
     default = np.array(anymal.default_joint_pos)
     moving = default != 0
     com_arm = np.array([oracle.rotation_matrix(row[3:7]) @ BASE_COM for row in q])
@@ -98,7 +85,7 @@ def test_starts_fill_their_ranges(anymal):
 
 def test_the_start_stands_on_the_highest_ground_under_the_robot(anymal):
     grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(2)])
-    q, _, _ = start([1, 2], 8, grids, anymal)
+    q, _, _ = start(grids, 8, anymal)
     for env, row in enumerate(np.float64(q)):
         half = np.array(anymal.footprint)
         low, high = np.floor((row[:2] - half) / 0.05).astype(int), np.ceil((row[:2] + half) / 0.05).astype(int)

@@ -89,14 +89,11 @@ def test_starts_are_drawn_from_counter_and_environment_alone():
     assert len({*seeds(4, 7), *seeds(4, 8)}) == 8
 
 
-def command(
-    num_envs=1, *, steps=0, yaw=0.0, heading=None, before=(0.0, 0.0, 0.0), count=0, place=(0.0, 0.0), task=None, **rules
-):
+def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, count=0, place=(0.0, 0.0), task=None, **rules):
     """Commands, joint velocities and headings after the launch."""
     task = task or filled(Task, yaw_gain=0.5, max_yaw_rate=1.0)
     episodes, training = make_batch(num_envs, outcome=Outcome.RUNNING, count=count)
     episodes.steps.assign(np.broadcast_to(np.int32(steps), num_envs))
-    training.command.assign(np.tile(np.float32(before), (num_envs, 1)))
     if heading is not None:
         training.heading.fill_(heading)
     joint_q = np.zeros((num_envs, 7 + NUM_JOINTS), np.float32)
@@ -115,12 +112,6 @@ def test_commands_fill_their_ranges_and_slow_ones_are_zero():
     assert abs((speed == 0).mean() - 0.0628) < 0.015
     for values, bound in ((commands[:, 0], 1.0), (commands[:, 1], 0.5), (headings, np.pi)):
         assert -bound <= values.min() < -0.99 * bound and 0.99 * bound < values.max() <= bound
-
-
-@pytest.mark.parametrize(("steps", "drawn"), [(0, True), (499, False), (500, True), (501, False), (1000, True)])
-def test_commands_are_drawn_when_due(steps, drawn):
-    commands, _, _ = command(steps=steps, before=(0.123, 0.0, 0.0))
-    assert (commands[0, 0] != np.float32(0.123)) == drawn
 
 
 @pytest.mark.parametrize(

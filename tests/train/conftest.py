@@ -1,10 +1,16 @@
 """One small task for all tests of the room: what is compiled for one serves the others."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from train.cfg import FinetuneCfg
+from train.finetune import FineTuning, elites_of
+from train.ppo.checkpoint import read_start
 from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
@@ -25,3 +31,11 @@ def make_task(device: str) -> Callable[..., CommandTask]:
 def shared_task(device: str) -> CommandTask:
     """A task that tests may step and change, but not count on finding at its beginning."""
     return CommandTask(get_robot("anymal"), TaskCfg(curriculum=CURRICULUM), num_envs=NUM_ENVS, device=device, seed=1)
+
+
+def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> FineTuning:
+    """A fine-tuning on the CPU that has not iterated yet."""
+    start = read_start(Path(cfg.policy or robot.policy_file), robot)
+    cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
+    elites = elites_of(robot, cfg)
+    return FineTuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from qd.evaluate.marks import TRAINED_ON, marks_of
-from tests.builders import make_archive, write_run
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 
@@ -38,10 +37,3 @@ def write_trained(folder: Path, genes: np.ndarray) -> Path:
     path = write_actor(folder / "tuned.pt")
     path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: marks_of(genes)}))
     return path
-
-
-def make_places(folder: Path) -> Path:
-    """A folder with an archive of ten elites and a controller."""
-    write_run(folder / "archive", make_archive(10))
-    write_actor(folder / "start.pt")
-    return folder

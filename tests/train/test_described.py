@@ -11,14 +11,13 @@ from sim.mujoco_c.crossing import cross, draw_starts
 from sim.policy.described import read_controller, text_of
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
-from sim.spaces.registry import get_space
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_toml
+from tests.train.conftest import begun
 from tests.train.starts import PPO
 from train.cfg import FinetuneCfg, RunCfg
-from train.finetune import FineTuning, elites_of, finetune
+from train.finetune import finetune
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
-from train.task.mix import Mix
 
 TERMS = """observation = [
   {term = "ang_vel", scale = 0.25, clip = 4.0}, {term = "gravity"}, {term = "joint_pos", clip = [-1.0, 2.0]},
@@ -54,18 +53,8 @@ def cfg_of(robot, **changes):
     return replace(FinetuneCfg.of(robot), **values | changes)
 
 
-def begun(robot, policy, run, device="cpu"):
-    """A fine-tuning that has not iterated yet."""
-    start = read_start(policy, robot)
-    cfg = cfg_of(robot, ppo=replace(PPO, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
-    return FineTuning(
-        robot, cfg, run, device=device, settings={}, saved=None, elites=elites_of(robot, cfg), start=start,
-        controller=start.controller,
-    )  # fmt: skip
-
-
 def test_the_actor_begins_as_the_controller(robot, tmp_path):
-    tuned = begun(robot, robot.policy_file, tmp_path)
+    tuned = begun(robot, cfg_of(robot), tmp_path)
     policy, env, alg = load_policy(robot.policy_file, robot, "cpu"), tuned.learner.env, tuned.learner.alg
     assert alg.get_policy().state_dict()[STD].tolist() == pytest.approx([0.3] * 4)
     observations, ends, done = env.get_observations(), 0, []
@@ -101,7 +90,8 @@ def test_it_learns_goes_on_and_crosses(robot, tmp_path):
     brief = replace(robot, max_duration_s=0.2)
     assert not cross(brief, after, flat, draw_starts(brief, flat, 2, 3, "cpu")).invalid.any()
     (tmp_path / "further").mkdir()
-    further = begun(robot, run / "checkpoint.pt", tmp_path / "further")  # as a hardening does: with its critic
+    # As a hardening does: with its critic.
+    further = begun(robot, cfg_of(robot, policy=str(run / "checkpoint.pt")), tmp_path / "further")
     expected = read_checkpoint(run / "checkpoint.pt")["critic_state_dict"]
     assert all(value.equal(expected[key]) for key, value in further.learner.alg.critic.state_dict().items())
     assert further.learner.env.controller.activation == "swish"
@@ -125,13 +115,3 @@ def test_other_networks_are_refused(robot, tmp_path):
     (tmp_path / "controller.toml").write_text(f'policy = "twice.pt"\n{TERMS}')
     with pytest.raises(ValueError, match="finetune needs a network of plain layers"):
         read_start(tmp_path / "controller.toml", robot)
-
-
-def test_hand_crafted_terrains_are_as_low_as_the_space():
-    heights, usual = (
-        Mix(kind="hand-crafted", num_terrains=6, genes=(), seed=0, device="cpu", spaces=(get_space(name),))
-        .next()
-        .heights
-        for name in ("super_gaussian@0.05", "super_gaussian")
-    )
-    np.testing.assert_allclose(heights, usual / 5, rtol=1e-5)

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +17,11 @@ from sim.robots.find import get_robot
 from sim.spaces import registry as spaces
 from tests.builders import fresh_values, make_archive, write_run
 from tests.sim.spaces.spaces import move, write_ridges
-from tests.train.starts import PPO, make_places, write_actor
+from tests.train.conftest import begun
+from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import Finetune
-from train.finetune import FineTuning, elites_of, finetune, train_specialist
+from train.finetune import elites_of, finetune, train_specialist
 from train.ppo import training
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
 from train.ppo.ppo import CapturedPPO
@@ -33,7 +33,11 @@ ON_CPU = RunCfg(device="cpu")
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    return make_places(tmp_path_factory.mktemp("finetune"))
+    """A folder with an archive of ten elites and a controller."""
+    folder = tmp_path_factory.mktemp("finetune")
+    write_run(folder / "archive", make_archive(10))
+    write_actor(folder / "start.pt")
+    return folder
 
 
 def cfg_of(places, **changes):
@@ -46,16 +50,6 @@ def cfg_of(places, **changes):
         "iterations": 3, "ppo": replace(PPO, hidden_dims=(512, 256, 128)), "recipe": replace(base.recipe, **recipe),
     }  # fmt: skip
     return replace(base, **values | changes)
-
-
-def begun(places, **changes):
-    """A fine-tuning that has not iterated yet."""
-    cfg = cfg_of(places, **changes)
-    start = read_start(Path(str(cfg.policy)), ROBOT)
-    cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
-    return FineTuning(
-        ROBOT, cfg, places, device="cpu", settings={}, saved=None, elites=elites_of(ROBOT, cfg), start=start
-    )
 
 
 def actor_of(path):
@@ -137,8 +131,8 @@ def test_the_controller_is_the_mean_of_the_last_actors(places):
 
 def test_a_critic_that_comes_along_is_taken_and_the_first_steps_are_small(places):
     path = write_actor(places / "with_critic.pt", critic=True)
-    tuned = begun(places, policy=str(path))
-    assert tuned.facts()["critic_iterations"] == 0
+    tuned = begun(ROBOT, cfg_of(places, policy=str(path)), places)
+    assert tuned.critic_iterations == 0
     expected = torch.load(path, weights_only=True)["critic_state_dict"]
     assert all(value.equal(expected[key]) for key, value in tuned.learner.alg.critic.state_dict().items())
     tuned.before_iteration()
@@ -147,8 +141,8 @@ def test_a_critic_that_comes_along_is_taken_and_the_first_steps_are_small(places
 
 
 def test_what_no_critic_and_no_half_precision_can_hold(places):
-    tuned = begun(places, iterations=1200, ppo=replace(PPO, average=1.0))
-    assert tuned.facts()["critic_iterations"] == tuned.averaged_from == 50  # before that the actor is what it was
+    tuned = begun(ROBOT, cfg_of(places, iterations=1200, ppo=replace(PPO, average=1.0)), places)
+    assert tuned.critic_iterations == tuned.averaged_from == 50  # before that the actor is what it was
     tuned.learner.alg.get_policy().state_dict()["mlp.0.weight"][0, 0] = 70_000.0
     training.write_controller(places / "large.pt", tuned.learner, {})
     state = actor_of(places / "large.pt")

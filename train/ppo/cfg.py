@@ -46,11 +46,9 @@ def ppo_problems(cfg: PpoCfg, num_envs: int) -> list[str]:
     transitions = num_envs * cfg.steps_per_env
     if not cfg.hidden_dims:
         lines.append("ppo.hidden_dims must name at least one layer, got none")
-    if transitions == 1:
-        lines.append("an iteration must have at least 2 transitions, got 1: more num_envs or ppo.steps_per_env")
-    elif cfg.mini_batches > transitions // 2:
+    if cfg.mini_batches > transitions // 2:
         lines.append(
             f"ppo.mini_batches must be at most half of the {num_envs} x {cfg.steps_per_env} transitions of an "
-            f"iteration, got {cfg.mini_batches}"
+            f"iteration, got {cfg.mini_batches}: give fewer, or more num_envs"
         )
     return lines

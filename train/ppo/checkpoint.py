@@ -59,11 +59,6 @@ class Start:
     controller: ControllerCfg | None = None
     """What the actor sees and does, with the activation between its layers, if it is described."""
 
-    def with_noise_of(self, other: "Start") -> "Start":
-        """The same with another's standard deviation of the actions, where that is known."""
-        noise = {STD: other.actor[STD]} if STD in other.actor else {}
-        return replace(self, actor={**self.actor, **noise})
-
 
 def read_start(path: Path, robot: RobotCfg) -> Start:
     """Networks of an rsl_rl checkpoint, fit to be trained on.
@@ -75,16 +70,12 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
     if described is not None:
         return _start_described(described, path, robot)
     policy = load_policy(path, robot, "cpu")
-    if not isinstance(policy, MlpPolicy):
+    content = read_weights(path) if isinstance(policy, MlpPolicy) else {}
+    if not isinstance(policy, MlpPolicy) or policy.activation != "elu" or "actor_state_dict" not in content:
         raise ValueError(
-            f"a fine-tuning starts from an rsl_rl checkpoint (actor_state_dict), got another kind of controller: "
-            f"{path}; train one with `{robot.train_command}`, and leave --policy out"
-        )
-    content = read_weights(path)
-    if policy.activation != "elu" or "actor_state_dict" not in content:
-        raise ValueError(
-            f"a fine-tuning starts from an rsl_rl 5 checkpoint (actor_state_dict) with ELU between its layers, got "
-            f"{policy.activation} and {', '.join(content)}: {path}; give another controller"
+            "a fine-tuning starts from a controller.toml, or from an rsl_rl 5 checkpoint (actor_state_dict) with ELU "
+            f"between its layers, got another kind of controller: {path}; describe it in a controller.toml, or train "
+            f"one with `{robot.train_command}`"
         )
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
     critic = None if policy.normalised else content.get("critic_state_dict")
@@ -96,7 +87,12 @@ def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, pat
         weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
         actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
     hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
-    _check_std(actor, policy.sizes[1], path)
+    std, count = actor.get(STD), policy.sizes[1]
+    if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
+        raise ValueError(
+            f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0, got "
+            f"{' '.join(str(std).split())}: leave it out, or give another controller"
+        )
     if critic is not None:
         _check_critic(critic, (robot.observation_size, *hidden, 1), path)
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
@@ -157,15 +153,6 @@ def plain_layers(network: Any, place: str) -> MlpPolicy:
         f"finetune needs a network of plain layers with one kind of activation, got another in {place}: give an rsl_rl "
         "checkpoint or its TorchScript as the description's policy"
     )
-
-
-def _check_std(actor: State, count: int, path: Path) -> None:
-    std = actor.get(STD)
-    if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
-        raise ValueError(
-            f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0, got "
-            f"{' '.join(str(std).split())}: leave it out, or give another controller"
-        )
 
 
 def _check_critic(critic: Any, sizes: tuple[int, ...], path: Path) -> None:

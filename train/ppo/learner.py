@@ -124,13 +124,14 @@ class Learner:
         if self.ranks.size > 1:
             self.alg.broadcast_parameters()
             self._draw_apart(seed)
-        self._begin()
+        self.begin()
 
     def _draw_apart(self, seed: int) -> None:
         """Other random numbers from here on than the other processes draw."""
         torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
-    def _begin(self) -> None:
+    def begin(self) -> None:
+        """Go on from the environment as it is now, where all episodes have begun anew."""
         if self._random_ages:
             ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
             self.env.episode_length_buf = ages
@@ -163,11 +164,6 @@ class Learner:
             raise FloatingPointError(f"iteration {self.iteration}: the networks' weights are not finite")
         self.iteration += 1
         return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
-
-    @property
-    def noise_std(self) -> float:
-        """Mean standard deviation of the actions."""
-        return float(self.actor_state()[STD].mean())
 
     def actor_state(self) -> State:
         """The actor under rsl_rl's keys, on the CPU."""
@@ -208,28 +204,20 @@ class Learner:
         if start.critic is not None:
             self.alg.critic.load_state_dict(start.critic)
 
-    def begin_again(self) -> None:
-        """Go on from the environment as it is now: to be called between iterations when its episodes began anew."""
-        self._observations = self.env.get_observations()
-
     def resume(self, content: dict[str, Any]) -> None:
         """Go on from :meth:`state`; episodes begin anew."""
+        task = self.env.task
         try:
             self.alg.load(content, None, True)
-            self._restore(content)
+            self.iteration, self.averaged = content["iter"], content["averaged"]
+            self._mean = {key: value.to(self.alg.device) for key, value in content["mean_actor_state_dict"].items()}
+            task.counter.fill_(content["counter"])
+            task.restart_all(content["levels"].to(task.levels.device, task.levels.dtype))
+            torch.set_rng_state(content["rng_cpu"])
+            if content["rng_cuda"] is not None and task.observation.is_cuda:
+                torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
         except Exception as error:  # torch answers states that do not fit with many types
             raise ValueError(f"the checkpoint is damaged: {in_one_line(error)}; put a copy of it back") from error
-        self._begin()
-
-    def _restore(self, content: dict[str, Any]) -> None:
-        """Iteration, mean, terrain levels and random numbers of a checkpoint."""
-        task = self.env.task
-        self.iteration, self.averaged = content["iter"], content["averaged"]
-        self._mean = {key: value.to(self.alg.device) for key, value in content["mean_actor_state_dict"].items()}
-        task.counter.fill_(content["counter"])
-        task.restart_all(content["levels"].to(task.levels.device, task.levels.dtype))
-        torch.set_rng_state(content["rng_cpu"])
-        if content["rng_cuda"] is not None and task.observation.is_cuda:
-            torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
         if self.ranks.size > 1:  # the state is the first process's
             self._draw_apart(int(torch.initial_seed()) % 2**31)
+        self.begin()

@@ -13,6 +13,7 @@ from kernels.rewards import REWARDS
 from qd.run.progress import clock
 from sim.files.atomic import explain_failed_write
 from sim.files.intervals import value_words
+from train.ppo.checkpoint import STD
 from train.ppo.learner import Iteration, Learner
 
 _ROWS = 100  # over a whole training
@@ -107,7 +108,7 @@ class Progress:
             "terms": {name: sums[name] / (steps * dt) for name in REWARDS},
             "losses": window[-1].losses,
             "learning_rate": learner.alg.learning_rate,
-            "noise_std": learner.noise_std,
+            "noise_std": float(learner.actor_state()[STD].mean()),
         }
         self._curve.append(_rounded(row))
         self._window = []

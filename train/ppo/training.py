@@ -140,20 +140,22 @@ class Training:
         settings: dict[str, Any],
         saved: dict[str, Any] | None,
         tiles: Tiles | None = None,
-        random_ages: bool = True,
+        facts: dict[str, Any] | None = None,
         controller: ControllerCfg | None = None,
     ) -> None:
         """Begin, or go on from a checkpoint (:func:`read_saved`); without ``tiles`` on those of the curriculum.
 
-        ``settings`` are what checkpoint and record say of it (:func:`settings_of`), ``random_ages`` as of
-        :class:`Learner`, ``controller`` as of :class:`CommandVecEnv`.
+        ``settings`` are what checkpoint and record say of it (:func:`settings_of`), ``facts`` what they say beside,
+        ``controller`` is as of :class:`CommandVecEnv`.
         """
-        self._robot, self._cfg, self._run_dir, self._settings = robot, cfg, run_dir, settings
+        self._cfg, self._run_dir, self._settings, self._facts = cfg, run_dir, settings, facts or {}
         ranks = Ranks.of_environment()
         self.task = CommandTask(
             robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
         )
-        self.learner = Learner(CommandVecEnv(self.task, controller), cfg.ppo, seed=cfg.seed, random_ages=random_ages)
+        # On terrains that are given every episode is whole: who crossed which is counted.
+        env = CommandVecEnv(self.task, controller)
+        self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=tiles is None)
         if saved is not None:
             self.learner.resume(saved)
         self.progress = Progress(
@@ -168,13 +170,14 @@ class Training:
         """What a kind of training does before each iteration: nothing."""
 
     @property
-    def averaged_from(self) -> int:
-        """The iteration after which actors count into the controller."""
-        return round((1.0 - self._cfg.ppo.average) * self._cfg.iterations)
+    def critic_iterations(self) -> int:
+        """Iterations in which the critic learns alone."""
+        return self._facts.get("critic_iterations", 0)
 
-    def facts(self) -> dict[str, Any]:
-        """What checkpoint and record say beside settings and progress: nothing."""
-        return {}
+    @property
+    def averaged_from(self) -> int:
+        """The iteration after which actors count into the controller; while the critic learns alone, none does."""
+        return max(round((1.0 - self._cfg.ppo.average) * self._cfg.iterations), self.critic_iterations)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
@@ -184,7 +187,7 @@ class Training:
             "settings": self._settings,
             "progress": self.progress.state(),
             **({} if self.learner.env.controller is None else {DESCRIPTION: text_of(self.learner.env.controller)}),
-            **self.facts(),
+            **self._facts,
         }
 
     def run(self, export: Path | None) -> Path:
@@ -236,7 +239,7 @@ class Training:
         self._save()
         if not learner.ranks.is_first:
             return
-        record = {**self.progress.record(), "averaged": learner.averaged, **self.facts()}
+        record = {**self.progress.record(), "averaged": learner.averaged, **self._facts}
         for path in (self._run_dir / POLICY, *([export] if export else [])):
             write_controller(path, learner, record)
             if learner.env.controller is not None:

@@ -40,16 +40,15 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
     if cfg.num_columns + cfg.noise_columns < 1:
         raise ValueError("the curriculum needs at least one column, got num_columns 0 and noise_columns 0")
     tile_rng, noise_rng = np.random.default_rng(seed).spawn(2)
-    noise = np.empty((NUM_LEVELS, cfg.noise_columns, NUM_ROWS, NUM_COLS), np.float32)
-    for level in range(NUM_LEVELS):
-        for column in range(cfg.noise_columns):
-            noise[level, column] = crossing_terrain("noise", level, noise_rng)
+    grid = np.empty((NUM_LEVELS, cfg.num_columns + cfg.noise_columns, NUM_ROWS, NUM_COLS), np.float32)
     types = ("noise",) * cfg.noise_columns
     if cfg.num_columns:
         tiles, type_index = training_tiles(cfg.num_columns, tile_rng)
-        noise = np.concatenate([tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS), noise], axis=1)
+        grid[:, : cfg.num_columns] = tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS)
         types = (*(TILE_TYPES[k] for k in type_index), *types)
-    return Tiles(heights=noise.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
+    for level, column in np.ndindex(NUM_LEVELS, cfg.noise_columns):
+        grid[level, cfg.num_columns + column] = crossing_terrain("noise", level, noise_rng)
+    return Tiles(heights=grid.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
 
 
 def first_levels(num_envs: int, cfg: CurriculumCfg, rng: np.random.Generator) -> np.ndarray:

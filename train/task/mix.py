@@ -53,19 +53,11 @@ class Mix:
     """How many of them reached the goal."""
 
     def __post_init__(self) -> None:
+        self.num_elites = sum(map(len, self.genes))
+        self.num_hand_crafted = self.num_terrains if self.kind == "hand-crafted" else self.num_terrains // 2
         self.episodes = np.zeros(self.num_elites, np.int64)
         self.crossed = np.zeros(self.num_elites, np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
-
-    @property
-    def num_hand_crafted(self) -> int:
-        """How many of the terrains are hand-crafted."""
-        return self.num_terrains if self.kind == "hand-crafted" else self.num_terrains // 2
-
-    @property
-    def num_elites(self) -> int:
-        """E."""
-        return sum(map(len, self.genes))
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
         """The terrains of the next exchange.

@@ -12,9 +12,9 @@ from sim.robots.find import get_robot
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
 
-def make_set(name: str, count: int, first: int = 0) -> TerrainSet:
+def make_set(count: int, first: int = 0) -> TerrainSet:
     """A set of hard-random terrains that are numbered from ``first`` on."""
-    return replace(plain_set("hard_random", count, 0), name=name, numbers=np.arange(first, first + count))
+    return replace(plain_set("hard_random", count, 0), numbers=np.arange(first, first + count))
 
 
 def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, bad: Sequence[int] = ()) -> Measured:
@@ -28,6 +28,6 @@ def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, b
 def make_report(goals: Mapping[str, Mapping[str, Sequence[int]]], *, of: int = 4) -> Tables:
     """Tables of ANYmal: set -> controller -> on each terrain, in how many of ``of`` episodes it reached the goal."""
     crossed = {name: {who: make_measured(counts, of=of) for who, counts in row.items()} for name, row in goals.items()}
-    sets = {name: make_set(name, len(next(iter(row.values())))) for name, row in goals.items()}
+    sets = {name: make_set(len(next(iter(row.values())))) for name, row in goals.items()}
     controllers = {who: {"policy": who, "sha256": None} for who in next(iter(goals.values()))}
     return make_tables(crossed, sets, get_robot("anymal"), controllers=controllers, episodes=of, seed=0)

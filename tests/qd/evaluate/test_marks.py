@@ -25,9 +25,7 @@ def test_the_records_of_all_files_of_a_controller_are_read(tmp_path):
         recorded_marks(str(path))
 
 
-@pytest.mark.parametrize("inside", ["checkpoint", "controller"])
-def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(inside, tmp_path):
-    path, part = write_actor(tmp_path / "policy.pt"), {TRAINED_ON: marks_of(GENES)}
-    content = torch.load(path, weights_only=True)
-    torch.save(content | ({"extra": part} if inside == "checkpoint" else part), path)
-    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(part[TRAINED_ON])
+def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(tmp_path):
+    path = write_actor(tmp_path / "policy.pt")
+    torch.save(torch.load(path, weights_only=True) | {TRAINED_ON: marks_of(GENES)}, path)
+    assert recorded_marks(str(path)) == recorded_marks(f"some.module:adapter@{path}") == set(marks_of(GENES))

@@ -16,7 +16,7 @@ from tests.qd.evaluate.made import make_measured, make_set
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
 ABOUT = {who: {"policy": f"{who}.pt", "sha256": sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))}
-SET = replace(make_set("generated", 5), numbers=np.array([10, 3, 7, 5, 8]))
+SET = replace(make_set(5), numbers=np.array([10, 3, 7, 5, 8]))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def report(anymal):
     none = result_of([[GOAL] * 4, [BAD] * 4, [LATE] * 4], reward=[[20] * 4, [0] * 4, [8] * 4])
     crossed = {"hand_crafted": {"base": good, "C-G": good}, "generated": {"base": poor, "C-G": none}}
     measured = {name: {who: measure(row[who], (1.0, 1.0)) for who in row} for name, row in crossed.items()}
-    return tables_of(anymal, measured, {"generated": make_set("generated", 3, 100)})
+    return tables_of(anymal, measured, {"generated": make_set(3, 100)})
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +36,13 @@ def certified(anymal):
     given = Certificates(("C-G", "S"), ("a", "b"), np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool), "f")
     goals = {"base": [4, 1, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
     row = {who: make_measured(counts, of=4) for who, counts in goals.items()}
-    elites = replace(make_set("generated", 4, 10), certificates=given, families=np.arange(4))
+    elites = replace(make_set(4, 10), certificates=given, families=np.arange(4))
     return tables_of(anymal, {"generated": row, "hard_random": row}, {"generated": elites})
 
 
 def tables_of(robot, measured, sets):
     """Tables of crossings on some sets; others are of hard-random terrains."""
-    sets = {name: make_set(name, len(next(iter(row.values())).goals)) for name, row in measured.items()} | sets
+    sets = {name: make_set(len(next(iter(row.values())).goals)) for name, row in measured.items()} | sets
     about = {who: ABOUT[who] for who in next(iter(measured.values()))}
     return make_tables(measured, sets, robot, controllers=about, episodes=4, seed=0)
 
@@ -61,7 +61,7 @@ def test_values_are_means_over_terrains(report):
 
 def test_intervals_over_elites_are_over_families_of_kin(anymal):
     measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 8 + [0] * 2, of=4))}
-    kin = replace(make_set("generated", 10), families=np.array([0] * 4 + [1] * 4 + [2, 3]))
+    kin = replace(make_set(10), families=np.array([0] * 4 + [1] * 4 + [2, 3]))
     of_terrains, of_kin = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
     # Of four families 1 of 16 resamples has nothing but the two that fail; of ten terrains hardly any has 6 that do.
     assert of_kin["intervals"]["goal"]["generated"]["base"][0] == 0.0

@@ -62,7 +62,7 @@ def close(device: str) -> dict[str, float]:
 
 @pytest.mark.parametrize("desired_kl", [1e-5, 0.01, 10.0])  # the learning rate falls, moves both ways, rises
 def test_update_equals_rsl_rl(desired_kl: float, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
-    cfg = replace(CFG, desired_kl=desired_kl)
+    cfg = replace(CFG, desired_kl=desired_kl, clip=0.005)  # so little that values and ratios are clipped
     ours, theirs = make_runner(CapturedPPO, cfg, device), make_runner(PPO, cfg, device)
     losses = []
     for runner in (ours, theirs):
@@ -81,26 +81,6 @@ def test_settings_reach_rsl_rl(device: str) -> None:
     alg = make_runner(CapturedPPO, cfg, device).alg
     assert (alg.learning_rate, alg.gamma, alg.lam, alg.clip_param) == (0.002, 0.5, 0.6, 0.3)
     assert (alg.desired_kl, alg.entropy_coef, alg.num_learning_epochs, alg.num_mini_batches) == (0.7, 0.8, 3, 2)
-
-
-def test_the_value_moves_no_further_than_the_clip_in_an_update(device: str) -> None:
-    # The critic says .5, which is what came; it said 0 before. Clipped to 0 + .2, its error is .3 and its square .09.
-    runner = make_runner(CapturedPPO, replace(CFG, epochs=1, mini_batches=1), device)
-    alg = runner.alg
-    with torch.no_grad():
-        for parameter in alg.critic.parameters():
-            parameter.zero_()
-        list(alg.critic.parameters())[-1].fill_(0.5)
-    observations = runner.env.get_observations()
-    with torch.inference_mode():
-        for _ in range(8):
-            actions = alg.act(observations)
-            observations, rewards, dones, extras = runner.env.step(actions)
-            alg.process_env_step(observations, rewards, dones, extras)
-        alg.compute_returns(observations)
-        alg.storage.values.zero_()
-        alg.storage.returns.fill_(0.5)
-    assert alg.update()["value"] == pytest.approx(0.09, rel=1e-5)
 
 
 @pytest.mark.parametrize("changes", [{"gamma": 2.0}, {"mini_batches": 49}, {"hidden_dims": ()}])

@@ -47,6 +47,12 @@ def test_the_other_mixes():
     assert not any(np.array_equal(before, after) for before in first.heights[2:] for after in second.heights[2:])
 
 
+def test_hand_crafted_terrains_are_as_low_as_the_space():
+    spaces = map(get_space, ("super_gaussian@0.05", "super_gaussian"))
+    low, usual = (make_mix(kind="hand-crafted", spaces=(space,)).next().heights for space in spaces)
+    np.testing.assert_allclose(low, usual / 5, rtol=1e-5)
+
+
 def test_exchanges_differ_and_follow_from_the_seed():
     mix, same, other = make_mix(), make_mix(), make_mix(seed=1)
     first = mix.next().heights
