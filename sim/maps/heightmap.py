@@ -92,18 +92,15 @@ def read_heightmap(
         heights = _read_png(path)
         values = read_json(beside) if beside.exists() else {}
         if scale_m is None and "scale_m" not in values:
-            raise ValueError(
-                f"{path}: expected metres a gray level: give --scale, or scale_m in {beside.name} beside it"
-            )
+            raise ValueError(f"{path}: expected metres a gray level: give --scale, or scale_m in {beside.name}")
     else:
         raise ValueError(f"a heightmap must be an .npz or a .png file, got {path}: save it as one of these")
     given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
-    values = {name: given[name] if given[name] is not None else values.get(name) for name in given}
-    if values["size_m"] is None:
-        raise ValueError(
-            f"{path}: expected its size: give --size X Y in metres, or size_m in the .npz or in {beside.name}"
-        )
-    meaning = from_builtins(_Meaning, {name: value for name, value in values.items() if value is not None}, str(path))
+    values = {name: values.get(name) if value is None else value for name, value in given.items()}
+    values = {name: value for name, value in values.items() if value is not None}
+    if "size_m" not in values:
+        raise ValueError(f"{path}: expected its size: give --size X Y [m], or size_m in the .npz or in {beside.name}")
+    meaning = from_builtins(_Meaning, values, str(path))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
         heights = heights * meaning.scale_m + meaning.offset_m
     _check_heights(path, heights)
@@ -129,9 +126,7 @@ def _read_png(path: Path) -> NDArray[np.float64]:
     except Exception as error:  # a damaged image can fail with anything
         raise ValueError(f"{path} must be a PNG image, got: {error}") from None
     if gray is None:
-        raise ValueError(
-            f"{path} must be a grayscale image of 8 or 16 bits, got mode '{mode}', {size}: convert it first"
-        )
+        raise ValueError(f"{path} must be grayscale of 8 or 16 bits, got mode '{mode}', {size}: convert it first")
     return gray[::-1].astype(np.float64)
 
 
@@ -140,12 +135,10 @@ def _ground_in(path: Path, arrays: dict[str, NDArray[Any]], size_m: tuple[float,
     if not maps:
         return None
     if not _is_whole(size_m):
-        raise ValueError(
-            f"{path}: with friction or softness it must be {_WHOLE[0]:g} m x {_WHOLE[1]:g} m, got {size_m}"
-        )
-    plain = GroundMaps.plain(1)
+        raise ValueError(f"{path}: with friction or softness it must be {_WHOLE[0]:g} x {_WHOLE[1]:g} m, got {size_m}")
     try:
-        return replace(plain, **{name: np.asarray(values, np.float32)[None] for name, values in maps.items()})
+        each = {name: np.asarray(values, np.float32)[None] for name, values in maps.items()}
+        return replace(GroundMaps.plain(1), **each)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -1,8 +1,8 @@
 """Recordings on disk: one npz, read as data, whose names and shapes are checked.
 
-The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays of those names, ``origin`` as JSON, and
-``format`` as its name and version. Of terrains given by genes of a shipped space it holds no heights: the reader makes
-them again. Of a space of a user's own it holds both, so that reading runs no code.
+The file holds the fields of :class:`sim.recording.recorder.Recording` as arrays of those names, of ``ground`` its two
+maps, ``origin`` as JSON, and ``format`` as its name and version. Of terrains given by genes of a shipped space it holds
+no heights: the reader makes them again. Of a space of a user's own it holds both, so that reading runs no code.
 """
 
 import json
@@ -16,7 +16,7 @@ import numpy as np
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
-from sim.ground import PATCHES
+from sim.ground import PATCHES, GroundMaps
 from sim.recording.recorder import FRAME_ARRAYS, Recording
 from sim.spaces.registry import get_space, is_own
 
@@ -42,6 +42,8 @@ _OPTIONAL = ("genes", "heights", "friction", "time_constant_s")
 def write_recording(path: Path, recording: Recording) -> None:
     """Writes a recording, atomically, as an ``.npz`` by custom; equal recordings give equal bytes."""
     values = {field.name: getattr(recording, field.name) for field in fields(Recording)}
+    values |= {} if recording.ground is None else vars(recording.ground)
+    del values["ground"]
     if recording.genes is not None and not is_own(recording.origin["space"]):
         del values["heights"]
     values |= {"format": FORMAT, "origin": json.dumps(recording.origin)}
@@ -70,6 +72,8 @@ def _read(path: Path) -> Recording:
     check_shapes(content, _SHAPES)
     origin = json.loads(str(content["origin"]))
     values: dict[str, Any] = {"genes": None, **content}
+    if maps := {name: values.pop(name) for name in ("friction", "time_constant_s") if name in content}:
+        values["ground"] = GroundMaps(**maps)
     if "heights" not in content:
         values["heights"] = heights_of(content["genes"], get_space(origin["space"]))
     values |= {name: content[name].astype(np.float32) for name in FRAME_ARRAYS}

@@ -82,29 +82,20 @@ class Recording:
     touching: NDArray[np.bool_]
     """Whether each geom was pushed with more than 0.1 N in the last physics step, shape (T, K, F, G); the base's also
     where its collision ended the episode, whenever in the last control step that was. False from ``num_frames`` on."""
-    friction: NDArray[np.float32] | None = None
-    """Of the patches of each terrain, shape (T, rows, cols); None where ground is as always."""
-    time_constant_s: NDArray[np.float32] | None = None
-    """Softness of the patches, with and without as ``friction`` (:class:`sim.ground.GroundMaps`)."""
+    ground: GroundMaps | None = None
+    """Friction and softness of the terrains; None where ground is as always."""
 
     @property
     def num_episodes(self) -> int:
         """K."""
         return self.outcome.shape[1]
 
-    @property
-    def ground(self) -> GroundMaps | None:
-        """Friction and softness of the terrains."""
-        if self.friction is None or self.time_constant_s is None:
-            return None
-        return GroundMaps(friction=self.friction, time_constant_s=self.time_constant_s)
-
     def of_terrain(self, terrain: int) -> "Recording":
         """The recording of the terrain of one index alone."""
         row, frames = slice(terrain, terrain + 1), int(self.num_frames[terrain].max())
         cut = {name: getattr(self, name)[row, :, :frames] for name in (*FRAME_ARRAYS, "touching")}
         each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s", "num_frames")
-        given = [name for name in ("genes", "friction", "time_constant_s") if getattr(self, name) is not None]
+        given = [name for name in ("genes", "ground") if getattr(self, name) is not None]
         return replace(self, **cut, **{name: getattr(self, name)[row] for name in (*each, *given)})
 
     def result(self) -> RolloutResult:
@@ -238,8 +229,7 @@ def record(
         dt=robot.control_dt,
         labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
         heights=heights.copy(),  # on the CPU numpy() is a view
-        friction=None if maps is None else maps.friction[: len(terrains)],
-        time_constant_s=None if maps is None else maps.time_constant_s[: len(terrains)],
+        ground=None if maps is None else maps[: len(terrains)],
         genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
         seeds=seeds.astype(np.uint32),
         origin={

@@ -191,9 +191,8 @@ def _keep_robot(spec: Any) -> list[str]:
     problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
     problems += [f"a flexible body ({flex.info})" for flex in spec.flexes]
     for body in spec.bodies:
-        moving = [joint for joint in body.joints]
-        problems += [f"a ball joint ({joint.info})" for joint in moving if joint.type == _JOINT.mjJNT_BALL]
-        problems += [f"<joint ref> ({joint.info})" for joint in moving if joint.ref]
+        problems += [f"a ball joint ({joint.info})" for joint in body.joints if joint.type == _JOINT.mjJNT_BALL]
+        problems += [f"<joint ref> ({joint.info})" for joint in body.joints if joint.ref]
         problems += [f"<body {name}> ({body.info})" for name in ("gravcomp", "mocap") if getattr(body, name)]
         for number, geom in enumerate(touching_geoms(body)):
             geom.name = geom.name or f"{body.name}_geom_{number}"

@@ -77,6 +77,8 @@ def _read_toml(path: Path, file: Path) -> tuple[RobotCfg, RobotFile]:
     known = [field.name for field in fields(RobotCfg) if field.name != "settings_file"]
     if unknown := [name for name in given if name not in known]:
         raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(known)}")
+    if no_list := [name for name in _NAMES if not isinstance(given.get(name, []), list)]:
+        raise ValueError(f"{path}: {', '.join(no_list)} must be a list of names")
     if not isinstance(given.get("model_file"), str):
         raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
     of_file = read_robot_file(file.parent / given["model_file"])
@@ -177,19 +179,16 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     wrong = {line.split(" ", 1)[0] for line in mistakes}
     if "name" not in wrong and not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
         mistakes.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
-    if robot.name in ROBOTS:
+    elif "name" not in wrong and robot.name in ROBOTS:
         mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
     if wrong.isdisjoint(_NAMES):
         mistakes += _name_problems(robot)
     if (robot.stiffness is None) != (robot.damping is None):
         mistakes.append("stiffness and damping must be given together")
-    given, least = robot.contact_time_constant_s, 2.0 * robot.physics_dt
-    if (
-        given is not None
-        and wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
-        and given < least * (1.0 - 1e-9)
-    ):
-        mistakes.append(f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {given:g}")
+    fine = wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
+    given, step = robot.contact_time_constant_s if fine else None, robot.physics_dt
+    if given is not None and given < 2.0 * step * (1.0 - 1e-9):
+        mistakes.append(f"contact_time_constant_s must be at least twice physics_dt, {2 * step:g} s, got {given:g}")
     return mistakes
 
 
@@ -199,12 +198,11 @@ def _name_problems(robot: RobotCfg) -> list[str]:
     twice = sorted({name for a, b in itertools.combinations(roles.values(), 2) for name in {*a} & {*b}})
     strange = [name for name in getattr(robot.training, "steady_joints", ()) if name not in robot.joint_names]
     known = set(robot.penalties) <= set(PENALTIES) and len(robot.penalties) >= 2
+    needed = ("base_geoms", "foot_geoms", "joint_names")
+    repeats = {field: ", ".join(row) for field, row in names.items() if len({*row}) < len(row)}
     findings = [
-        *((field != "limb_geoms" and not names[field], f"{field} must name at least one") for field in _NAMES[:-1]),
-        *(
-            (len({*row}) < len(row), f"{field} must hold each name once, got {', '.join(row)}")
-            for field, row in names.items()
-        ),
+        *((not names[field], f"{field} must name at least one") for field in needed),
+        *((True, f"{field} must hold each name once, got {row}") for field, row in repeats.items()),
         (twice, f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}"),
         (not known, f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}"),
         (strange, f"training.steady_joints: no joint named {', '.join(strange)} in joint_names"),

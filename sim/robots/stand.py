@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.bank import TerrainBank
+from sim.bank import TerrainBank, heights_of
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot, geom_names
 from sim.robots.probes import extents, start_height
@@ -70,10 +70,8 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains."""
     rng = np.random.default_rng(seed)
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    genes = np.concatenate([np.zeros((1, SUPER_GAUSSIAN.num_genes)), SUPER_GAUSSIAN.hard_random(_TERRAINS, seed)])
-    bank.set_genes(genes.astype(np.float32))
-    heights = np.array(bank.heights.numpy())
-    heights[0] = 0.0
+    rough = heights_of(SUPER_GAUSSIAN.hard_random(_TERRAINS, seed))
+    heights = np.concatenate([np.zeros_like(rough[:1]), rough])
     bank.set_heights(heights)
     sim = Simulation(robot, bank, np.concatenate([[0], 1 + np.arange(drops) % _TERRAINS]))
     q = np.zeros((1 + drops, 7 + robot.num_joints), dtype=np.float32)

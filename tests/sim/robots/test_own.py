@@ -110,6 +110,7 @@ def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path)
         ("default_joint_pos = [0.1]", "default_joint_pos"),
         ("speed = 'fast'", "speed"),
         ("base_geoms = ['tail']", "tail"),
+        ("base_geoms = 3", "base_geoms"),
         ("=", "TOML"),
     ],
 )
