@@ -21,7 +21,7 @@ from sim.bank import TerrainBank
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
 from sim.ground import GroundMaps
 from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
-from sim.policy.runner import Memory, PolicyRunner
+from sim.policy.runner import PolicyRunner
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -313,7 +313,7 @@ class Rollout:
             self._queue.busy.zero_()
             self._began_at = self._taken_at = self._step
             self._taken_s = time.perf_counter()
-        if idle or self._policy.memory is not Memory.WHOLE:
+        if idle or self._policy.memory != "reset()":
             self._release(begin=idle)
 
     def _write_terrains(self, terrains: Any, seeds: Any, slots: Sequence[slice], ground: GroundMaps | None) -> None:
@@ -332,7 +332,7 @@ class Rollout:
     def _release(self, *, begin: bool) -> None:
         """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
         count = self._num_unreleased
-        if self._policy.memory is Memory.WHOLE:
+        if self._policy.memory == "reset()":
             count = min(count, self.num_envs)
             self._policy.reset()
         self._num_unreleased -= count

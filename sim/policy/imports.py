@@ -3,7 +3,8 @@
 import os
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,23 +34,25 @@ _TERMS = {
 _ISAAC_TERMS = {"base_lin_vel": "lin_vel", "base_ang_vel": "ang_vel", "projected_gravity": "gravity",
                 "generated_commands": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel",
                 "last_action": "last_action", "height_scan": "scan", "gait_phase": "clock"}  # fmt: skip
-_ISAAC_GROUP = ("concatenate_terms", "concatenate_dim", "enable_corruption", "history_length", "flatten_history_dim")
 _RL_SAR = {"default_dof_pos": "default_joint_pos", "rl_kp": "stiffness", "rl_kd": "damping", "dt": "physics_dt",
            "decimation": "decimation", "action_scale": "action_scale"}  # fmt: skip
 _RL_SAR_MORE = {"torque_limits": "effort_limit", "clip_obs": "observation_clip"}
-_RL_SAR_SCALES = {"lin_vel": "lin_vel_scale", "ang_vel": "ang_vel_scale", "command": "commands_scale",
-                  "joint_pos": "dof_pos_scale", "joint_vel": "dof_vel_scale"}  # fmt: skip
+_SCALES = {"lin_vel_scale": "lin_vel", "ang_vel_scale": "ang_vel", "commands_scale": "command", "cmd_scale": "command",
+           "dof_pos_scale": "joint_pos", "dof_vel_scale": "joint_vel"}  # fmt: skip
 _DEPLOYMENT = {"default_angles": "default_joint_pos", "kps": "stiffness", "kds": "damping",
                "simulation_dt": "physics_dt", "control_decimation": "decimation",
                "action_scale": "action_scale"}  # fmt: skip
 _MJLAB = {"default_joint_pos": "default_joint_pos", "joint_stiffness": "stiffness", "joint_damping": "damping",
           "action_scale": "action_scale"}  # fmt: skip
+_BLIND = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
 
 
 @dataclass(kw_only=True)
 class _Found:
-    """What a source says of a robot, whose file is known, and of its controller."""
+    """What a source says of a robot, whose model is known, and of its controller."""
 
+    file: Path
+    """Of the source, as errors name it."""
     model_file: Path
     model: Any
     joints: tuple[str, ...]
@@ -65,27 +68,27 @@ class _Found:
         self.settings |= settings
         self.why |= dict.fromkeys(settings, why)
 
-    def check(self, file: Path, said: Mapping[str, Any], needed: Sequence[str], more: Sequence[str], idle: str) -> None:
-        """Refuses names that are missing, and those that nobody understands."""
+    def leave(self, said: Mapping[str, Any], idle: str) -> None:
+        """Refuses what nobody has taken, except what is idle."""
         self.unused = [name for name in idle.split() if name in said]
-        if missing := [name for name in needed if name not in said]:
-            raise ValueError(f"{file} must say {', '.join(missing)}")
-        _refuse_unknown(file, said, (*needed, *more, *self.unused))
+        self.check_known(said, self.unused)
 
-    def take(self, file: Path, said: Mapping[str, Any], table: Mapping[str, str], joints: Sequence[str]) -> None:
+    def check_known(self, names: Iterable[str], known: Iterable[str]) -> None:
+        """Refuses names that nobody understands."""
+        if unknown := [str(name) for name in names if name not in known]:
+            what = f"{self.file} says what is not understood: {', '.join(unknown)}"
+            raise ValueError(f"{what}: take it out if it does not matter")
+
+    def take(self, said: dict[str, Any], table: Mapping[str, str], joints: Sequence[str]) -> None:
         """Settings that ``table`` gives other names; those of the robot's joints in the order of its file."""
         for key, name in table.items():
-            value = said.get(key)
+            value = said.pop(key)
             if name in PER_JOINT and isinstance(value, list):
-                if len(value) != len(joints):
-                    got = f"{', '.join(joints)}, got {len(value)}"
-                    raise ValueError(f"{file}: {key} must have {len(joints)} values, of {got}")
-                if set(joints) != set(self.joints):
-                    must = f"those of {self.model_file}, {', '.join(self.joints)}"
-                    raise ValueError(f"{file}: joints of {key} must be {must}, got {', '.join(joints)}")
+                if set(joints) != set(self.joints) or len(value) != len(joints):
+                    must = f"one a joint of {self.model_file}, {', '.join(self.joints)}"
+                    raise ValueError(f"{self.file}: {key} must be {must}, got {len(value)} of {', '.join(joints)}")
                 value = [value[list(joints).index(joint)] for joint in self.joints]
-            if key in said:
-                self.put(**{name: _one_of(value)})
+            self.put(**{name: _one_of(value)})
 
     def order(self, joints: Sequence[str], why: str = "") -> None:
         """The controller's order of joints, where it is not that of the file."""
@@ -120,9 +123,13 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
     of_file = read_robot_file(model_file)
-    found = _Found(model_file=model_file, model=of_file.model, joints=joint_names(of_file.model), home=of_file.home)
+    joints = joint_names(of_file.model)
+    found = _Found(file=source, model_file=model_file, model=of_file.model, joints=joints, home=of_file.home)
     kind, read = _reader_of(source)
-    weights = read(source, found)
+    try:
+        weights = read(source, found)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{source} must be {kind}, but: {type(error).__name__}: {error}") from None
     out.mkdir(parents=True, exist_ok=True)
     found.put(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights.name)
     print(f"{source} is read as {kind}; its weights are {weights}.")
@@ -187,11 +194,6 @@ def _weights_of(folder: Path, name: str) -> Path:
     return file
 
 
-def _refuse_unknown(file: Path, names: Any, known: Any) -> None:
-    if unknown := [str(name) for name in names if name not in known]:
-        raise ValueError(f"{file} says what is not understood: {', '.join(unknown)}: take it out if it does not matter")
-
-
 def _one_of(values: Any) -> Any:
     """One value in place of a list of equal ones."""
     return values[0] if isinstance(values, list) and all(value == values[0] for value in values) else values
@@ -205,46 +207,43 @@ def _term(name: str, scale: Any = None, **more: Any) -> dict[str, Any]:
 
 def _read_rl_sar(source: Path, found: _Found) -> Path:
     """A controller's YAML over the base.yaml of its robot, which is beside it or in the folder above."""
-    file = source / "config.yaml" if source.is_dir() else source
+    found.file = file = source / "config.yaml" if source.is_dir() else source
     bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
     base = next((place for place in bases if place.is_file()), None)
     if base is None:
         raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
     said = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
-    needed = (*_RL_SAR, "model_name", "observations", "joint_names", "joint_mapping")
-    more = (*_RL_SAR_MORE, *_RL_SAR_SCALES.values(), "observations_history", "observations_history_priority",
-            "clip_actions_lower", "clip_actions_upper", "wheel_indices")  # fmt: skip
-    unused = "fixed_kp fixed_kd num_of_dofs num_observations joint_controller_names framework"
-    found.check(file, said, needed, more, unused)
-    if said.get("wheel_indices"):
+    if said.pop("wheel_indices", None):
         raise ValueError(f"{file}: wheel_indices must be empty, since wheels are not supported")
-    joints = [said["joint_names"][k] for k in said["joint_mapping"]]
+    names = said.pop("joint_names")
+    joints = [names[k] for k in said.pop("joint_mapping")]
     found.order(joints)
-    found.take(file, said, _RL_SAR | _RL_SAR_MORE, joints)
+    found.take(said, _RL_SAR | {key: name for key, name in _RL_SAR_MORE.items() if key in said}, joints)
     if "clip_actions_upper" in said:
-        pairs = [list(pair) for pair in zip(said["clip_actions_lower"], said["clip_actions_upper"], strict=True)]
+        limits = said.pop("clip_actions_lower"), said.pop("clip_actions_upper")
+        pairs = [list(pair) for pair in zip(*limits, strict=True)]
         high = pairs[0][1]
         found.put(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
-    steps = said.get("observations_history") or [0]
+    steps = said.pop("observations_history", None) or [0]
     if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
         raise ValueError(f"{file}: observations_history must be all steps from 0 on, got {steps}")
+    by = {"time": "row", "term": "term"}[said.pop("observations_history_priority", "time")]
     if len(steps) > 1:
-        by = {"time": "row", "term": "term"}[said.get("observations_history_priority", "time")]
         history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
         found.put(history=history, why="steps before the start are zeros, as in rl_sar's own loop")
-    _refuse_unknown(file, said["observations"], _TERMS)
-    names = [_TERMS[name] for name in said["observations"]]
-    found.put(observation=[_term(name, said.get(_RL_SAR_SCALES.get(name, ""))) for name in names])
-    return _weights_of(file.parent, said["model_name"])
+    terms = said.pop("observations")
+    found.check_known(terms, _TERMS)
+    scales = {name: said.pop(key) for key, name in _SCALES.items() if key in said}
+    found.put(observation=[_term(_TERMS[name], scales.get(_TERMS[name])) for name in terms])
+    weights = _weights_of(file.parent, said.pop("model_name"))
+    found.leave(said, "fixed_kp fixed_kd num_of_dofs num_observations joint_controller_names framework")
+    return weights
 
 
 def _read_deployment(source: Path, found: _Found) -> Path:
     """A YAML of ``deploy_mujoco``, whose script has the observation: its order, and a clock if there is room for it."""
     said = read_yaml(source)
-    needed = (*_DEPLOYMENT, "policy_path", "ang_vel_scale", "dof_pos_scale", "dof_vel_scale", "cmd_scale",
-              "num_actions", "num_obs")  # fmt: skip
-    found.check(source, said, needed, (), "xml_path simulation_duration cmd_init")
-    count, width = said["num_actions"], said["num_obs"]
+    count, width = said.pop("num_actions"), said.pop("num_obs")
     if count != len(found.joints):
         joints = f"{len(found.joints)}, the joints of {found.model_file}"
         raise ValueError(f"{source}: num_actions must be {joints}, got {count}")
@@ -252,28 +251,28 @@ def _read_deployment(source: Path, found: _Found) -> Path:
     if width not in (blind, clocked):
         by_hand = "describe it by hand (docs/controllers.md)"
         raise ValueError(f"{source}: num_obs must be {blind}, or {clocked} with a clock, got {width}: {by_hand}")
-    found.take(source, said, _DEPLOYMENT, found.joints)
-    scales = {"ang_vel": "ang_vel_scale", "gravity": "", "command": "cmd_scale", "joint_pos": "dof_pos_scale",
-              "joint_vel": "dof_vel_scale", "last_action": ""}  # fmt: skip
-    terms = [_term(name, said.get(key)) for name, key in scales.items()]
+    found.take(said, _DEPLOYMENT, found.joints)
+    scales = {_SCALES[key]: said.pop(key) for key in ("ang_vel_scale", "cmd_scale", "dof_pos_scale", "dof_vel_scale")}
+    terms = [_term(name, scales.get(name)) for name in _BLIND]
     terms += [{"term": "clock", "period_s": 0.8}] * (width == clocked)
     clock = ", and the period of its clock" * (width == clocked)
     found.put(observation=terms, why=f"the order of unitree_rl_gym's deploy_mujoco.py{clock}")
-    return _weights_of(source.parent, said["policy_path"])
+    weights = _weights_of(source.parent, said.pop("policy_path"))
+    found.leave(said, "xml_path simulation_duration cmd_init")
+    return weights
 
 
 def _read_mjlab(source: Path, found: _Found) -> Path:
     """An ONNX file with the metadata of mjlab's exporter, rounded to three decimals."""
-    said = _onnx_metadata(source)
-    of_terms = [f"observation_terms_{name}" for name in ("scale", "clip", "history_length")]
-    needed = (*_MJLAB, "joint_names", "observation_names")
-    found.check(source, said, needed, of_terms, "run_path command_names observation_terms_flatten_history_dim")
-    names, joints = said["observation_names"].split(","), said["joint_names"].split(",")
-    _refuse_unknown(source, names, _TERMS)
-    found.take(source, {key: [float(part) for part in said[key].split(",")] for key in _MJLAB}, _MJLAB, joints)
+    said: dict[str, Any] = {key: text.split(",") for key, text in _onnx_metadata(source).items() if text}
+    names, joints = said.pop("observation_names"), said.pop("joint_names")
+    found.check_known(names, _TERMS)
+    found.take({key: [*map(float, said.pop(key))] for key in _MJLAB}, _MJLAB, joints)
     found.order(joints)
     found.put(physics_dt=0.005, decimation=4, why="the metadata do not say it; mjlab's own tasks are like this")
-    scales, clips, lengths = (said[key].split(",") if said.get(key) else [""] * len(names) for key in of_terms)
+    scales, clips, lengths = (said.pop(f"observation_terms_{name}", [""] * len(names))
+                              for name in ("scale", "clip", "history_length"))  # fmt: skip
+    found.leave(said, "run_path command_names observation_terms_flatten_history_dim")
     terms, why = [], ""
     for name, scale, clip in zip(names, scales, clips, strict=True):
         limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
@@ -298,8 +297,7 @@ def _read_weights(source: Path, found: _Found) -> Path:
     found.put(action_scale=None, why="radians per unit of action, one or one a joint")
     if count not in (None, len(found.joints)):
         found.put(joints=None, why=f"the {count} joints that it moves, in its order")
-    terms = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
-    example = to_toml([_term("lin_vel", at=place), *map(_term, terms)])
+    example = to_toml([_term("lin_vel", at=place), *map(_term, _BLIND)])
     found.put(observation=None, why=f"its {width or 'all'} columns in its order, with scale; of {example}")
     return source
 
@@ -310,27 +308,21 @@ def _widths(source: Path) -> tuple[int | None, int | None]:
     if hasattr(network, "sizes"):
         return network.sizes
     for weight in network.parameters():
-        if weight.ndim == 2:
-            try:
-                return weight.shape[1], network(torch.zeros(1, weight.shape[1])).shape[1]
-            except (RuntimeError, AttributeError):
-                continue
+        with suppress(RuntimeError, AttributeError, IndexError):  # of an inner layer
+            return weight.shape[1], network(torch.zeros(1, weight.shape[1])).shape[1]
     return None, None
 
 
 def _read_isaac_lab(source: Path, found: _Found) -> Path:
     """A run folder of Isaac Lab: params/env.yaml, params/agent.yaml, exported/ or checkpoints."""
-    file, agent_file = source / "params" / "env.yaml", source / "params" / "agent.yaml"
-    env = read_yaml(file)
-    try:
-        _isaac_robot(env, file, found)
-        order = _isaac_action(env["actions"], source, file, found)
-        group = env["observations"]["policy"]
-        terms = {name: term for name, term in group.items() if name not in _ISAAC_GROUP and term is not None}
-        lengths = [group.get("history_length") or term.get("history_length") or 1 for term in terms.values()]
-        rows = [_isaac_term(name, term, env["scene"], order, file, found) for name, term in terms.items()]
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{file} is not what Isaac Lab writes for a robot: {type(error).__name__}: {error}") from None
+    found.file, agent_file = source / "params" / "env.yaml", source / "params" / "agent.yaml"
+    env = read_yaml(found.file)
+    _isaac_robot(env, found)
+    order = _isaac_action(env["actions"], source, found)
+    group = env["observations"]["policy"]
+    terms = {name: term for name, term in group.items() if isinstance(term, dict)}
+    lengths = [group.get("history_length") or term.get("history_length") or 1 for term in terms.values()]
+    rows = [_isaac_term(name, term, env["scene"], order, found) for name, term in terms.items()]
     found.stack(rows, lengths)
     found.put(observation=rows)
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
@@ -345,12 +337,12 @@ def _read_isaac_lab(source: Path, found: _Found) -> Path:
     return (*exported, *checkpoints[::-1])[0]
 
 
-def _isaac_robot(env: dict[str, Any], file: Path, found: _Found) -> None:
+def _isaac_robot(env: dict[str, Any], found: _Found) -> None:
     """Pose, gains, limits, steps and speed."""
-    articulation, joints = env["scene"]["robot"], found.joints
+    articulation, joints, file = env["scene"]["robot"], found.joints, found.file
     pose = per_joint(articulation["init_state"]["joint_pos"], joints, f"{file}: init_state.joint_pos", partly=True)
     found.put(default_joint_pos=_one_of([angle or 0.0 for angle in pose]))
-    values: dict[str, dict[str, Any]] = {name: {} for name in PER_JOINT[1:]}
+    values: dict[str, dict[str, Any]] = {name: dict.fromkeys(joints) for name in PER_JOINT[1:]}
     notes = []
     for name, group in articulation["actuators"].items():
         kind = str(group.get("class_type", "")).rpartition(":")[2]
@@ -361,12 +353,11 @@ def _isaac_robot(env: dict[str, Any], file: Path, found: _Found) -> None:
             given = group.get(f"{key}_sim") if group.get(key) is None else group[key]
             of_key |= zip(moved, per_joint(given, moved, f"{file}: {name}.{key}", partly=True), strict=True)
     for key, of_key in values.items():
-        without = [joint for joint in joints if of_key.get(joint) is None]
+        without = [joint for joint, value in of_key.items() if value is None]
+        asked = f"a gain of each joint: none is said of {', '.join(without)}"
         if not without:
-            known = _one_of([of_key[joint] for joint in joints])
-            found.put(**{key: known}, why="; ".join(notes) if key == "stiffness" else "")
+            found.put(**{key: _one_of([*of_key.values()])}, why="; ".join(notes) if key == "stiffness" else "")
         elif key in ("stiffness", "damping"):
-            asked = f"a gain of each joint: none is said of {', '.join(without)}"
             found.put(**{key: None}, why="; ".join([asked, *notes]))
     found.put(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
     ranges = [command["ranges"]["lin_vel_x"][1] for command in (env.get("commands") or {}).values()
@@ -383,9 +374,9 @@ def _chosen(patterns: Any, order: Sequence[str], preserve: Any = False) -> list[
     return list(found) if preserve else [joint for joint in order if joint in found]
 
 
-def _isaac_action(actions: dict[str, Any], source: Path, file: Path, found: _Found) -> list[str]:
+def _isaac_action(actions: dict[str, Any], source: Path, found: _Found) -> list[str]:
     """Scale, offset and order of actions; returns the order of all joints, which env.yaml does not say."""
-    why = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
+    file, why = found.file, "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
     order = _breadth_first(found.model)
     for said in sorted(source.rglob("*IO_descriptors.yaml"))[:1]:
         order, why = read_yaml(said)["articulations"]["robot"]["joint_names"], ""
@@ -407,26 +398,22 @@ def _isaac_action(actions: dict[str, Any], source: Path, file: Path, found: _Fou
 
 def _breadth_first(model: Any) -> list[str]:
     """Joints from the base outwards, those of a body's children by name."""
-    order, level = list[str](), [1]
     names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
-    while level:
-        level = [
-            child
-            for parent in level
-            for child in sorted(np.flatnonzero(model.body_parentid == parent), key=lambda k: names[int(k)])
-        ]
-        order += [names[int(body)] for body in level]
-    return order
+
+    def path(body: int) -> list[str]:
+        return [*path(int(model.body_parentid[body])), names[body]] if body in names else []
+
+    return [joints[-1] for joints in sorted(map(path, names), key=lambda joints: (len(joints), joints))]
 
 
 def _isaac_term(
-    name: str, term: dict[str, Any], scene: dict[str, Any], order: Sequence[str], file: Path, found: _Found
-) -> dict[str, Any]:  # fmt: skip
+    name: str, term: dict[str, Any], scene: dict[str, Any], order: Sequence[str], found: _Found
+) -> dict[str, Any]:
     function, params = re.split(r"[:.]", str(term["func"]))[-1], term.get("params") or {}
     if function not in _ISAAC_TERMS or term.get("modifiers"):
         what = f"{term['func']}{' with modifiers' if term.get('modifiers') else ''}"
         known = ", ".join(_ISAAC_TERMS)
-        raise ValueError(f"{file} says what is not understood: observation {name}, {what}; only {known}")
+        raise ValueError(f"{found.file} says what is not understood: observation {name}, {what}; only {known}")
     row = _term(_ISAAC_TERMS[function], term.get("scale"), clip=term.get("clip"))
     if function in ("joint_pos_rel", "joint_vel_rel"):
         asset = params.get("asset_cfg") or {}
@@ -440,7 +427,7 @@ def _isaac_term(
         pattern, place = sensor["pattern_cfg"], sensor["offset"]["pos"]
         level = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
         if "resolution" not in pattern or not level:
-            raise ValueError(f"{file}: a height scanner must be a grid in the yaw frame, got {pattern}")
+            raise ValueError(f"{found.file}: a height scanner must be a grid in the yaw frame, got {pattern}")
         step = pattern["resolution"]
         x, y = (
             [round(centre - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]

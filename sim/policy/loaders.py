@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 import warp as wp
@@ -26,23 +26,19 @@ from sim.robots.robot import RobotCfg
 
 _FORMATS = (
     "a description (.toml), an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), "
-    "module:callable or "
-    "file.py:callable (a function on device tensors, or a class or factory marked by `faultline_factory = True` that "
-    "is called with (robot, device)), or module:adapter@file (a function that is called with (controller, robot))"
+    "module:callable or file.py:callable (a function on device tensors, or a class or factory marked by "
+    "`faultline_factory = True` that is called with (robot, device)), or module:adapter@file (a function that is "
+    "called with (controller, robot))"
 )
+Policy = Callable[[torch.Tensor], torch.Tensor]
+"""Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size).
 
-
-class Policy(Protocol):
-    """Anything that maps observations to actions.
-
-    One that remembers has a method ``reset(rows)``, called before every step with a bool tensor of shape (num_envs,):
-    True where a robot begins a new episode. Robots begin at different times. One whose ``reset()`` takes no rows is
-    called when all its robots begin together, which leaves robots idle that have ended.
-    """
-
-    def __call__(self, observation: torch.Tensor, /) -> torch.Tensor:
-        """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size)."""
-        ...
+One that remembers has a method ``reset(rows)``, called before every step with a bool tensor of shape (num_envs,): True
+where a robot begins a new episode. Robots begin at different times. One whose ``reset()`` takes no rows is called when
+all its robots begin together, which leaves robots idle that have ended.
+"""
+PolicySpec = str | Path | Policy
+"""A controller as :func:`load_policy` takes it, or as a callable."""
 
 
 def prepare_torch(device: str) -> None:
@@ -122,15 +118,14 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
+    called, arguments = "robot, device", (robot, device)
     if spec.file is not None:
         called, arguments = "controller, robot", (_load_file(Path(spec.file), robot, device, fits=False), robot)
-    elif getattr(target, "faultline_factory", False):
-        called, arguments = "robot, device", (robot, device)
-    elif inspect.isclass(target):
-        raise ValueError(
-            f"policy '{spec}' is a class: mark it by `faultline_factory = True` to be called with (robot, device)"
-        )
-    else:
+    elif not getattr(target, "faultline_factory", False):
+        if inspect.isclass(target):
+            raise ValueError(
+                f"policy '{spec}' is a class: mark it by `faultline_factory = True` to be called ({called})"
+            )
         return target
     try:
         policy = target(*arguments)
@@ -215,37 +210,35 @@ def load_network(
     return policy.to(device).eval()
 
 
-_NORMALISER = r"obs_normalizer\.(_mean|_var|_std|count)"
-_KNOWN = {
-    "actor_state_dict": rf"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|{_NORMALISER}|distribution\.(log_)?std_param",
-    "model_state_dict": rf"actor\.\d+\.(weight|bias)|memory_[ac]\.rnn\.\w+|actor_{_NORMALISER}|(log_)?std|critic.*",
-}
-"""What rsl_rl 5, and rsl_rl 1 to 4, keep of an actor and beside it."""
 _TODAYS = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
+"""Names of rsl_rl 5 for what rsl_rl 1 to 4 keep of an actor."""
+_KNOWN = (
+    r"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|obs_normalizer\.(_mean|_var|_std|count)|"
+    r"distribution\.(log_)?std_param|(log_)?std|critic.*|memory_c\.rnn\.\w+"
+)
 
 
 def _actor_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
     """The actor's tensors by rsl_rl 5's names."""
-    form = next((name for name in _KNOWN if isinstance(content, dict) and name in content), None)
-    state = content[form] if form else None
-    first = "mlp.0.weight" if form == "actor_state_dict" else "actor.0.weight"
-    if not isinstance(state, dict) or first not in state:
+    forms = ("actor_state_dict", "model_state_dict")
+    state = next((content[form] for form in forms if isinstance(content, dict) and form in content), None)
+    names = {
+        key: next((new + key.removeprefix(old) for old, new in _TODAYS.items() if key.startswith(old)), key)
+        for key in (map(str, state) if isinstance(state, dict) else ())
+    }
+    if not isinstance(state, dict) or "mlp.0.weight" not in names.values():
         got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
         raise ValueError(
             f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', or "
             f"'model_state_dict' with 'actor.0.weight', got {got}"
         )
-    unknown = [str(key) for key in state if not re.fullmatch(_KNOWN[str(form)], str(key))]
-    if unknown:
+    if unknown := [key for key, name in names.items() if not re.fullmatch(_KNOWN, name)]:
         raise ValueError(
-            f"policy '{path}' has more than a perceptron or a recurrent network: {', '.join(unknown)} in '{form}' are "
-            "not understood; export it as TorchScript or ONNX"
+            f"policy '{path}' has more than a perceptron or a recurrent network: {', '.join(unknown)} are not "
+            "understood; export it as TorchScript or ONNX"
         )
-    if form == "model_state_dict":
-        state = {new + key.removeprefix(old): value for old, new in _TODAYS.items() for key, value in state.items()
-                 if key.startswith(old)}  # fmt: skip
-        state |= {f"obs_normalizer.{key}": value for key, value in content.get("obs_norm_state_dict", {}).items()}
-    return state
+    normaliser = {f"obs_normalizer.{key}": value for key, value in content.get("obs_norm_state_dict", {}).items()}
+    return {names[key]: value for key, value in state.items()} | normaliser
 
 
 def _activation_of(content: dict[str, Any], path: Path) -> str:
@@ -333,20 +326,15 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
             f"or holding code): {in_one_line(reason)}; expected {_FORMATS}"
         ) from error
-    if sizes is None:
-        return module
-    initial, axis = _memory_of_script(probe, path, sizes[0])
-    if initial is None:
-        return module
-    return _RecurrentScript(module, initial, axis).to(device) if initial else _Script(module)
+    return module if sizes is None else _by_robot(module, probe, path, sizes[0], device)
 
 
-@torch.inference_mode()
-def _memory_of_script(probe: Any, path: Path, width: int) -> tuple[dict[str, torch.Tensor] | None, int]:
-    """The buffers in which a module on the CPU remembers, as an episode begins, and their axis of robots.
+@torch.no_grad()
+def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> Policy:
+    """A module that remembers each robot, by its copy on the CPU.
 
-    They are those that a call changes, made for one robot: as many rows of them must act as one robot after the other
-    does. None where it remembers elsewhere and has a ``reset()``; empty where it remembers nothing.
+    It remembers in the buffers that a call changes, made for one robot: as many rows of them must act as one robot
+    after the other does. One that remembers elsewhere and has a ``reset()`` stays as it is.
     """
     rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
     begin = next((getattr(probe, name) for name in ("reset", "reset_memory") if hasattr(probe, name)), None)
@@ -356,14 +344,14 @@ def _memory_of_script(probe: Any, path: Path, width: int) -> tuple[dict[str, tor
     try:
         once, again = (probe(rows[0, :1]) for _ in range(2))
     except RuntimeError:  # of another width: it is tried afterwards
-        return {}, 0
+        return _Script(module)
     initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
     if not initial and torch.equal(once, again):
-        return {}, 0
+        return _Script(module)
     if not initial and begin is None:
         raise ValueError(f"policy '{path}' answers the same row differently, and none of its buffers changes: mend it")
     if not initial:
-        return None, 0
+        return module
     apart = []
     for robot in range(rows.shape[1]):
         for name, value in probe.named_buffers():
@@ -377,7 +365,7 @@ def _memory_of_script(probe: Any, path: Path, width: int) -> tuple[dict[str, tor
             except RuntimeError:
                 continue
             if torch.allclose(together, torch.stack(apart), rtol=1e-4, atol=1e-4):
-                return initial, axis
+                return _RecurrentScript(module, initial, axis).to(device)
     raise ValueError(
         f"policy '{path}' remembers one robot alone, in {', '.join(initial)}, and rows of it do not act as one "
         "robot does: give the checkpoint that it was exported from"
@@ -407,7 +395,3 @@ def load_checkpoint(spec: str | Path, robot: RobotCfg) -> MlpPolicy:
     if not isinstance(policy, MlpPolicy):
         raise ValueError(f"policy '{spec}' must be an rsl_rl checkpoint (.pt), got {type(policy).__name__}")
     return policy
-
-
-PolicySpec = str | Path | Callable[[torch.Tensor], torch.Tensor]
-"""A controller as :func:`load_policy` takes it, or as a callable."""

@@ -1,7 +1,5 @@
 """The controllers of rsl_rl's checkpoints."""
 
-import re
-
 import torch
 
 from sim.policy.runner import Recurrent, with_rows_of_zeros
@@ -24,15 +22,13 @@ class MlpPolicy(torch.nn.Module):
         """
         super().__init__()
         self.activation = activation
-        indices = sorted(int(m.group(1)) for key in state if (m := re.fullmatch(r"mlp\.(\d+)\.weight", key)))
+        weights = {key.removeprefix("mlp."): value for key, value in state.items() if key.startswith("mlp.")}
         layers: list[torch.nn.Module] = []
-        for index in indices:
-            weight = state[f"mlp.{index}.weight"]
-            layer = torch.nn.Linear(weight.shape[1], weight.shape[0])
-            layer.weight.data.copy_(weight)
-            layer.bias.data.copy_(state[f"mlp.{index}.bias"])
-            layers += [layer, ACTIVATIONS[activation]()]
+        for index in sorted(int(key.removesuffix(".weight")) for key in weights if key.endswith(".weight")):
+            size, width = weights[f"{index}.weight"].shape
+            layers += [torch.nn.Linear(width, size), ACTIVATIONS[activation]()]
         self.layers = torch.nn.Sequential(*layers[:-1])
+        self.layers.load_state_dict(weights)
         self.mean = torch.nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
         self.std = torch.nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
         self.normalised = "obs_normalizer._mean" in state
@@ -43,11 +39,13 @@ class MlpPolicy(torch.nn.Module):
         linear = [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
         return linear[0].in_features, linear[-1].out_features
 
+    def normalise(self, observation: torch.Tensor) -> torch.Tensor:
+        """Observation rows as the layers see them."""
+        return (observation - self.mean) / (self.std + 1e-2) if self.normalised else observation
+
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean actions, shape (num_envs, num_joints)."""
-        if self.normalised:
-            observation = (observation - self.mean) / (self.std + 1e-2)
-        return self.layers(with_rows_of_zeros(observation))[: len(observation)]
+        return self.layers(with_rows_of_zeros(self.normalise(observation)))[: len(observation)]
 
 
 class RnnPolicy(Recurrent):
@@ -63,14 +61,10 @@ class RnnPolicy(Recurrent):
         super().__init__([torch.zeros(layers, 1, size)] * (2 if kind is torch.nn.LSTM else 1), 1)
         self.rnn = kind(width, size, layers)
         self.rnn.load_state_dict(weights)
-        self.head = MlpPolicy({key: value for key, value in state.items() if key.startswith("mlp.")}, activation)
-        self.mean = torch.nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
-        scale = state["obs_normalizer._std"].float() + 1e-2 if "obs_normalizer._std" in state else torch.ones(1)
-        self.scale = torch.nn.Buffer(scale)
+        self.head = MlpPolicy(state, activation)
         self.sizes = width, self.head.sizes[1]
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Mean actions, and the state after them."""
-        rows = (rows - self.mean) / self.scale
-        out, after = self.rnn(rows[None], tuple(state) if len(state) == 2 else state[0])
-        return self.head(out[0]), [*after] if len(state) == 2 else [after]
+        out, after = self.rnn(self.head.normalise(rows)[None], tuple(state) if len(state) == 2 else state[0])
+        return self.head.layers(out[0]), [*after] if len(state) == 2 else [after]

@@ -21,13 +21,13 @@ _OPERATORS = {"elu": "Elu", "selu": "Selu", "relu": "Relu", "lrelu": "LeakyRelu"
               "softplus": "Softplus", "identity": "Identity"}  # fmt: skip
 _ATTRIBUTES = {"elu": {"alpha": 1.0}, "lrelu": {"alpha": 0.01}}
 _CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
-_Run = Callable[[Sequence[torch.Tensor], Sequence[Sequence[int]]], list[torch.Tensor]]
 
 
-class _Session:
-    """A graph run by onnxruntime: where the tensors are if it can, else on the CPU, with copies."""
+class OnnxPolicy:
+    """A controller that onnxruntime runs, with copies from the device of the tensors and back."""
 
-    def __init__(self, data: bytes, device: torch.device) -> None:
+    def __init__(self, data: bytes, device: torch.device, sizes: tuple[int, int] | None) -> None:
+        """Of a file's content; ``sizes`` of observation and action are the file's if None."""
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()  # one in worker processes, as prepare_torch has it
         options.inter_op_num_threads = 1
@@ -39,48 +39,20 @@ class _Session:
             # TF32 would round every product to 10 bits.
             providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
         self.session = onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
-        self.device = device if self.session.get_providers()[0] == _CUDA else torch.device("cpu")
-
-    def run(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
-        """Outputs of these shapes of the graph's inputs, in its order, on their device."""
-        place = inputs[0].device
-        values = [value.detach().to(self.device, torch.float32).contiguous() for value in inputs]
-        outputs = [torch.empty(tuple(shape), device=self.device) for shape in shapes]
-        binding = self.session.io_binding()
-        for bind, ports, tensors in (
-            (binding.bind_input, self.session.get_inputs(), values),
-            (binding.bind_output, self.session.get_outputs(), outputs),
-        ):
-            for port, tensor in zip(ports, tensors, strict=True):
-                where = self.device.type, self.device.index or 0
-                bind(port.name, *where, np.float32, tuple(tensor.shape), tensor.data_ptr())
-        if self.device.type == "cuda":  # it has a stream of its own: ours must be done before, and it waits at its end
-            torch.cuda.current_stream(self.device).synchronize()
-        self.session.run_with_iobinding(binding)
-        return [output.to(place) for output in outputs]
-
-    def run_apart(self, inputs: Sequence[torch.Tensor], shapes: Sequence[Sequence[int]]) -> list[torch.Tensor]:
-        """:meth:`run` with one robot at a time, of a graph that takes no more."""
-        alone = [_resized(shape, 1) for shape in shapes]
-        outputs = [self.run([value.narrow(-2, k, 1) for value in inputs], alone) for k in range(len(inputs[0]))]
-        return [torch.cat(parts, dim=-2) for parts in zip(*outputs, strict=True)]
-
-
-def _resized(shape: Sequence[int], count: int) -> list[int]:
-    """The shape of so many robots' rows, or states, which have layers first."""
-    return [*shape[:-2], count, shape[-1]]
-
-
-class OnnxPolicy:
-    """A controller that onnxruntime runs."""
-
-    def __init__(self, run: _Run, sizes: tuple[int, int], device: torch.device) -> None:
-        """Of a graph of one float32 input and one output, of these observation and action sizes, on its device."""
-        self.sizes, self.device, self._run = sizes, device, run
+        self.sizes, self.states, self.of_one = _checked_sizes(self.session, sizes)
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size)."""
-        return self._run([observation], [(len(observation), self.sizes[1])])[0]
+        return self.run([observation])[0]
+
+    def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Outputs of the graph's inputs, in its order, on their device; a graph of one robot runs once a robot."""
+        values = [value.detach().cpu().float() for value in inputs]
+        names = [port.name for port in self.session.get_inputs()]
+        parts = zip(*(value.split(1, dim=-2) for value in values), strict=True) if self.of_one else [values]
+        outputs = [self.session.run(None, dict(zip(names, map(np.asarray, part), strict=True))) for part in parts]
+        return [torch.from_numpy(np.concatenate(output, axis=-2)).to(inputs[0].device)
+                for output in zip(*outputs, strict=True)]  # fmt: skip
 
 
 class _OnnxRecurrent(Recurrent):
@@ -88,23 +60,23 @@ class _OnnxRecurrent(Recurrent):
 
     graph_safe = False
 
-    def __init__(self, run: _Run, sizes: tuple[int, int], states: Sequence[Sequence[int]]) -> None:
-        super().__init__([torch.zeros(_resized(shape, 1)) for shape in states], 1)
-        self.sizes, self._run = sizes, run
+    def __init__(self, policy: OnnxPolicy) -> None:
+        super().__init__([torch.zeros(layers, 1, size) for layers, _, size in policy.states], 1)
+        self.sizes, self._run = policy.sizes, policy.run
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        action, *after = self._run([rows, *state], [(len(rows), self.sizes[1]), *(value.shape for value in state)])
+        action, *after = self._run([rows, *state])
         return action, after
 
 
 class OnnxLayers(torch.nn.Module):
     """A controller whose graph has plain layers alone: in torch's operators, so that it can be captured."""
 
-    def __init__(self, model: Any, session: _Session, sizes: tuple[int, int]) -> None:
-        """Of a graph of one float32 input and one output, of these sizes; a KeyError if it has another operator."""
+    def __init__(self, model: Any, policy: OnnxPolicy) -> None:
+        """Of a graph as onnxruntime runs it; a KeyError if it has another operator."""
         super().__init__()
-        self.sizes = sizes
-        self._input, self._output = session.session.get_inputs()[0].name, session.session.get_outputs()[0].name
+        self.sizes = policy.sizes
+        self._input, self._output = policy.session.get_inputs()[0].name, policy.session.get_outputs()[0].name
         constants = {tensor.name: tensor for tensor in model.graph.initializer}
         self._nodes: list[tuple[Callable[..., Any], list[str], list[str], dict[str, Any]]] = []
         for node in model.graph.node:
@@ -127,8 +99,8 @@ class OnnxLayers(torch.nn.Module):
             values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
         return values[self._output][: len(rows)]
 
-    def run(self, inputs: Sequence[torch.Tensor], shapes: Any) -> list[torch.Tensor]:
-        """:meth:`_Session.run` of the same graph."""
+    def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """:meth:`OnnxPolicy.run` of the same graph."""
         return [self(*inputs)]
 
 
@@ -162,39 +134,38 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
     where = torch.device(device)
     try:
         data = path.read_bytes()
-        model = _check_all_inside(data)
-        session = _Session(data, where)
-        sizes, states, one = _checked_sizes(session.session, sizes)
-        run = session.run_apart if one else session.run
-        if layers := _made_alike(lambda: OnnxLayers(model, session, sizes), run, sizes, states, 1e-5):
+        model = onnx.ModelProto.FromString(data)
+        if not model.graph.node:
+            raise ValueError("it has no graph")
+        outside = [tensor.name for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
+        if outside:
+            raise ValueError(f"it keeps {len(outside)} of its tensors in another file ('{outside[0]}' first)")
+        policy = OnnxPolicy(data, where, sizes)
+        if layers := _made_alike(lambda: OnnxLayers(model, policy), policy, 1e-5):
             return layers.to(where)
-        if one and (free := _made_alike(lambda: _Session(_set_free(model), where), run, sizes, states, 1e-4)):
-            run = free.run
+        if policy.of_one:
+            policy = _made_alike(lambda: OnnxPolicy(_set_free(model), where, sizes), policy, 1e-4) or policy
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
-    if where != session.device:
+    if where.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
         warnings.warn(
-            f"policy '{path}' runs on the CPU, with copies to and from {device} every control step: this onnxruntime "
-            "has no CUDA that works; install onnxruntime-gpu, or give the rsl_rl checkpoint",
+            f"policy '{path}' has more than plain layers and runs on the CPU, since this onnxruntime has no CUDA that "
+            "works: install onnxruntime-gpu, or give the rsl_rl checkpoint",
             stacklevel=2,
         )
-    if run == session.run_apart:
+    if policy.of_one:
         warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
-    return _OnnxRecurrent(run, sizes, states).to(where) if states else OnnxPolicy(run, sizes, session.device)
+    return _OnnxRecurrent(policy).to(where) if policy.states else policy
 
 
-def _made_alike(
-    make: Callable[[], Any], run: _Run, sizes: tuple[int, int], states: Sequence[Sequence[int]], near: float
-) -> Any:  # fmt: skip
-    """What ``make`` makes if its ``run`` answers random rows, and states, as ``run`` does to ``near``; else None."""
-    generator = torch.Generator().manual_seed(0)
+def _made_alike(make: Callable[[], Any], policy: OnnxPolicy, near: float) -> Any:
+    """What ``make`` makes if it answers random rows, and states, as the policy does to ``near``; else None."""
+    generator, shapes = torch.Generator().manual_seed(0), [(1, policy.sizes[0]), *policy.states]
     try:
         made = make()
         for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
-            inputs = [size * torch.randn(_resized(shape, count), generator=generator)
-                      for shape in ((1, sizes[0]), *states)]  # fmt: skip
-            shapes = [_resized(shape, count) for shape in ((1, sizes[1]), *states)]
-            for value, expected in zip(made.run(inputs, shapes), run(inputs, shapes), strict=True):
+            inputs = [size * torch.randn([*shape[:-2], count, shape[-1]], generator=generator) for shape in shapes]
+            for value, expected in zip(made.run(inputs), policy.run(inputs), strict=True):
                 most = near * max(1.0, float(expected.abs().max()))
                 torch.testing.assert_close(value, expected, rtol=0.0, atol=most)
     except Exception:  # onnxruntime's errors have no base
@@ -210,17 +181,6 @@ def _set_free(model: Any) -> bytes:
             port.type.tensor_type.shape.dim[-2].dim_param = "batch"
     del model.graph.value_info[:]
     return model.SerializeToString()
-
-
-def _check_all_inside(data: bytes) -> Any:
-    """The model, all of whose weights must be in the file."""
-    model = onnx.ModelProto.FromString(data)
-    if not model.graph.node:
-        raise ValueError("it has no graph")
-    outside = [tensor.name for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
-    if outside:
-        raise ValueError(f"it keeps {len(outside)} of its tensors in another file ('{outside[0]}' first)")
-    return model
 
 
 def _tensors(message: Any) -> Iterator[Any]:
@@ -275,29 +235,25 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
     if policy.activation not in _OPERATORS:
         raise ValueError(f"ONNX of opset {_OPSET} has no {policy.activation}, only {', '.join(_OPERATORS)}")
     prepare_output(path)
-    nodes: list[Any] = []
-    weights: list[Any] = []
+    nodes, weights = list[Any](), list[Any]()
 
-    def weight(name: str, value: torch.Tensor) -> str:
-        weights.append(numpy_helper.from_array(value.detach().cpu().float().contiguous().numpy(), name))
-        return name
-
-    def node(kind: str, inputs: list[str], name: str, **attributes: Any) -> str:
-        nodes.append(helper.make_node(kind, inputs, [name], name=f"make_{name}", **attributes))
+    def node(kind: str, value: str, name: str, tensors: dict[str, torch.Tensor], **attributes: Any) -> str:
+        nodes.append(helper.make_node(kind, [value, *tensors], [name], name=f"make_{name}", **attributes))
+        arrays = {key: tensor.detach().cpu().float().contiguous().numpy() for key, tensor in tensors.items()}
+        weights.extend(numpy_helper.from_array(array, key) for key, array in arrays.items())
         return name
 
     value = "observation"
     if policy.normalised:  # the 1e-2 is rsl_rl's
-        value = node("Sub", [value, weight("mean", policy.mean)], "centred")
-        value = node("Div", [value, weight("scale", policy.std + 1e-2)], "normalised")
+        value = node("Sub", value, "centred", {"mean": policy.mean})
+        value = node("Div", value, "normalised", {"scale": policy.std + 1e-2})
     last = len(policy.layers) - 1
     for k, layer in enumerate(policy.layers):
         name = "action" if k == last else f"layer_{k}"
         if isinstance(layer, torch.nn.Linear):
-            inputs = [value, weight(f"weight_{k}", layer.weight), weight(f"bias_{k}", layer.bias)]
-            value = node("Gemm", inputs, name, transB=1)
+            value = node("Gemm", value, name, {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}, transB=1)
         else:
-            value = node(_OPERATORS[policy.activation], [value], name, **_ATTRIBUTES.get(policy.activation, {}))
+            value = node(_OPERATORS[policy.activation], value, name, {}, **_ATTRIBUTES.get(policy.activation, {}))
     ports = [
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])]
         for name, size in zip(("observation", "action"), policy.sizes, strict=True)

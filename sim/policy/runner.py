@@ -2,8 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import warp as wp
@@ -32,36 +31,30 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
     return None
 
 
-class Memory(Enum):
-    """What a policy remembers from one step to the next, by its ``reset``."""
-
-    NONE = "none"
-    BY_ROW = "reset(rows)"
-    """It forgets single robots."""
-    WHOLE = "reset()"
-    """It forgets all of them or none: its robots have to begin together."""
+Memory = Literal["none", "reset(rows)", "reset()"]
+"""How a policy forgets: it has no memory, forgets single robots, or all, so that its robots have to begin together."""
 
 
 def memory_of(policy: Any) -> Memory:
-    """What a policy remembers."""
+    """What a policy remembers from one step to the next, by its ``reset``."""
     reset = getattr(policy, "reset", None)
     if not callable(reset):
-        return Memory.NONE
+        return "none"
     try:
         inspect.signature(reset).bind(None)
     except (TypeError, ValueError):  # a ValueError of what has no signature
-        return Memory.WHOLE
-    return Memory.BY_ROW
+        return "reset()"
+    return "reset(rows)"
 
 
 def forget_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
     """Let a policy that remembers forget all its robots; returns whether it is one."""
     memory = memory_of(policy)
-    if memory is Memory.BY_ROW:
+    if memory == "reset(rows)":
         policy.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
-    elif memory is Memory.WHOLE:
+    elif memory == "reset()":
         policy.reset()
-    return memory is not Memory.NONE
+    return memory != "none"
 
 
 class Recurrent(torch.nn.Module):
@@ -73,14 +66,10 @@ class Recurrent(torch.nn.Module):
     def __init__(self, initial: Sequence[torch.Tensor], axis: int) -> None:
         """States at the start of an episode, with one robot along ``axis``."""
         super().__init__()
-        self._axis, self._count = axis, len(initial)
+        self._axis = axis
         self._states: dict[int, list[torch.Tensor]] = {}  # by the number of robots: a graph keeps their addresses
-        for k, state in enumerate(initial):
-            self.register_buffer(f"initial_{k}", state.detach().clone())
-
-    @property
-    def _initial(self) -> list[torch.Tensor]:
-        return [self.get_buffer(f"initial_{k}") for k in range(self._count)]
+        copies = [torch.nn.Parameter(state.detach().clone(), requires_grad=False) for state in initial]
+        self._initial = torch.nn.ParameterList(copies)
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Actions of the rows, shape (num_rows, size), and the state after them; it may change the state in place."""
@@ -112,7 +101,7 @@ class Recurrent(torch.nn.Module):
 
 def is_graph_safe(policy: Any) -> bool:
     """Whether a policy may be captured as a CUDA graph: a module without memory, or what says that it is."""
-    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and memory_of(policy) is Memory.NONE)
+    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and memory_of(policy) == "none")
 
 
 class PolicyRunner:
@@ -139,13 +128,13 @@ class PolicyRunner:
         self._observation = wp.to_torch(observation)
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
+        self._plain = isinstance(policy, torch.nn.Module) and self.memory == "none"
         if self._observation.is_cuda and is_graph_safe(policy):
             self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
 
     def reset(self) -> None:
         """Let a policy forget that can only forget all robots."""
-        if self.memory is Memory.WHOLE:
+        if self.memory == "reset()":
             self._policy.reset()
 
     def _call(self) -> None:
@@ -155,7 +144,7 @@ class PolicyRunner:
             observation = with_rows_of_zeros(observation)
         sizes = tuple(observation.shape)
         try:
-            if self.memory is Memory.BY_ROW:
+            if self.memory == "reset(rows)":
                 self._policy.reset(self._begins != 0)
             action = self._policy(observation)
         except (Exception, SystemExit) as error:  # a controller can fail with anything

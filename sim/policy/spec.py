@@ -106,22 +106,17 @@ def controller_hash(policy: str | Path) -> str | None:
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
     if spec.place is not None and not spec.place.endswith(".py"):
-        files.insert(0, _file_of_module(spec.place))
+        try:
+            module = importlib.util.find_spec(spec.place)
+        except (ImportError, ValueError):  # no package of that name
+            module = None
+        files.insert(0, Path((module and module.origin) or ""))
     if not all(file.is_file() for file in files):
         return None
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     if spec.place is None and len(hashes) == 1:
         return hashes[0]
     return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
-
-
-def _file_of_module(module: str) -> Path:
-    """File of a module; a path that is no file if there is no such module."""
-    try:
-        spec = importlib.util.find_spec(module)
-    except (ImportError, ValueError):  # no package of that name
-        spec = None
-    return Path("" if spec is None or spec.origin is None else spec.origin)
 
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from sim.policy.loaders import load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import export_onnx, load_onnx
-from sim.policy.runner import Memory, memory_of
+from sim.policy.runner import memory_of
 from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor
 
 ACTOR = rsl_rl_actor(normalised=True).state_dict()
@@ -105,7 +105,7 @@ def test_what_remembers_one_robot_remembers_any_number_apart(tmp_path, anymal, r
         torch.onnx.export(model, model.get_dummy_inputs(), str(path), input_names=model.input_names,
                           output_names=model.output_names, opset_version=18, dynamo=False)  # fmt: skip
     policy = load_policy(path, anymal, "cpu")
-    assert memory_of(policy) is Memory.BY_ROW
+    assert memory_of(policy) == "reset(rows)"
     policy.reset(torch.ones(5, dtype=torch.bool))
     for step, actions in zip(steps, expected, strict=True):
         torch.testing.assert_close(policy(step), actions, rtol=1e-4, atol=1e-5)
@@ -154,8 +154,8 @@ def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
                 load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
         else:
             policies[kind] = load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
-    assert memory_of(policies["plain"]) is Memory.NONE
-    assert memory_of(policies["averages"]) is Memory.BY_ROW
+    assert memory_of(policies["plain"]) == "none"
+    assert memory_of(policies["averages"]) == "reset(rows)"
     layer, rows = Exported("plain").layer, rows_of(4)
     torch.manual_seed(0)
     layer = Exported("plain").layer
