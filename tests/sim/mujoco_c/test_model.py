@@ -15,7 +15,6 @@ from sim.mujoco_c.model import (
     goal_commands,
     observations,
     step_penalties,
-    surface_heights,
     to_mujoco,
 )
 from sim.policy.loaders import load_policy
@@ -24,7 +23,7 @@ from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
-from tests.sim.dogs import KINDS, with_mesh, write_dog
+from tests.sim.dogs import GAINS, KINDS, with_mesh, write_dog
 from tests.sim.plain_mujoco import on_plane, rays_from_above
 from tests.sim.policies import Remembers, stand
 
@@ -35,12 +34,6 @@ FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 @pytest.fixture(scope="module")
 def heights():
     return np.float32(0.3) * np.sin(np.arange(NUM_COLS) / 9.0, dtype=np.float32) * np.ones((NUM_ROWS, 1), np.float32)
-
-
-def test_surface_heights_are_those_of_the_oracle(heights):
-    x, y = np.random.default_rng(1).uniform([-1, -1], [17, 9], (40, 2)).T
-    expected = [oracle.surface_height(heights, SPACING, *point) for point in zip(x, y, strict=True)]
-    np.testing.assert_allclose(surface_heights(np.float64(heights), x, y), expected, atol=1e-9)
 
 
 def test_starts_are_those_of_the_rollout(robot):
@@ -77,9 +70,16 @@ def test_plain_mujoco_takes_any_robot_that_the_search_takes(tmp_path):
     assert (model.nu, model.nq) == (8, 15)
     assert model.geom("trunk").type[0] == mujoco.mjtGeom.mjGEOM_MESH
     assert model.geom("trunk").conaffinity[0] == 0 and model.geom("ground").conaffinity[0] == 1
-    for kind in ({"more": "\n    friction=0.6,"}, KINDS["urdf"]):
-        model = crossing_model(get_robot(str(write_dog(tmp_path / str(len(kind)), **kind))), FLAT)
-        assert model.nu == 8 and model.geom("trunk").friction[0] == (0.6 if "model" not in kind else 1.0)
+    # A URDF says nothing of contact: friction 1, the time constant of the shipped robots.
+    given = KINDS["urdf"] | {"more": f"{GAINS}\n    friction=0.6,\n    contact_time_constant_s=0.02,"}
+    for number, (kind, contact) in enumerate(
+        (({}, [0.8, 0.01]), (KINDS["urdf"], [1.0, 0.01]), (given, [0.6, 0.02])),
+    ):
+        model = crossing_model(get_robot(str(write_dog(tmp_path / str(number), **kind))), FLAT)
+        of_robot = model.geom_bodyid > 0
+        assert model.nu == 8 and of_robot.sum() == 13
+        of_geoms = np.column_stack([model.geom_friction[of_robot, 0], model.geom_solref[of_robot, 0]])
+        np.testing.assert_allclose(of_geoms, [contact] * 13)
 
 
 FINE = {"physics_dt": 0.001, "decimation": 20}

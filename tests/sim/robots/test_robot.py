@@ -33,17 +33,6 @@ def test_published_mass(robot, c_model, builder):
     assert builder.body_count == 13
 
 
-def test_joints_are_in_policy_order(robot, c_model, builder):
-    anymals = [f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")]
-    leg = ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
-    cassies = [f"{joint}_{side}" for side in ("left", "right") for joint in leg]
-    expected = {"anymal": anymals, "cassie": cassies}[robot.name]
-    assert list(robot.joint_names) == expected
-    assert [c_model.joint(k).name for k in range(1, 13)] == expected
-    assert [c_model.actuator(k).name for k in range(12)] == expected
-    assert builder.joint_label[1:] == expected
-
-
 def limits_of(builder):
     return np.column_stack([builder.joint_limit_lower[6:], builder.joint_limit_upper[6:]])
 

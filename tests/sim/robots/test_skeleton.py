@@ -23,25 +23,6 @@ def matrix_of(quaternion_wxyz):
     return oracle.rotation_matrix(np.roll(quaternion_wxyz, -1))
 
 
-def test_bodies_and_shapes_stand_where_mujoco_has_them(robot, skeleton):
-    model = mujoco.MjModel.from_xml_path(str(robot.model_file))
-    data, qpos = mujoco.MjData(model), np.float64(random_states(4, robot.num_joints)[0])
-    positions, quaternions = skeleton.body_poses(qpos)
-    for frame, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(positions[frame], data.xpos[1:], atol=1e-12)
-        for name in robot.geom_names:
-            geom = skeleton.model.geom(name)
-            turn = matrix_of(quaternions[frame, geom.bodyid[0] - 1])
-            centre = positions[frame, geom.bodyid[0] - 1] + turn @ geom.pos
-            np.testing.assert_allclose(centre, data.geom(name).xpos, atol=1e-12)
-            expected = data.geom(name).xmat.reshape(3, 3)
-            np.testing.assert_allclose(turn @ matrix_of(geom.quat), expected, atol=1e-12)
-    with pytest.raises(ValueError, match="qpos"):
-        skeleton.body_poses(np.zeros((2, 7)))
-
-
 def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot, skeleton):
     """No shape that collides is seen; each role shows its touch, feet by what is where they are."""
     model, touches = skeleton.model, skeleton.touches
@@ -55,11 +36,11 @@ def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot,
         assert all(len(columns) <= 1 for columns in touches.values())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
-    """Limbs and feet, by their names in the simulation's own model, in poses of every joint."""
-    dog = get_robot(str(with_mesh(tmp_path, kind)))
-    skeleton, rows, builder = Skeleton(dog), np.float64(random_states(3, dog.num_joints)[0]), build_robot(dog)
+@pytest.mark.parametrize("kind", [*KINDS, "anymal", "cassie"])
+def test_shapes_stand_where_the_simulation_has_them(tmp_path, kind):
+    """By their names in the simulation's own model, in poses of every joint."""
+    robot = get_robot(str(with_mesh(tmp_path, kind)) if kind in KINDS else kind)
+    skeleton, rows, builder = Skeleton(robot), np.float64(random_states(3, robot.num_joints)[0]), build_robot(robot)
     positions, quaternions = skeleton.body_poses(rows)
     names = geom_names(builder)
     with wp.ScopedDevice("cpu"):
@@ -68,12 +49,16 @@ def test_a_users_robot_stands_where_the_simulation_has_it(tmp_path, kind):
     for row, position, quaternion in zip(rows, positions, quaternions, strict=True):
         state.joint_q.assign(row[[0, 1, 2, 4, 5, 6, 3, *range(7, len(row))]].astype(np.float32))
         newton.eval_fk(model, state.joint_q, model.joint_qd, state)
-        for name in (*dog.limb_geoms, *dog.foot_geoms):
+        for name in (*robot.limb_geoms, *robot.foot_geoms):
             shape, geom = names.index(name), skeleton.model.geom(name)
-            pose = wp.transform(*state.body_q.numpy()[builder.shape_body[shape]])
-            expected = np.array((pose * builder.shape_transform[shape]).p)
+            pose = wp.transform(*state.body_q.numpy()[builder.shape_body[shape]]) * builder.shape_transform[shape]
             body = geom.bodyid[0] - 1
-            np.testing.assert_allclose(position[body] + matrix_of(quaternion[body]) @ geom.pos, expected, atol=1e-5)
+            turn = matrix_of(quaternion[body])
+            np.testing.assert_allclose(position[body] + turn @ geom.pos, np.array(pose.p), atol=1e-5)
+            expected = oracle.rotation_matrix(np.array(pose.q))
+            np.testing.assert_allclose(turn @ matrix_of(geom.quat), expected, atol=1e-5)
+    with pytest.raises(ValueError, match="qpos"):
+        skeleton.body_poses(np.zeros((2, 7)))
 
 
 BOX = '<geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/>'

@@ -10,9 +10,9 @@ from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, mjcf, urdf, write_dog
 from tests.sim.plain_mujoco import on_plane, to_c
-from tests.sim.scenes import FLAT, simulate
+from tests.sim.scenes import FLAT, put, simulate, standing
 
-OFF, SECONDS, DT, HEIGHT = 0.3, 0.4, 0.005, 5.0
+OFF, DT, STEPS, HEIGHT = 0.3, 0.005, 80, 5.0
 PLAIN = mjcf()
 
 
@@ -74,81 +74,65 @@ SPELLINGS = {
 }  # fmt: skip
 
 
-def in_mujoco(file, target):
-    """Joint angles [rad] of a file in free flight for a while, from the default pose at rest; and its mass [kg]."""
-    spec = mujoco.MjSpec.from_file(str(file))
+def in_mujoco(robot):
+    """The robot's file in MuJoCo C, as long as :func:`told` is flown: joint angles [rad], and its mass [kg]."""
+    spec = mujoco.MjSpec.from_file(str(robot.model_file))
     option = spec.option
     option.timestep, option.integrator, option.tolerance = DT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-8
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     model = spec.compile()
     data = mujoco.MjData(model)
-    start = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *target(0.0)])
-    data.qpos[:] = to_c(start)
-    for name, angle in zip(JOINTS, target(OFF), strict=True):
-        data.ctrl[model.actuator(name).id] = angle
-    for _ in range(round(SECONDS / DT)):
+    data.qpos[:] = to_c(standing(robot, 1, z=HEIGHT)[0])
+    for name, angle in zip(JOINTS, robot.default_joint_pos, strict=True):
+        data.ctrl[model.actuator(name).id] = angle + OFF
+    for _ in range(STEPS):
         mujoco.mj_step(model, data)
     return data.qpos[[int(model.joint(name).qposadr[0]) for name in JOINTS]], float(model.body_subtreemass[0])
+
+
+def told(robot, device, off):
+    """A simulation of the robot high up, at rest in its default pose, whose joints are told to move so far [rad]."""
+    sim, q = simulate(robot, FLAT[None], device), standing(robot, 1, z=HEIGHT)
+    put(sim, q)
+    q[0, 7:] += off
+    sim.targets.assign(np.float32(q))
+    return sim
 
 
 @pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 @pytest.mark.parametrize("text", SPELLINGS.values(), ids=SPELLINGS)
 def test_a_file_flies_as_in_mujoco(tmp_path, device, text):
-    file = write_dog(tmp_path, model=text)
-    robot = get_robot(str(file))
+    robot = get_robot(str(write_dog(tmp_path, model=text)))
     assert robot.joint_names == JOINTS
-
-    def target(off):
-        return np.array(robot.default_joint_pos) + off
-
-    expected, mass = in_mujoco(file.with_suffix(".xml"), target)
-    sim = simulate(robot, FLAT[None], device)
+    expected, mass = in_mujoco(robot)
+    sim = told(robot, device, OFF)
     assert sim.model.body_mass.numpy().sum() == pytest.approx(mass, rel=1e-6)
-    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *target(0.0)], np.float32)[None]
-    sim.joint_q.assign(q)
-    q[0, 7:] = target(OFF)
-    sim.targets.assign(q)
-    for _ in range(round(SECONDS / DT)):
+    for _ in range(STEPS):
         sim.physics_step()
     np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], expected, atol=1e-3)
 
 
 FREE_GAINS = GAINS.replace("effort_limit=(30.0,) * 8,", "")
-MOTORS = {  # drives, torque limit of the settings [N m], what holds
-    "forcerange": ('<motor name="{0}" joint="{0}" forcerange="-5 5"/>', None, 5.0),
-    "ctrlrange": ('<motor name="{0}" joint="{0}" ctrlrange="-5 5"/>', None, 5.0),
-    "gear and ctrlrange": ('<motor name="{0}" joint="{0}" gear="2.5" ctrlrange="-2 2"/>', None, 5.0),
-    "gear and forcerange": ('<motor name="{0}" joint="{0}" gear="2.5" forcerange="-2 2"/>', None, 5.0),
-    "settings above": ('<motor name="{0}" joint="{0}" forcerange="-5 5"/>', 20.0, 5.0),
-    "settings below": ('<motor name="{0}" joint="{0}" forcerange="-20 20"/>', 5.0, 5.0),
-    "nothing": ("", None, 66.0),
-    "drives that settings replace": ('<position name="{0}" joint="{0}" kp="9" forcerange="-5 5"/>', None, 5.0),
+OF_JOINTS = mjcf(drive="").replace('range="-1.5 2.5"', 'range="-1.5 2.5" actuatorfrcrange="-5 5"')
+MOTORS = {  # model, torque limit of the settings [N m], what holds
+    "forcerange": (drives('<motor name="{0}" joint="{0}" forcerange="-5 5"/>'), None, 5.0),
+    "ctrlrange": (drives('<motor name="{0}" joint="{0}" ctrlrange="-5 5"/>'), None, 5.0),
+    "gear and ctrlrange": (drives('<motor name="{0}" joint="{0}" gear="2.5" ctrlrange="-2 2"/>'), None, 5.0),
+    "gear and forcerange": (drives('<motor name="{0}" joint="{0}" gear="2.5" forcerange="-2 2"/>'), None, 5.0),
+    "settings above": (drives('<motor name="{0}" joint="{0}" forcerange="-5 5"/>'), 20.0, 5.0),
+    "settings below": (drives('<motor name="{0}" joint="{0}" forcerange="-20 20"/>'), 5.0, 5.0),
+    "nothing": (drives(""), None, 66.0),
+    "drives that settings replace": (drives('<position name="{0}" joint="{0}" kp="9" forcerange="-5 5"/>'), None, 5.0),
+    "of some joints": (OF_JOINTS, None, [5.0, 66.0] * 4),
 }
 
 
-@pytest.mark.parametrize(("drive", "effort", "expected"), MOTORS.values(), ids=MOTORS)
-def test_the_smallest_torque_limit_holds(tmp_path, device, drive, effort, expected):
+@pytest.mark.parametrize(("model", "effort", "expected"), MOTORS.values(), ids=MOTORS)
+def test_the_smallest_torque_limit_holds(tmp_path, device, model, effort, expected):
     more = FREE_GAINS if effort is None else GAINS.replace("30.0", str(effort))
-    robot = get_robot(str(write_dog(tmp_path, model=mjcf(drive=drive), more=more)))
-    sim = simulate(robot, FLAT[None], device)
-    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)[None]
-    sim.joint_q.assign(q)
-    q[0, 7:] += 1.1  # 66 N m by a gain of 60
-    sim.targets.assign(q)
+    sim = told(get_robot(str(write_dog(tmp_path, model=model, more=more))), device, 1.1)  # 66 N m by a gain of 60
     sim.physics_step()
     np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:], expected, rtol=1e-5)
-
-
-def test_a_joint_limit_of_torque_holds_too(tmp_path, device):
-    text = swap(('range="-1.5 2.5"', 'range="-1.5 2.5" actuatorfrcrange="-5 5"'), ('range="-2.6 -0.1"',
-                'range="-2.6 -0.1" actuatorfrcrange="-7 7"'))  # fmt: skip
-    sim = simulate(get_robot(str(write_dog(tmp_path, model=text))), FLAT[None], device)
-    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *sim.robot.default_joint_pos], np.float32)[None]
-    sim.joint_q.assign(q)
-    q[0, 7:] += 1.1
-    sim.targets.assign(q)
-    sim.physics_step()
-    np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:], [5.0, 7.0] * 4, rtol=1e-5)
 
 
 CONTACTS = {
@@ -158,7 +142,7 @@ CONTACTS = {
     "solref of one number": {"model": swap(('solref="0.01 1"', 'solref="0.01"'))},
     "impratio": {"model": swap(("<default>\n", '<option impratio="10"/><default>\n'))},
     "no option but a cone": {"model": swap(("<default>\n", '<option cone="pyramidal"/><default>\n'))},
-    "friction of the settings": {"more": "\n    friction=0.4,"},
+    "contact of the settings": {"more": "\n    friction=0.4,\n    contact_time_constant_s=0.02,"},
     "gains of the settings": {"model": mjcf(drive=""), "more": GAINS},
     "urdf": KINDS["urdf"],
 }
@@ -167,20 +151,16 @@ CONTACTS = {
 @pytest.mark.parametrize("kind", CONTACTS.values(), ids=CONTACTS)
 def test_a_push_moves_it_on_the_ground_as_in_mujoco(tmp_path, device, kind):
     robot = get_robot(str(write_dog(tmp_path, **kind)))
-    start = np.array([8.0, 4.0, robot.default_base_height, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)
+    start, speed = standing(robot, 1), np.array([[0.5, 1.0, *[0.0] * 12]])
     model = on_plane(robot)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:2] = to_c(start), (0.5, 1.0)
-    for name, angle in zip(JOINTS, robot.default_joint_pos, strict=True):
-        data.ctrl[model.actuator(name).id] = angle
+    data.qpos[:], data.qvel[:], data.ctrl[:] = to_c(start[0]), speed[0], robot.default_joint_pos
     sim = simulate(robot, FLAT[None], device)
-    sim.joint_q.assign(start[None])
-    sim.targets.assign(start[None])
-    sim.joint_qd.assign(np.array([[0.5, 1.0, *[0.0] * 12]], np.float32))
-    for _ in range(round(SECONDS / DT)):
+    put(sim, start, speed)
+    for _ in range(STEPS):
         mujoco.mj_step(model, data)
         sim.physics_step()
-    assert np.hypot(*(data.qpos[:2] - start[:2])) > 0.02
+    assert np.hypot(*(data.qpos[:2] - start[0, :2])) > 0.02
     np.testing.assert_allclose(sim.joint_q.numpy()[0, :3], data.qpos[:3], atol=5e-3)
     np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], data.qpos[7:], atol=0.02)
 
@@ -190,13 +170,12 @@ def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
     assert knee in text
     text = text.replace(knee, f'{knee}<mimic joint="FL_hip" multiplier="-2.0" offset="0.1"/>')
     robot = get_robot(str(write_dog(tmp_path, **KINDS["urdf"] | {"model": text})))
-    sim = simulate(robot, FLAT[None], device)
-    q = np.array([8.0, 4.0, HEIGHT, 0, 0, 0, 1, *robot.default_joint_pos], np.float32)[None]
+    sim, q = simulate(robot, FLAT[None], device), standing(robot, 1, z=HEIGHT)
     q[0, 8] = -2.0 * q[0, 7] + 0.1
-    sim.joint_q.assign(q)
+    put(sim, q)
     q[0, 7:9] = 0.8, 2.0  # what the follower is told counts for nothing
-    sim.targets.assign(q)
-    for _ in range(round(SECONDS / DT)):
+    sim.targets.assign(np.float32(q))
+    for _ in range(STEPS):
         sim.physics_step()
     hip, knee = sim.joint_q.numpy()[0, 7:9]
     assert hip == pytest.approx(0.8, abs=0.1) and knee == pytest.approx(-2.0 * hip + 0.1, abs=0.03)
