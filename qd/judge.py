@@ -33,7 +33,6 @@ from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, load_space
 
 Stage = Literal["fresh", "resolved", "others"]
-STAGES: tuple[Stage, ...] = ("fresh", "resolved", "others")
 """Fresh episodes of all elites; of those that fail, crossings with contact resolved, and by other controllers."""
 CROSSINGS_FOLDER = "crossings"
 """Folder of a run that keeps what was crossed to judge it."""
@@ -240,7 +239,7 @@ def judge(
     run: Path,
     *,
     compute: Compute,
-    stages: Sequence[Stage] = STAGES,
+    stages: Sequence[Stage] = ("fresh", "resolved", "others"),
     certifiers: Mapping[str, str] | None = None,
     robot: str | None = None,
     policy: str | None = None,

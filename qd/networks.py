@@ -139,11 +139,9 @@ class Training:
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
         """Takes a step for each batch that was drawn. All tensors are on the device.
 
-        Args:
-            maps: Of all terrains, half precision, shape (N, num_maps, *SHAPE).
-            targets: What the networks should say of them, shape (N, num_out).
-            drawn: Which terrains each network sees in each step, shape (steps, batch, MEMBERS).
-            turned: Whether it sees them mirrored, shape (steps, batch, MEMBERS).
+        Maps of all terrains are of half precision, shape (N, num_maps, *SHAPE); targets are what the networks should
+        say of them, (N, num_out). ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it
+        sees them mirrored, both (steps, batch, MEMBERS).
         """
         if self._stream is None:
             self._take_steps(maps, targets, drawn, turned)

@@ -136,17 +136,9 @@ class Rollout:
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
-        Args:
-            robot: Robot settings.
-            policy: The controller, by file, ``module:callable`` or as a callable on device tensors.
-            num_terrains: Terrains that may be under way at once.
-            num_replicas: Episodes on each.
-            device: Warp device name.
-            num_envs: Robots; one an episode if None, and never more.
-            cfg: The crossing.
-            solver: Solver options.
-            space: What the genes of terrains mean.
-            with_ground: Whether heights may come with maps of the ground; with genes the space decides.
+        The policy is a file, ``module:callable`` or a callable on device tensors. ``num_terrains`` may be under way at
+        once, with ``num_replicas`` episodes on each, run by ``num_envs`` robots: one an episode if None, and never
+        more. Heights may come with maps of the ground if ``with_ground``; with genes the space decides.
         """
         if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(

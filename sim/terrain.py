@@ -92,12 +92,6 @@ def _difficulty(kind: str, kinds: tuple[str, ...], level: int) -> float:
     return level / NUM_LEVELS
 
 
-def _check_positive(**counts: int) -> None:
-    for name, count in counts.items():
-        if count < 1:
-            raise ValueError(f"{name} must be at least 1, got {count}")
-
-
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
 
@@ -127,7 +121,8 @@ def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarr
         Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
         a type is an index into :data:`CROSSING_TYPES`.
     """
-    _check_positive(count=count)
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
     types = np.arange(count) % len(CROSSING_TYPES)
     levels = np.empty(count, int)
     heights = np.empty((count, NUM_ROWS, NUM_COLS), np.float32)
@@ -168,7 +163,8 @@ def training_tiles(num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray
         Heights [m] float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
         index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
     """
-    _check_positive(num_columns=num_columns)
+    if num_columns < 1:
+        raise ValueError(f"num_columns must be at least 1, got {num_columns}")
     ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
     heights = np.empty((NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), np.float32)

@@ -198,22 +198,13 @@ class Crossings:
         at_most: int | None = None,
         invalid_ok: bool = False,
     ) -> RolloutResult:
-        """Lets a controller cross each terrain several times.
+        """Lets a controller (:func:`sim.policy.loaders.load_policy`) cross each terrain in ``replicas`` episodes.
 
-        Episodes that are invalid are reported on stderr where they are many.
-
-        Args:
-            policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
-            terrains: Genes, shape (B, num_genes), or heights [m], shape (B, nrow, ncol).
-            seeds: One a terrain, shape (B,), uint32.
-            replicas: Episodes a terrain.
-            space: Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it.
-            how: Physics of the crossing.
-            reward: Whether the training task's reward is summed too.
-            penalties_from_s: Penalties are summed from this time of an episode on [s].
-            label: What is crossed, for the progress bar.
-            at_most: Terrains of the largest call to come that agrees with this one; the simulation has room for them.
-            invalid_ok: Whether a result without a valid episode is returned.
+        Terrains are genes of a space, shape (B, num_genes), or heights [m], shape (B, nrow, ncol), each with a seed,
+        uint32 of shape (B,). Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the
+        training task's reward too. The progress bar shows ``label``. ``at_most`` are the terrains of the largest call
+        to come that agrees with this one: the simulation has room for them. Invalid episodes are reported on stderr
+        where they are many; a result without a valid one is returned if ``invalid_ok``.
 
         Returns:
             One row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C tells

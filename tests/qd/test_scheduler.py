@@ -14,7 +14,6 @@ CELLS = Cells(6)
 FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
 JOINED = ("cma_me+cma_mae", "map_elites+hard_random", "surrogate+cma_mae")
 BRIEF = {"training_steps": 2, "candidates": 2, "generations": 2}  # networks learn little in it
-SMALL = SchedulerCfg(method="cma_mae+map_elites", emitters=2, batch_size=6, restart_rule=4, **BRIEF)
 
 
 @pytest.fixture(autouse=True)
@@ -23,15 +22,16 @@ def small_steps(monkeypatch):
     monkeypatch.setattr(surrogate, "BATCH", 2)
 
 
-def make_search(cfg: SchedulerCfg = SMALL, seed: int = 0, cells: Cells = CELLS) -> Scheduler:
-    return Scheduler(cfg, cells=cells, seed=seed)
+def make_search(**settings) -> Scheduler:
+    cfg = {"emitters": 2, "batch_size": 6, **BRIEF, **settings}
+    return Scheduler(SchedulerCfg(**cfg), cells=CELLS, seed=0)
 
 
-def advance(search: Scheduler, first: int, last: int, cells: Cells = CELLS) -> None:
+def advance(search: Scheduler, first: int, last: int) -> None:
     for iteration in range(first, last + 1):
         genes = search.ask()
         seeds = np.random.SeedSequence([0, iteration]).generate_state(len(genes))
-        search.tell(evaluation_of(stand_in.evaluate(genes, seeds), cells, FITNESS), iteration)
+        search.tell(evaluation_of(stand_in.evaluate(genes, seeds), CELLS, FITNESS), iteration)
 
 
 def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
@@ -48,7 +48,7 @@ def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
 
 
 def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
-    search = make_search()
+    search = make_search(method="cma_mae+map_elites", restart_rule=4)
     genes = search.ask()
     search.tell(evaluation_with([7, 7] + [9] * 10, [5.0, 1.0] + [0.0] * 10), 1)
     # A threshold of 3, the mean of 5 and 1, would let 4 in.
@@ -64,8 +64,7 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
 @pytest.mark.parametrize("method", [*METHODS, *JOINED, "cma_mae+map_elites", "cma_mae+map_elites+surrogate"])
 def test_a_saved_search_goes_on_bit_for_bit(method, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
-    cfg = SchedulerCfg(emitters=2, batch_size=6, restart_rule=5, method=method, **BRIEF)
-    straight, cut = make_search(cfg), make_search(cfg)
+    straight, cut = (make_search(restart_rule=5, method=method) for _ in range(2))
     advance(straight, 1, 16)
     advance(cut, 1, 7)
     save_checkpoint(tmp_path / "saved", {"scheduler": cut})
@@ -78,7 +77,7 @@ def test_a_saved_search_goes_on_bit_for_bit(method, tmp_path):
 
 @pytest.mark.parametrize("method", [*METHODS, *JOINED])
 def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_valid_terrain(method):
-    search = make_search(SchedulerCfg(emitters=2, batch_size=6, restart_rule=1, method=method, **BRIEF))
+    search = make_search(restart_rule=1, method=method)
     for iteration in (1, 2):
         genes = search.ask()
         assert genes.shape == (12, 64)
@@ -91,7 +90,7 @@ def test_every_method_asks_within_the_limits_and_survives_iterations_without_a_v
 
 
 def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_the_limits():
-    hard, uniform = (make_search(SchedulerCfg(emitters=2, method=f"{kind}_random")) for kind in ("hard", "uniform"))
+    hard, uniform = (make_search(batch_size=20, method=f"{kind}_random") for kind in ("hard", "uniform"))
     first = hard.ask()
     assert (np.abs(first[:, 7::8]) == 1.0).all()
     assert not (np.abs(uniform.ask()[:, 7::8]) == 1.0).any()
@@ -100,7 +99,7 @@ def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_t
 
 
 def test_joined_methods_take_turns_each_judged_by_its_own_archive():
-    search = make_search(SchedulerCfg(emitters=5, batch_size=2, method="cma_me+cma_mae+uniform_random"))
+    search = make_search(emitters=5, batch_size=2, method="cma_me+cma_mae+uniform_random")
     assert [type(emitter) for emitter in search.emitters] == [
         EvolutionStrategyEmitter, EvolutionStrategyEmitter, RandomEmitter,
         EvolutionStrategyEmitter, EvolutionStrategyEmitter,

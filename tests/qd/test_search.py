@@ -64,24 +64,21 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     assert archive.penalty_mean == pytest.approx(4.0 * hardness**3, rel=0.1)
 
 
-def in_groups(path, groups, *, opener=stand_in.open_stand_in, iterations=5):
-    scheduler = dataclasses.replace(CFG.scheduler, emitters=5, batch_size=3, groups=groups)
-    return run(path, scheduler=scheduler, iterations=iterations, opener=opener)
-
-
-def test_a_search_in_groups_that_is_stopped_at_any_lot_goes_on_as_if_it_had_not_been(tmp_path):
+def test_a_search_in_groups_that_is_stopped_at_any_lot_says_how_to_go_on_as_if_it_had_not_been(tmp_path):
     """Five emitters make groups of one, two and two, which are put in ahead."""
-    robots = Robots()
-    whole = in_groups(tmp_path / "whole", 3, opener=robots)
+    scheduler = dataclasses.replace(CFG.scheduler, emitters=5, batch_size=3, groups=3)
+    settings, robots = {"scheduler": scheduler, "iterations": 5}, Robots()
+    whole = run(tmp_path / "whole", **settings, opener=robots)
     assert robots.pipeline.most_lots == 3 and not robots.pipeline.lots
     assert whole.iterations == 5 and len(whole) > 10
     expected = (tmp_path / "whole/archive.npz").read_bytes(), rows_of(tmp_path / "whole")
     # Stopped within the second iteration, at its end, and within the third, of five, each of 3 + 6 + 6 terrains.
     for count in (18, 30, 39):
         path = tmp_path / f"stopped-{count}"
-        with pytest.raises(Interrupted):
-            in_groups(path, 3, opener=Robots(stop_after=count))
-        in_groups(path, 3)
+        with pytest.raises(Interrupted, match=f"--resume {path}"):
+            run(path, **settings, opener=Robots(stop_after=count))
+        assert len(rows_of(path)) == count // 15
+        run(path, **settings)
         assert ((path / "archive.npz").read_bytes(), rows_of(path)) == expected, count
 
 
@@ -126,13 +123,6 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
     refused(r"checkpoint\.bin is lost", iterations=5)
 
 
-def test_an_interrupt_leaves_finished_iterations_and_says_how_to_go_on(tmp_path):
-    path = tmp_path / "run"
-    with pytest.raises(Interrupted, match=f"--resume {path}"):
-        run(path, iterations=3, opener=Robots(stop_after=12))  # an iteration has 12 terrains
-    assert len(rows_of(path)) == 1
-
-
 def invalid_from(iteration, share):
     """The stand-in, whose episodes are invalid from an iteration on: so large a share of each terrain's."""
 
@@ -153,9 +143,6 @@ def test_an_iteration_of_invalid_episodes_alone_stops_the_search_with_those_befo
     with pytest.raises(AllInvalidError, match=r"48 episodes"):
         run(path, iterations=4, opener=invalid_from(3, 1.0))
     assert [row["iteration"] for row in rows_of(path)] == [1, 2]
-    run(path, iterations=4)  # with what it was mended by
-    run(tmp_path / "whole", iterations=4)
-    assert (path / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
 
 
 def test_invalid_episodes_are_counted_and_many_of_them_reported(tmp_path, capsys):

@@ -50,8 +50,8 @@ def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
     return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in names}
 
 
-def make_surrogate(cfg: SchedulerCfg = CFG, seed: int = 0) -> Surrogate:
-    return Surrogate(cfg, CELLS, SUPER_GAUSSIAN, np.random.SeedSequence(seed))
+def make_surrogate(cfg: SchedulerCfg = CFG) -> Surrogate:
+    return Surrogate(cfg, CELLS, SUPER_GAUSSIAN, np.random.SeedSequence(0))
 
 
 @pytest.fixture(scope="module")
@@ -212,9 +212,9 @@ PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
 LINE = (PAIR[1] - PAIR[0]).numpy()
 
 
-def children(pool: torch.Tensor, count: int = 400, genes_per_part: int | None = 8, **steps: float) -> np.ndarray:
+def children(pool: torch.Tensor, genes_per_part: int | None = 8, **steps: float) -> np.ndarray:
     cfg = SchedulerCfg(**{"iso_sigma": 0.0, "line_sigma": 0.0, "crossover_share": 0.0, **steps})
-    return vary_elites(pool, count, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
+    return vary_elites(pool, 400, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
 
 
 def test_of_a_share_of_the_children_half_of_the_bumps_are_another_elites():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.reward import make_motion
+from sim.reward import Reward
 from sim.robots.training import RewardCfg, TrainingCfg
 from tests.sim.policies import stand
 from tests.sim.scenes import FLAT, crossing, positions, put, spike
@@ -97,7 +97,8 @@ def test_asking_for_the_reward_changes_nothing_else(anymal):
 
 
 def test_a_robots_own_settings_reach_the_kernels(eight, robot):
-    motion = make_motion(eight, replace(robot.training, soft_joint_limit=0.9), command=None, action=None)
+    soft = replace(robot.training, soft_joint_limit=0.9)
+    motion = Reward(eight, soft, command=None, action=None, falls=()).motion
     steady = {name for name, flag in zip(robot.joint_names, motion.joint_is_steady.numpy(), strict=True) if flag}
     hips = {f"hip_{joint}_{side}" for joint in ("abduction", "rotation") for side in ("left", "right")}
     assert steady == (hips if robot.name == "cassie" else set())

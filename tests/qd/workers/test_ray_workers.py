@@ -1,14 +1,10 @@
 """Ray workers: how terrains are spread changes nothing, and no failure of a worker loses or alters a result."""
 
-import contextlib
 import dataclasses
 import os
-import signal
-import socket
 import subprocess
 import sys
 import time
-import uuid
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +17,7 @@ from tests.qd import crossers, stand_in
 pytestmark = pytest.mark.ray
 
 ray = pytest.importorskip("ray")
+Cluster = pytest.importorskip("ray.cluster_utils").Cluster
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 120.0
@@ -82,34 +79,6 @@ def test_a_worker_of_other_code_is_refused(cluster, monkeypatch):
         pass
 
 
-class Node:
-    """A Ray node of one core, in a process group of its own."""
-
-    def __init__(self, environment: dict[str, str], *flags: str) -> None:
-        command = [str(Path(sys.executable).parent / "ray"), "start", *flags, "--block", "--num-cpus=1"]
-        command += ["--object-store-memory=100000000", "--disable-usage-stats"]
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment, start_new_session=True
-        )
-
-    def kill(self) -> None:
-        """As a machine that loses its power."""
-        for process in [self._process.pid, *children(self._process.pid)]:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-        self._process.wait()
-
-
-def children(pid: int) -> list[int]:
-    """Processes begotten by one, at any remove."""
-    parent_of = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            parent_of[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-    direct = [child for child, parent in parent_of.items() if parent == pid]
-    return direct + [further for child in direct for further in children(child)]
-
-
 GROWING_RUN = """
 import sys, time
 from tests.qd import crossers
@@ -127,18 +96,10 @@ with open_evaluator(CFG.__class__(**{**vars(CFG), "workers": "ray"}), build=cros
 
 
 def test_a_cluster_is_used_as_it_grows_and_shrinks():
-    port = free_port()
-    token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": uuid.uuid4().hex * 2}  # Ray's nodes ask each other for one
-    nodes = [Node({**os.environ, **token}, "--head", f"--port={port}", "--include-dashboard=false")]
-    environment = {**os.environ, **token, "RAY_ADDRESS": f"127.0.0.1:{port}", "PYTHONPATH": str(ROOT)}
+    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    environment = {**os.environ, "RAY_ADDRESS": nodes.address, "PYTHONPATH": str(ROOT)}
     total = repr(float(stand_in.evaluate(GENES, SEEDS, 4).penalties.sum()))
     try:
-        end = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.1)
         run = subprocess.Popen(
             [sys.executable, "-c", GROWING_RUN], cwd=ROOT, env=environment, text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
@@ -150,15 +111,14 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
             return next((line.split()[1:] for line in run.stdout if line.startswith("crossed ")), [])
 
         assert ask(1) == ["1", total]
-        nodes.append(Node({**os.environ, **token}, f"--address=127.0.0.1:{port}"))
+        node = nodes.add_node(num_cpus=1)
         assert ask(2) == ["2", total]
-        nodes.pop().kill()
+        nodes.remove_node(node, allow_graceful=False)  # as a machine that loses its power
         assert ask(1) == ["1", total]
         _, errors = run.communicate(timeout=60)
         assert run.returncode == 0 and "Traceback" not in errors, errors
     finally:
-        for node in nodes:
-            node.kill()
+        nodes.shutdown()
 
 
 def test_no_cluster_at_the_address_is_an_error(monkeypatch):
