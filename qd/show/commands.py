@@ -90,11 +90,13 @@ class Film(Replay):
 
     def execute(self) -> None:
         """Makes the films."""
-        from qd.show.film import FilmCfg, film_source
+        from qd.show.film import film_source
         from qd.workers.evaluator import resolve_device
 
-        look = FilmCfg(episode=self.episode, whole=self.whole, gif=self.gif, shadows=self.shadows)
-        film_source(self._source(), look, beside=self.beside, device=resolve_device(self.device), out=self.out)
+        film_source(
+            self._source(), episode=self.episode, gif=self.gif, beside=self.beside, device=resolve_device(self.device),
+            out=self.out, whole=self.whole, shadows=self.shadows,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

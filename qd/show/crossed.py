@@ -1,6 +1,5 @@
 """Recorded crossings in numbers and figures: how they ended, and where."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,42 +62,12 @@ class Rate(NamedTuple):
         return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in wilson_interval(self.hits, self.count)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Crossed:
-    """One terrain's recording; E valid episodes."""
-
-    recording: Recording
-    """Of one terrain."""
-    chosen: NDArray[np.int64]
-    """Valid episodes, shape (E,)."""
-    outcome: NDArray[np.uint8]
-    """How each ended, shape (E,)."""
-    rates: dict[str, Rate]
-    """By the words of :data:`ENDINGS`, and ``fallen``."""
-
-    @property
-    def ends(self) -> NDArray[np.float64]:
-        """Where each episode ended, shape (E, 3) [m]."""
-        return np.array([self.path(k)[-1] for k in range(len(self.chosen))]).reshape(-1, 3)
-
-    def path(self, k: int) -> NDArray[np.float64]:
-        """Base positions of the k-th valid episode [m], shape (frames, 3)."""
-        episode = self.chosen[k]
-        return self.recording.base_position[0, episode, : self.recording.num_frames[0, episode]].astype(np.float64)
-
-
-def crossed_of(recording: Recording) -> Crossed:
-    """A recording of one terrain in numbers."""
-    chosen = np.flatnonzero(recording.outcome[0] != Outcome.INVALID)
-    outcome = recording.outcome[0, chosen]
+def rates_of(recording: Recording) -> dict[str, Rate]:
+    """How often valid episodes of one terrain ended in each way, by the words of :data:`ENDINGS`, and ``fallen``."""
+    outcome, valid = recording.outcome[0], recording.outcome[0] != Outcome.INVALID
     hits = {ending.words: outcome == end for end, ending in ENDINGS.items()}
-    hits["fallen"] = recording.fallen[0, chosen]
-    return Crossed(
-        recording=recording,
-        chosen=chosen,
-        outcome=outcome,
-        rates={label: Rate(int(hit.sum()), len(chosen)) for label, hit in hits.items()},
-    )
+    hits["fallen"] = recording.fallen[0] & valid
+    return {label: Rate(int(hit.sum()), int(valid.sum())) for label, hit in hits.items()}
 
 
 _STUCK = 0.3  # a robot that gets stuck is stuck once it is so near to where it ends [m]
@@ -166,39 +135,40 @@ def title_of(recording: Recording, controller: str = "") -> str:
     return f"{who}, {recording.labels[0]}: {way_to_end(most, fall)}, {count} of {valid.sum()}"
 
 
-def draw_crossing(crossed: Crossed, title: str) -> Figure:
-    """One terrain: its height map with the paths, and its profile."""
+def draw_crossing(recording: Recording, title: str) -> Figure:
+    """One terrain: its height map with the paths of the valid episodes, and its profile."""
     figure = new_figure(9.5, 6.4)
     figure.suptitle(title)
     top, profile = panels = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 0.9))
-    image = draw_heights(top, crossed.recording.heights[0], crossed.recording.ground)
+    ground = recording.ground
+    image = draw_heights(top, recording.heights[0], ground)
     figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
-    handles = [*_draw_paths(top, crossed), *(Line2D([], [], **look) for look in (START, GOAL))]
-    ground = crossed.recording.ground
+    handles = [*_draw_paths(top, recording), *(Line2D([], [], **look) for look in (START, GOAL))]
     if ground is not None and (ground.friction < 1.0).any():
         handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
     if ground is not None and ground.time_constant_s.any():
         handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
-    _draw_profile(profile, crossed.recording.heights[0])
+    _draw_profile(profile, recording.heights[0])
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
-    xs = [0.0, LENGTH, *crossed.ends[:, 0]]  # robots may leave the terrain
-    top.set_xlim(min(xs), max(xs))
     return figure
 
 
-def _draw_paths(axes: Axes, crossed: Crossed) -> list[Any]:
+def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
     """Every path, its end marked by how it ended; returns handles of the ends there are, and how many."""
-    handles: list[Any] = []
+    handles, xs = list[Any](), [0.0, LENGTH]
     for outcome, end in ENDINGS.items():
-        chosen = np.flatnonzero(crossed.outcome == outcome)
-        if not len(chosen):
+        paths = [recording.qpos(0, k)[:, :2] for k in np.flatnonzero(recording.outcome[0] == outcome).tolist()]
+        if not paths:
             continue
-        for k in chosen.tolist():
-            axes.plot(*crossed.path(k)[:, :2].T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
+        for path in paths:
+            axes.plot(*path.T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
         mark: dict[str, Any] = {"color": end.color, "marker": end.marker}
-        axes.scatter(*crossed.ends[chosen][:, :2].T, s=55, edgecolors="white", zorder=3, **mark)
+        ends = np.stack([path[-1] for path in paths], axis=1)
+        axes.scatter(*ends, s=55, edgecolors="white", zorder=3, **mark)
         mark |= {"linestyle": end.line, "markeredgecolor": "white", "markersize": 9}
-        handles.append(Line2D([], [], **mark, label=f"{end.words} ({len(chosen)})"))
+        handles.append(Line2D([], [], **mark, label=f"{end.words} ({len(paths)})"))
+        xs += ends[0].tolist()
+    axes.set_xlim(min(xs), max(xs))  # robots may leave the terrain
     return handles
 
 

@@ -35,10 +35,8 @@ class Terrain(NamedTuple):
     """Name of files about it: ``elite-3`` or ``minimal-3``."""
     label: str
     """What it is, in words."""
-    minimal: dict[str, object] | None = None
+    minimal: dict[str, object] | None
     """What is known of a minimal terrain."""
-    words: str = ""
-    """The same in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,27 +122,23 @@ class OpenedRun:
     def terrains(self, elite: str = "", minimal: str | None = None) -> list[Terrain]:
         """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
 
-        Without a number it is the worst elite.
+        Without a number it is the worst elite. Labels name what stops the robot, where that is known.
         """
-        if minimal is None:
-            if not elite and len(self.archive):
-                elite = str(rank(self.archive, self.space, read_minimal(self.folder, self.archive)).worst(1)[0])
-            numbers = chosen_elites(elite or "0", len(self.archive), self.path)
-            return [Terrain(n, self.archive.genes[n], f"elite-{n}", f"elite {n}{self._why(n)}") for n in numbers]
-        minima = self.minima()
+        archive, minima = self.archive, read_minimal(self.folder, self.archive)
+        if minimal is not None:
+            minima = self.minima()
+            numbers = minima.chosen(minimal, self.path)
+            known = [(minima.genes[n], f"minimal-{n}", f"minimal terrain {n}", minima.entry(n)) for n in numbers]
+        else:
+            if not elite and len(archive):
+                elite = str(rank(archive, self.space, minima).worst(1)[0])
+            numbers = chosen_elites(elite or "0", len(archive), self.path)
+            known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
+        causes = rank(archive, self.space, minima, numbers=numbers).causes
         return [
-            Terrain(
-                n, minima.genes[n], f"minimal-{n}", f"minimal terrain {n}{self._why(n)}", minima.entry(n),
-                minima.words(n),
-            )
-            for n in minima.chosen(minimal, self.path)
-        ]  # fmt: skip
-
-    def _why(self, number: int) -> str:
-        """What stops the robot on an elite, in brackets; nothing where that is not known."""
-        minima = read_minimal(self.folder, self.archive)
-        (cause,) = rank(self.archive, self.space, minima, numbers=[number]).causes
-        return f" ({cause})" if cause not in ("", UNCLEAR) else ""
+            Terrain(n, genes, stem, label if cause in ("", UNCLEAR) else f"{label} ({cause})", entry)
+            for n, (genes, stem, label, entry), cause in zip(numbers, known, causes, strict=True)
+        ]
 
 
 def open_run(named: str | None, run: Path | None = None, *, space: str | None = None) -> OpenedRun:

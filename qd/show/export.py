@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
 from qd.groups import VERDICTS, Ranking, rank
@@ -29,7 +27,6 @@ INDEX_FILE = "index.json"
 README_FILE = "README.md"
 """How other programs take the files, beside it."""
 _FOLDER = "terrains"
-_AT_ONCE = 32  # terrains rasterised
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +51,9 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | Non
     ranking = rank(archive, space, minima, numbers=[terrain.number for terrain in terrains])
 
     def rasterised() -> Iterator[ExportedTerrain]:
-        for first in range(0, len(terrains), _AT_ONCE):
-            chosen = terrains[first : first + _AT_ONCE]
-            grids, maps = terrains_of(np.stack([terrain.genes for terrain in chosen]), space)
-            for k, terrain in enumerate(chosen):
-                yield ExportedTerrain(
-                    heights=grids[k], name=terrain.stem, genes=terrain.genes, timestep=robot.physics_dt,
-                    ground=None if maps is None else maps[k : k + 1],
-                )  # fmt: skip
+        for _, genes, name, *_ in terrains:
+            (heights,), ground = terrains_of(genes[None], space)
+            yield ExportedTerrain(heights=heights, name=name, genes=genes, timestep=robot.physics_dt, ground=ground)
 
     return Source(
         folder=folder_for(opened_run.path, robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),

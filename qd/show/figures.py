@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -99,26 +98,20 @@ def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
     figure.suptitle(f"{_title(archive)}: {len(archive):,} elites")
     panels = (("qd_score", "QD score"), ("elites", "elites"), ("mean_fitness", "mean fitness"))
     iterations = [row["iteration"] for row in metrics]
-    drawn = figure.subplots(1, len(panels), sharex=True)
+    drawn, percent = figure.subplots(1, len(panels), sharex=True), 100.0 / archive.cells.num_cells
+    as_share = (lambda count: percent * count, lambda share: share / percent)
     for axes, (key, label) in zip(drawn, panels, strict=True):
         axes.plot(iterations, [row[key] for row in metrics], color=_BLUE, marker="." if len(metrics) < 30 else "")
         axes.set_ylabel(label)
         if key != "mean_fitness":
             axes.set_ylim(bottom=0)
         if key == "elites":
-            _add_coverage_axis(axes, archive.cells.num_cells)
+            axes.secondary_yaxis("right", functions=as_share).set_ylabel("reachable coverage [%]")
     for axes in drawn:
         axes.set_xlabel("iteration")
         axes.grid(alpha=0.3)
         axes.xaxis.get_major_locator().set_params(integer=True)
     return figure
-
-
-def _add_coverage_axis(axes: Axes, num_cells: int) -> None:
-    """A second scale on the right: elites as a share of the reachable cells."""
-    right = axes.twinx()
-    right.set_ylim(*(100.0 * limit / num_cells for limit in axes.get_ylim()))
-    right.set_ylabel("reachable coverage [%]")
 
 
 def draw_archive(archive: Archive) -> Figure:
@@ -137,7 +130,8 @@ def draw_archive(archive: Archive) -> Figure:
     axes.set_title(title)
     places, order = np.arange(count), np.argsort(fitness)  # the fittest on top
     points = np.stack([np.broadcast_to(places, ratios.shape), ratios], axis=2)[order]
-    lines = LineCollection([*points], cmap="viridis", norm=Normalize(*_range(fitness)), linewidths=0.8, alpha=0.6)
+    low, high = np.quantile(fitness, (0.02, 0.98)).tolist() if len(fitness) else (0.0, 1.0)
+    lines = LineCollection([*points], cmap="viridis", norm=Normalize(low, high), linewidths=0.8, alpha=0.6)
     lines.set_array(fitness[order])
     axes.add_collection(lines)
     for place in places:
@@ -151,11 +145,6 @@ def draw_archive(archive: Archive) -> Figure:
     axes.spines[:].set_visible(False)
     figure.colorbar(lines, ax=axes, label="fitness", pad=0.02, extend="both")
     return figure
-
-
-def _range(fitness: np.ndarray) -> tuple[float, float]:
-    """Colour limits that a few outliers do not stretch."""
-    return (float(np.quantile(fitness, 0.02)), float(np.quantile(fitness, 0.98))) if len(fitness) else (0.0, 1.0)
 
 
 _CORRECTED = (

@@ -13,12 +13,13 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
 from qd.groups import way_to_end
 from qd.judge import controllers_in
 from qd.run.progress import share_bar
-from qd.show.crossed import ARRIVED, crossed_of, ending_of, moment_of_failure, title_of, typical_episode
+from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
 from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
 from sim.crossing import CrossingCfg
@@ -46,20 +47,6 @@ _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 
 Picture = NDArray[np.uint8]
 """RGB, shape (height, width, 3)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilmCfg:
-    """What a film shows, and as what."""
-
-    episode: int | None = None
-    """Number of the episode; the typical one if None."""
-    whole: bool = False
-    """All of the episode, not the seconds about its failure alone."""
-    gif: bool = False
-    """A GIF, not an MP4."""
-    shadows: bool = True
-    """Whether the sun casts shadows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,12 +85,6 @@ class Shot:
         played = np.cumsum([0.0, slow - begin, slowness * (moment - slow), stop - moment])
         return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, [begin, slow, moment, stop])
 
-    def second_line(self) -> str:
-        """Who else crosses, or how often this controller arrives."""
-        if self.beside is not None:
-            return f"{self.beside[0]} {title_of(self.beside[1]).partition(': ')[2]}"
-        return f"reached the goal: {crossed_of(self.recording).rates[ARRIVED]}"
-
 
 def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
     """Between two poses in proportion, MuJoCo's coordinates, shape (7 + num_joints,); past the last one the last."""
@@ -118,11 +99,9 @@ def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
 def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Camera]:
     """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it."""
     recording = shot.recording
-    base = recording.base_position[0, shot.episode, : recording.num_frames[0, shot.episode]].astype(np.float64)
-    width = max(1, round(_SMOOTH_S / recording.dt)) | 1
-    padded = np.pad(base, ((width // 2, width // 2), (0, 0)), mode="edge")
-    smooth = [np.convolve(axis, np.full(width, 1.0 / width), "valid") for axis in padded.T]
-    targets = np.stack([np.interp(times, recording.dt * np.arange(len(base)), axis) for axis in smooth], axis=1)
+    base = recording.qpos(0, shot.episode)[:, :3]
+    smooth = uniform_filter1d(base, max(1, round(_SMOOTH_S / recording.dt)) | 1, axis=0, mode="nearest")
+    targets = np.stack([np.interp(times, recording.dt * np.arange(len(base)), axis) for axis in smooth.T], axis=1)
     elevation = clear_elevation(recording.heights[0], targets, distance)
     return [Camera(target=(x, y, z), distance=distance, elevation=elevation) for x, y, z in targets.tolist()]
 
@@ -187,7 +166,10 @@ def _letter(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> N
         draw.text((place[0] * unit, place[1] * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
 
     write((10, 32), shot.title, 28, "black")
-    write((10, 62), shot.second_line(), 24, "#0b6e62" if shot.beside else "#303030")
+    if shot.beside is None:
+        write((10, 62), f"reached the goal: {rates_of(shot.recording)[ARRIVED]}", 24, "#303030")
+    else:
+        write((10, 62), f"{shot.beside[0]} {title_of(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
     speed = f"  1/{slowness} speed" if slowness > 1 else ""
     write((width - 10, 528), f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
@@ -221,23 +203,25 @@ def film(
     robot: RobotCfg,
     scales: dict[str, float],
     out: Path,
-    cfg: FilmCfg,
     *,
+    episode: int | None = None,
+    whole: bool = False,
+    shadows: bool = True,
     by: str = "",
     beside: tuple[str, Recording] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> None:
-    """Films an episode of a recording of one terrain.
+    """Films an episode of a recording of one terrain, by its number, as the MP4 or GIF that ``out`` is by its name.
 
-    ``scales`` of penalties find the typical episode. ``by`` names the controller, where it is not the robot's own;
-    ``beside`` is another with its recording from the same starts. ``progress`` is called with the share that is done.
+    ``scales`` of penalties find the typical episode, which is filmed if none is named: its seconds about the failure,
+    or the ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is another with its
+    recording from the same starts. ``progress`` is called with the share that is done.
     """
-    episode = typical_episode(recording, scales) if cfg.episode is None else cfg.episode
+    episode, gif = typical_episode(recording, scales) if episode is None else episode, out.suffix == ".gif"
     shot = Shot(recording=recording, episode=episode, title=title_of(recording, by), beside=beside)
-    fps, size = (GIF_FPS, GIF_SIZE) if cfg.gif else (FPS, SIZE)
-    times = shot.times(fps, whole=cfg.whole)
-    pictures = pictures_of(shot, robot, times, size, shadows=cfg.shadows, progress=progress)
-    save(out, as_gif([*pictures]) if cfg.gif else as_mp4(pictures, size, FPS), "Film")
+    fps, size = (GIF_FPS, GIF_SIZE) if gif else (FPS, SIZE)
+    pictures = pictures_of(shot, robot, shot.times(fps, whole=whole), size, shadows=shadows, progress=progress)
+    save(out, as_gif([*pictures]) if gif else as_mp4(pictures, size, FPS), "Film")
 
 
 def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> bytes:
@@ -269,19 +253,27 @@ def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def film_source(
-    source: Source, cfg: FilmCfg, *, beside: str | None = None, device: str = "cpu", out: Path | None = None
+    source: Source,
+    *,
+    episode: int | None = None,
+    gif: bool = False,
+    beside: str | None = None,
+    device: str = "cpu",
+    out: Path | None = None,
+    **look: Any,
 ) -> list[Path]:
     """Films of terrains; all is crossed and stored before the first is made.
 
-    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file.
+    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file;
+    ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
     """
     robot, run = source.robot, source.opened_run
-    if not cfg.gif and out is not None and out.suffix == ".gif":
+    if not gif and out is not None and out.suffix == ".gif":
         raise ValueError(f"{out} is a GIF by its name: give --gif too")
-    files = source.files(".gif" if cfg.gif else ".mp4", out)
+    files = source.files(".gif" if gif else ".mp4", out)
     replicas = source.wanted[0].replicas
-    if cfg.episode is not None and cfg.episode >= replicas:
-        raise ValueError(f"episode must be one of 0..{replicas - 1}, got {cfg.episode}")
+    if episode is not None and episode >= replicas:
+        raise ValueError(f"episode must be one of 0..{replicas - 1}, got {episode}")
     open_context(64, 64).free()
     others: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
@@ -297,5 +289,6 @@ def film_source(
         others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]
     for recording, other, file in zip(recordings, others, files, strict=True):
         with share_bar(f"filming {recording.labels[0]}") as progress:
-            film(recording, robot, source.scales, file, cfg, by=source.by, beside=other, progress=progress)
+            about: Any = {"episode": episode, "by": source.by, "beside": other, "progress": progress}
+            film(recording, robot, source.scales, file, **about, **look)
     return files

@@ -100,24 +100,19 @@ class Simulation:
 
     def __init__(self, robot: RobotCfg, device: str) -> None:
         self._robot, self._device = robot, device
-        self._rollouts: dict[tuple[str, int, int, str, bool], Rollout] = {}
-
-    def prepare(self, first: Wanted, count: int = 1) -> Rollout:
-        """The rollout that crosses such terrains, so many at once; built if there is none yet."""
-        key = (first.policy, count, first.replicas, first.space, first.ground is not None)
-        if key not in self._rollouts:
-            self._rollouts[key] = Rollout(
-                self._robot, first.policy, num_terrains=count, num_replicas=first.replicas, device=self._device,
-                space=load_space(first.space), with_ground=first.ground is not None,
-            )  # fmt: skip
-        return self._rollouts[key]
+        self._rollouts: dict[Any, Rollout] = {}
 
     def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> list[Recording]:
         """Recordings of all, in their order."""
-        first = wanted[0]
+        first, key = wanted[0], (len(wanted), wanted[0].kind)
+        if key not in self._rollouts:
+            self._rollouts[key] = Rollout(
+                self._robot, first.policy, num_terrains=len(wanted), num_replicas=first.replicas, device=self._device,
+                space=load_space(first.space), with_ground=first.ground is not None,
+            )  # fmt: skip
         grounds = [crossing.ground for crossing in wanted if crossing.ground is not None]
         recording = record(
-            self.prepare(first, len(wanted)),
+            self._rollouts[key],
             np.stack([crossing.terrain for crossing in wanted]),
             np.array([crossing.terrain_seed for crossing in wanted], np.uint32),
             policy=first.policy,
@@ -150,10 +145,6 @@ class Recordings:
             return None
         self._cache.touch(key)
         return replace(recording, labels=(wanted.label,))
-
-    def may_keep(self, wanted: Wanted) -> bool:
-        """Whether no recording of these crossings is stored yet."""
-        return not self._cache.file(self._key(wanted)).exists()
 
     def keep(self, wanted: Wanted, recording: Recording) -> None:
         """Stores a recording; prints a warning if it cannot be written."""

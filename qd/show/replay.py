@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from kernels.episode import Outcome
-from qd.archive import Archive
 from qd.descriptors import Cells
 from qd.faults import elite_words
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.run.directory import RUNS, folder_for
-from qd.show.crossed import Crossed, crossed_of, draw_crossing, title_of
+from qd.show.crossed import draw_crossing, title_of
 from qd.show.elites import OpenedRun, Terrain
 from qd.show.figures import label_of, look_of
 from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
@@ -153,12 +152,11 @@ def replay(source: Source, *, device: str = "cpu", out: Path | None = None) -> l
     figures, reports = source.files(".png", out), []
     for k, (recording, figure) in enumerate(zip(source.record(device), figures, strict=True)):
         refuse_all_invalid(recording.result())
-        crossed = crossed_of(recording)
         policy = ControllerSpec.parse(str(recording.origin["policy"])).label
-        reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(crossed)})
+        reports.append({**recording.origin, "policy": policy, **source.about[k], **numbers_of(recording)})
         print(describe(source, k, recording))
         save(figure.with_suffix(".json"), to_json(reports[-1]), "Numbers")
-        save(figure, as_png(draw_crossing(crossed, title_of(recording, source.by))), "Figure")
+        save(figure, as_png(draw_crossing(recording, title_of(recording, source.by))), "Figure")
     return reports
 
 
@@ -169,12 +167,13 @@ def save(file: Path, data: bytes, what: str) -> None:
     print(f"{what}: {file}{replaced}", flush=True)
 
 
-def numbers_of(crossed: Crossed) -> dict[str, Any]:
-    """Rates with 95 % intervals (Wilson), ends and raw penalties, over the valid episodes; at least one is."""
-    recording, count = crossed.recording, len(crossed.chosen)
+def numbers_of(recording: Recording) -> dict[str, Any]:
+    """Rates with 95 % intervals (Wilson), ends and raw penalties of one terrain, of valid episodes; at least one is."""
+    valid = recording.outcome[0] != Outcome.INVALID
+    count, fallen = int(valid.sum()), int(recording.fallen[0, valid].sum())
     ended = {o.name.lower(): int((recording.outcome[0] == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
-    hits = {"success": count - ended["base_collision"], "goal": ended["goal"], "fallen": crossed.rates["fallen"].hits}
-    names, sums = recording.penalty_names, recording.result().penalties[0, crossed.chosen]
+    hits = {"success": count - ended["base_collision"], "goal": ended["goal"], "fallen": fallen}
+    names, sums = recording.penalty_names, recording.result().penalties[0, valid]
     return {
         "episodes": recording.num_episodes,
         "invalid_episodes": recording.num_episodes - count,
@@ -184,7 +183,7 @@ def numbers_of(crossed: Crossed) -> dict[str, Any]:
             for name, number in hits.items()
         },
         "outcomes": ended,
-        "duration_s": float(recording.duration_s[0, crossed.chosen].mean()),
+        "duration_s": float(recording.duration_s[0, valid].mean()),
         "penalties": {
             name: {"mean": float(column.mean()), "std": float(column.std()), "unit": look_of(name).unit}
             for name, column in zip(names, sums.T, strict=True)
@@ -197,15 +196,17 @@ def describe(source: Source, k: int, recording: Recording) -> str:
     run, names, scales = source.opened_run, source.fitness.penalties, source.fitness.scales
     cells = Cells(len(names)) if run is None else run.archive.cells
     now = evaluation_of(recording.result(), cells, source.fitness)
-    columns: list[tuple[str, Archive | Evaluation, int]] = [("now", now, 0)]
+    columns: list[tuple[str, Evaluation, int]] = [("now", now, 0)]
     if run is not None:
         n, whole = source.terrains[k].number, "whole, " if source.terrains[k].minimal else ""
         stored = {"as found": run.archive, "fresh": run.archive.fresh}
         columns[:0] = [(f"{whole}{label}", values, n) for label, values in stored.items() if values is not None]
     rows = {"": [label for label, _, _ in columns]}
     rows["episodes"] = [str(values.episodes[row]) for _, values, row in columns]
+    valid = [int(v.episodes[row] - v.invalid_episodes[row]) if v.valid[row] else 0 for _, v, row in columns]
     for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
-        counted = [(getattr(values, rate)[row], _valid_episodes(values, row)) for _, values, row in columns]
+        shares = [getattr(values, rate)[row] for _, values, row in columns]
+        counted = zip(shares, valid, strict=True)
         words = [rate_words(round(share * count) if count else 0, count, short=True) for share, count in counted]
         rows[label] = [text.replace("% to ", "-").replace(" to ", "-") for text in words]
     for p, (name, scale) in enumerate(zip(names, scales, strict=True)):
@@ -241,7 +242,7 @@ def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> 
     """What the run knows of an elite, and whether what was crossed now agrees."""
     archive, n = run.archive, terrain.number
     if terrain.minimal:
-        known = f"Of the minimal terrain: {terrain.words}."
+        known = f"Of the minimal terrain: {run.minima().words(n)}."
     elif by:
         known = f"Now it was crossed with {by}; all else is of the controller that was searched."
     else:
@@ -253,9 +254,3 @@ def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> 
         *(f"- {line}" for line in run.space.describe(terrain.genes).splitlines()),
         *[known, *elite_words(archive, n)],
     ]
-
-
-def _valid_episodes(values: Archive | Evaluation, row: int) -> int:
-    """Episodes that a terrain's rates are of: none of a terrain that is invalid as a whole."""
-    valid = isinstance(values, Archive) or values.valid[row]  # what is found is valid, or it were no elite
-    return int(values.episodes[row] - values.invalid_episodes[row]) if valid else 0

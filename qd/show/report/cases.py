@@ -1,12 +1,12 @@
 """The elites that are crossed for a page: robots close up where they fail, and another controller beside."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from qd.archive import Archive, FaultCounts
 from qd.groups import VERDICTS, Ranking
 from qd.run.progress import share_bar
-from qd.show.crossed import ARRIVED, Crossed, Rate, crossed_of, draw_crossing
+from qd.show.crossed import ARRIVED, Rate, draw_crossing, rates_of
 from qd.show.recordings import Recordings, on_elite
 from qd.show.report.page import Table, figure_source
 from qd.show.report.pictures import close_pictures, failure_of, same_moment
@@ -14,48 +14,18 @@ from qd.show.report.search import Material
 from sim.recording.recorder import Recording
 
 
-@dataclass(frozen=True, kw_only=True)
-class Beside:
-    """Another controller on the same terrain."""
-
-    name: str
-    source: str
-    """Of its picture."""
-    time_s: float
-    """Of the picture."""
-    rate: Rate
-    """How often it reached the goal."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """One elite."""
-
-    number: int
-    name: str
-    """Its cause and how it ends."""
-    verdict: str
-    source: str
-    """Of the picture at the moment of failure; empty without pictures."""
-    time_s: float
-    """Of that moment."""
-    beside: Beside | None
-    figure: str
-    """Source of the map with paths, profile and penalties; empty of an elite that is shown in short."""
-    rates: Table
-    film: str
-    """The command that films it."""
-
-
 def cross_cases(
     material: Material, heads: Sequence[int], others: Sequence[int], recordings: Recordings, *, episodes: int,
     pictured: bool,
-) -> dict[int, Case]:  # fmt: skip
+) -> dict[int, dict[str, Any]]:  # fmt: skip
     """Crosses elites and takes their pictures, by number; one whose episodes are all invalid is left out.
 
-    ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short.
+    ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short. What the
+    template takes of each: its number, name and verdict, the ``source`` of the picture at the moment of failure
+    ``time_s`` [s], empty without pictures, who crosses ``beside`` it, if anybody, the source of the ``figure`` with
+    paths and profile, empty in short, the table of its ``rates``, and the command that films it.
     """
-    opened_run, archive, cases = material.opened_run, material.archive, dict[int, Case]()
+    opened_run, archive, cases = material.opened_run, material.archive, dict[int, dict[str, Any]]()
     files = opened_run.certifiers()
     names = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
     crossings = [(number, material.policy) for number in (*heads, *others)]
@@ -75,7 +45,7 @@ def cross_cases(
 def _case(
     material: Material, number: int, recording: Recording, other: tuple[str, Recording] | None, whole: bool,
     pictured: bool,
-) -> Case | None:  # fmt: skip
+) -> dict[str, Any] | None:  # fmt: skip
     archive, ranking = material.archive, material.ranking
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
     if (failure := failure_of(recording, scales)) is None:
@@ -84,29 +54,29 @@ def _case(
     sources = close_pictures(material.opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if other is not None:
-        rate = crossed_of(other[1]).rates[ARRIVED]
-        beside = Beside(name=other[0], source=sources[1], time_s=moments[1].time_s, rate=rate)
-    crossed, row = crossed_of(recording), ranking.elites.place_of(number)
-    title = f"{archive.robot}, elite {number} of {len(archive):,}: {len(crossed.chosen)} crossings"
-    return Case(
-        number=number,
-        name=ranking.name(row),
-        verdict=VERDICTS[int(ranking.elites.verdict[row])],
-        source=sources[0],
-        time_s=failure.time_s,
-        beside=beside,
-        figure=figure_source(draw_crossing(crossed, title)) if whole else "",
-        rates=_rates(ranking, archive, row, crossed),
-        film=material.command("film", elite=number),
-    )
+        rate = rates_of(other[1])[ARRIVED]
+        beside = {"name": other[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
+    arrived, row = rates_of(recording)[ARRIVED], ranking.elites.place_of(number)
+    title = f"{archive.robot}, elite {number} of {len(archive):,}: {arrived.count} crossings"
+    return {
+        "number": number,
+        "name": ranking.name(row),
+        "verdict": VERDICTS[int(ranking.elites.verdict[row])],
+        "source": sources[0],
+        "time_s": failure.time_s,
+        "beside": beside,
+        "figure": figure_source(draw_crossing(recording, title)) if whole else "",
+        "rates": _rates(ranking, archive, row, arrived),
+        "film": material.command("film", elite=number),
+    }
 
 
-def _rates(ranking: Ranking, archive: Archive, row: int, crossed: Crossed) -> Table:
+def _rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
     """Who reaches the goal how often: here, when the elite was found or judged, and under other conditions."""
     elites, number = ranking.elites, int(ranking.elites.numbers[row])
     tries = "fresh tries" if elites.fresh[row] else "tries of the search"
     rates = {
-        "for this page": crossed.rates[ARRIVED],
+        "for this page": arrived,
         tries: Rate(elites.hits("goal_rate", row), int(elites.counted[row])),
     }
     faults = archive.faults or FaultCounts.none_of(len(archive))

@@ -1,55 +1,32 @@
 """The tables of an evaluation, in data."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from qd.evaluate import labels
-from qd.evaluate.tables import read_tables
 from qd.show.report.page import Table, percent
 from sim.files.intervals import value_words
-from sim.files.records import without_machine
-from sim.robots.robot import RobotCfg
 
 MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward")}
 """Measures shown, in words; the first two are fractions."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Compared:
-    """Controllers on the sets of an evaluation."""
+def compared_of(tables: Mapping[str, Any], *, file: str = "", searched: str | None = None) -> dict[str, Any]:
+    """Tables as ``tables.json`` has them, and their file; ``searched`` is the hash of the controller of the page.
 
-    file: str
-    """The tables' file; empty of those that a hardening has."""
-    episodes: int
-    """On each terrain."""
-    of_searched: bool
-    """Whether the controller that was searched is among them, or nobody knows."""
-    measures: Sequence[tuple[str, Table]]
-    """What is measured, and a row a controller."""
-    certified: Table | None
-    """Goal rates on certified terrains alone; None where none are known."""
-    changes: Table
-    """What became of terrains from one controller to another."""
-
-
-def read_compared(file: Path, robot: RobotCfg, searched: str | None) -> Compared:
-    """The tables in a file, of a robot; ``searched`` is the hash of the searched controller."""
-    return compared_of({**read_tables(file, robot)}, file=without_machine(str(file)), searched=searched)
-
-
-def compared_of(tables: Mapping[str, Any], *, file: str = "", searched: str | None = None) -> Compared:
-    """Tables as ``tables.json`` has them; ``searched`` is the hash of the controller that a page is about."""
+    What the template takes: episodes a terrain, whether the searched controller is among them or nobody knows, measures
+    in words, each with a table of a row a controller, goal rates on certified terrains alone, if some are known, and
+    what became of terrains from one controller to another.
+    """
     hashes = {about["sha256"] for about in tables["controllers"].values()}
-    return Compared(
-        file=file,
-        episodes=tables["episodes"],
-        of_searched=searched is None or searched in hashes,
-        measures=[(words, _measure_table(tables, measure)) for measure, words in MEASURES.items()],
-        certified=_certified_table(tables),
-        changes=_changes_table(tables),
-    )
+    return {
+        "file": file,
+        "episodes": tables["episodes"],
+        "of_searched": searched is None or searched in hashes,
+        "measures": [(words, _measure_table(tables, measure)) for measure, words in MEASURES.items()],
+        "certified": _certified_table(tables),
+        "changes": _changes_table(tables),
+    }
 
 
 def _value(measure: str, value: float | None, limits: Sequence[float] | None) -> str:

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from qd.run.progress import clock
-from sim.files.atomic import prepare_output, write_atomically
+from qd.show.replay import save
+from sim.files.atomic import prepare_output
 from sim.files.figures import as_image
 
 _FIGURE_QUALITY = 80  # of WebP
@@ -46,9 +47,9 @@ def percent(share: float) -> str:
     return f"{text} %"
 
 
-def counted(number: int, noun: str, many: str = "") -> str:
+def counted(number: int, noun: str) -> str:
     """A number with its noun: ``1 elite``, ``459 elites``."""
-    return f"{number:,} {noun if number == 1 else many or f'{noun}s'}"
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def check_page(out: Path) -> None:
@@ -58,23 +59,16 @@ def check_page(out: Path) -> None:
     prepare_output(out)
 
 
-def render(template: str, **content: object) -> bytes:
-    """A page by its template."""
+def publish_page(out: Path, template: str, **content: object) -> Path:
+    """Writes a page by its template: it is whole or as it was."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters |= {"percent": percent, "counted": counted, "clock": clock}
     text = environment.get_template(template).render(content)
-    return text.encode("utf-8", errors="backslashreplace")  # a file's name may hold bytes that are no text
-
-
-def publish_page(out: Path, template: str, **content: object) -> Path:
-    """Writes a page: it is whole or as it was."""
-    page = render(template, **content)
-    replaced = " (replaced)" if out.exists() else ""
-    write_atomically(out, page)
-    print(f"Report: {out}{replaced} ({len(page) / 1e6:.1f} MB; opens in a browser, without a network)")
+    page = text.encode("utf-8", errors="backslashreplace")  # a file's name may hold bytes that are no text
+    save(out, page, "Report")
     return out
 
 

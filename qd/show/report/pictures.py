@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,32 +28,22 @@ _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of
 _DISTANCE = 3.0  # of the camera [m]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sheet:
-    """Small pictures of terrains in one image, so that a page of a thousand is light."""
+def sheet_of(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
+    """The terrains of genes, shape (T, num_genes), at least one, from above: blue is low, brown high.
 
-    source: str
-    """Of the image."""
-    columns: int
-    """Of small pictures."""
-
-    def offset(self, place: int) -> tuple[int, int]:
-        """Where a small picture begins: pixels from the left and from the top."""
-        return place % self.columns * TILE[0], place // self.columns * TILE[1]
-
-
-def sheet_of(genes: NDArray[np.float32], space: TerrainSpace) -> Sheet:
-    """The terrains of genes, shape (T, num_genes), at least one, from above: blue is low, brown high."""
+    They are small pictures in one image, so that a page of a thousand is light: its ``source``, and the ``offsets`` of
+    each picture, pixels from the left and from the top.
+    """
     columns = math.ceil(math.sqrt(len(genes) / 2))  # about a square, as a tile is twice as wide as high
     image = Image.new("RGB", (columns * TILE[0], -(-len(genes) // columns) * TILE[1]))
-    sheet = Sheet(source="", columns=columns)
+    offsets = [(place % columns * TILE[0], place // columns * TILE[1]) for place in range(len(genes))]
     for first in range(0, len(genes), _AT_ONCE):
         lot = genes[first : first + _AT_ONCE]
         grids, grounds = terrains_of(lot, space) if space.ground else (heights_of(lot, space, every=_EVERY), None)
         for place, heights in enumerate(grids):
             pixels = relief(heights, None if grounds is None else grounds[place : place + 1])[::-1]  # y up
-            image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), sheet.offset(first + place))
-    return Sheet(source=picture_source(image, _SHEET_QUALITY), columns=columns)
+            image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + place])
+    return {"source": picture_source(image, _SHEET_QUALITY), "offsets": offsets}
 
 
 class Moment(NamedTuple):

@@ -3,19 +3,21 @@
 from pathlib import Path
 
 from qd.archive import ARCHIVE_FILE, Archive
+from qd.evaluate.tables import read_tables
 from qd.groups import elites_of, rank
 from qd.minimise import read_minimal
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, ROUNDS_FILE, Metrics, RunDirectory, folder_for
 from qd.run.settings import find_policy
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Cross, Recordings
-from qd.show.report.cases import Case, cross_cases
-from qd.show.report.evaluation import read_compared
+from qd.show.report.cases import cross_cases
+from qd.show.report.evaluation import compared_of
 from qd.show.report.page import check_page, publish_page
 from qd.show.report.pictures import why_no_pictures
 from qd.show.report.rounds import write_rounds
 from qd.show.report.search import Material, content_of
 from qd.workers.evaluator import check_policy, resolve_device
+from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, spec_of
 
 _OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown
@@ -46,14 +48,17 @@ def write_report(
     suffix = "" if policy is None else opened_run.suffix(spec_of(policy, opened_run.robot))
     out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)
-    compared = None if tables is None else read_compared(tables, opened_run.robot, opened_run.archive.policy_sha256)
+    compared = None
+    if tables is not None:
+        about = {"file": without_machine(str(tables)), "searched": opened_run.archive.policy_sha256}
+        compared = compared_of({**read_tables(tables, opened_run.robot)}, **about)
     material = _material(opened_run, policy)
     ranking, missing = material.ranking, list[str]()
     heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
     heads = heads or ranking.worst(num_elites)
     causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}
     firsts = [int(ranking.elites.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
-    others, cases = firsts[:_OTHER_CAUSES], dict[int, Case]()
+    others, cases = firsts[:_OTHER_CAUSES], {}
     if reason := _why_not_crossed(material, device):
         missing.append(reason)
     else:

@@ -1,6 +1,5 @@
 """The page of a hardening, in data: faults by round, rates by round, and what became of terrains."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from qd.show.report.evaluation import compared_of
 from qd.show.report.page import Table, check_page, origin_rows, publish_page
 from sim.files.atomic import read_json
 from sim.files.command import command_line
+from sim.files.intervals import value_words
 from sim.files.records import without_machine
 from sim.robots.find import get_robot
 
@@ -24,7 +24,7 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     check_page(out)
     rounds = content["rounds"]
     rows = [
-        [row["controller"], _number(row.get("episodes")), *(_number(row.get(key)) for key in _COUNTS),
+        [row["controller"], *(value_words(row.get(key), None, ",") for key in ("episodes", *_COUNTS)),
          ", ".join(row["certifiers"]) or "nobody"] for row in rounds
     ]  # fmt: skip
     return publish_page(
@@ -34,20 +34,15 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
         run=without_machine(str(run)),
         rounds=rounds,
         counts=Table(head=["controller searched", "episodes", *_COUNTS, "crossed by"], rows=rows),
-        goals=goals_of(content["tables"]),
+        goals={
+            SETS.get(name, f"{name}, held out"): {who: 100.0 * rate for who, rate in rates.items() if rate is not None}
+            for name, rates in content["tables"]["goal"].items()
+        },
         compared=compared_of(content["tables"]),
         choices=content.get("choices", {}),
         origin=origin_rows(content),
         reports=[without_machine(command_line("report", run=run / row["search"])) for row in rounds],
     )
-
-
-def goals_of(tables: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Goal rate of every controller that has one [%], by the set of terrains and its name."""
-    return {
-        SETS.get(name, f"{name}, held out"): {who: 100.0 * rate for who, rate in rates.items() if rate is not None}
-        for name, rates in tables["goal"].items()
-    }
 
 
 def _read(run: Path, robot: str | None) -> dict[str, Any]:
@@ -66,7 +61,3 @@ def _read(run: Path, robot: str | None) -> dict[str, Any]:
     for row in content["rounds"]:  # without a specialist the faults are those that the panel shows
         row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
     return content
-
-
-def _number(count: int | None) -> str:
-    return "-" if count is None else f"{count:,}"

@@ -1,6 +1,6 @@
 """The page about a search, in data: how the controller fails, on which terrains, and where the numbers come from."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,59 +54,22 @@ class Material:
         """The elites."""
         return self.opened_run.archive
 
-    @property
-    def controller(self) -> str:
-        """The controller that was searched, in words."""
-        searched = SHIPPED if self.search is None else self.search.policy
-        return "its shipped controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
-
-    @property
-    def crosser(self) -> str:
-        """The controller of the pictures, in words."""
-        return ControllerSpec.parse(self.policy).label
-
-    @property
-    def place(self) -> str:
-        """Where the archive lies."""
-        return without_machine(str(self.opened_run.path))
-
     def command(self, word: str, **flags: object) -> str:
         """A command about this run as a user types it."""
         robot = self.opened_run.robot.spec
         return without_machine(command_line(word, robot=robot, run=self.opened_run.path, **flags))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cause:
-    """A bar: how many terrains stop the robot by a cause."""
-
-    name: str
-    failing: int
-    faults: int
-    share: float
-    """Of the longest bar, in percent."""
-    tile: int | None
-    """Row of its worst elite; None of several causes together."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Listing:
-    """Terrains in a table, each with a small picture."""
-
-    head: Sequence[str]
-    rows: Sequence[tuple[int, Sequence[str]]]
-    """Place of the picture, and words; the first are the number of the elite."""
-    wide: tuple[int, ...]
-    """Columns, from 1, that a phone has no room for."""
-
-
 def content_of(material: Material) -> dict[str, Any]:
     """What the template takes, beside the terrains that were crossed for the page."""
     archive, ranking, minima, metrics = material.archive, material.ranking, material.minima, material.metrics
-    elites, space = ranking.elites, material.opened_run.space
+    elites, space, (searched, _) = ranking.elites, material.opened_run.space, material.opened_run.as_searched()
     certifiers = () if archive.faults is None else archive.faults.certifiers
     return {
         "material": material,
+        "controller": "its shipped controller" if searched == SHIPPED else ControllerSpec.parse(searched).label,
+        "crosser": ControllerSpec.parse(material.policy).label,
+        "place": without_machine(str(material.opened_run.path)),
         "summary": summary_of(ranking, archive),
         "failing": int(elites.failing.sum()),
         "certifiers": any_of(certifiers) if certifiers else "",
@@ -130,8 +93,11 @@ def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
     return percent(float(rates.mean())) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 
-def causes_of(ranking: Ranking) -> list[Cause]:
-    """The bars, the longest first; the rarest causes share one."""
+def causes_of(ranking: Ranking) -> list[dict[str, Any]]:
+    """The bars, the longest first; the rarest causes share one.
+
+    Each has a name, its failing elites and faults, percent of the longest bar an elite, and the row of its worst elite.
+    """
     groups = [*ranking.by_cause().items()]
     count = len(groups) if len(groups) <= _MOST_BARS else _MOST_BARS - 1
     first, rest = groups[:count], groups[count:]
@@ -141,16 +107,19 @@ def causes_of(ranking: Ranking) -> list[Cause]:
         tiles.append(None)
     longest = max((len(rows) for _, rows in first), default=1)
     return [
-        Cause(
-            name=name, failing=len(rows), faults=int((ranking.elites.verdict[rows] == _FAULT).sum()),
-            share=100.0 / longest, tile=tile,
-        )
+        {
+            "name": name,
+            "failing": len(rows),
+            "faults": int((ranking.elites.verdict[rows] == _FAULT).sum()),
+            "share": 100.0 / longest,
+            "tile": tile,
+        }
         for (name, rows), tile in zip(first, tiles, strict=True)
-    ]  # fmt: skip
+    ]
 
 
-def _listed_elites(ranking: Ranking) -> Listing:
-    """Every elite, faults first, then what fails most."""
+def _listed_elites(ranking: Ranking) -> dict[str, Any]:
+    """Every elite, faults first, then what fails most: places of pictures with words, and columns not for a phone."""
     elites, rows = ranking.elites, []
     for row in elites.by_severity().tolist():
         rates = (elites.collision_rate[row], elites.fallen_rate[row])
@@ -163,11 +132,11 @@ def _listed_elites(ranking: Ranking) -> Listing:
         rows.append((row, cells))
     head = ["elite", "what happens", "verdict", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]",
             "family", "fitness"]  # fmt: skip
-    return Listing(head=head, rows=rows, wide=(5, 6, 7, 8, 9))
+    return {"head": head, "rows": rows, "wide": (5, 6, 7, 8, 9)}
 
 
-def _listed_minima(minima: MinimalTerrains) -> Listing:
-    """Every minimal terrain."""
+def _listed_minima(minima: MinimalTerrains) -> dict[str, Any]:
+    """Every minimal terrain, as the elites."""
     rows = []
     for place, entry in enumerate(minima.numbers["elites"]):
         cells = [
@@ -181,7 +150,7 @@ def _listed_minima(minima: MinimalTerrains) -> Listing:
         ]
         rows.append((place, cells))
     head = ["elite", "cause", "parts left", "goal [%]", "95 % interval", "margin [cm]", "verdict"]
-    return Listing(head=head, rows=rows, wide=(3, 5, 6))
+    return {"head": head, "rows": rows, "wide": (3, 5, 6)}
 
 
 def _shape_words(cause: Mapping[str, Any] | None) -> str:

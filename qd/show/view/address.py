@@ -1,15 +1,10 @@
 """What the address of a page says is shown: read when a tab opens, and kept up to date while it is used."""
 
-import json
 import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
-
-import viser
-
-from qd.show.view.bar import run_script
 
 _POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"
 """Viser's own: its page starts with that camera."""
@@ -84,14 +79,3 @@ def _point(text: str | None) -> Point | None:
     except ValueError:
         return None
     return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
-
-
-def show_query(client: viser.ClientHandle, query: str, *, is_new: bool = False) -> None:
-    """Have a browser show another address, without loading anything; a new one is an entry in its history."""
-    run_script(client, f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
-
-
-def copy_text(client: viser.ClientHandle, text: str) -> None:
-    """Have a browser copy a text; if it may not, it shows that to be copied by hand."""
-    run_script(client, f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
-         "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip

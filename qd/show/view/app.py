@@ -11,7 +11,7 @@ import viser
 
 from qd.show.recordings import Recordings
 from qd.show.view.bar import Bar
-from qd.show.view.common import Common
+from qd.show.view.crosser import Common
 from qd.show.view.meshes import robot_parts
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.scene import SKY, first_view_of
@@ -42,11 +42,14 @@ class App:
     def __init__(self, show: Show, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
         """Open the page; the recorder is closed with it."""
         self.tabs: dict[int, Tab] = {}
-        self._bars: dict[int, Bar] = {}
+        self.bars: dict[int, Bar] = {}
         self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
-        self._recorders, self._show, self._recordings = [recorder], show, recordings
+        self._recorders, self._show = [recorder], show
         self._adopt(recorder)
-        self._record_first(recorder)
+        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
+        wanted = show.wanted(first, next(iter(show.controllers), None), minimal=show.minimal)
+        if wanted is not None and recordings.read(wanted) is None:
+            recorder.record(wanted, tab="first")  # before a page is open
         skeleton = Skeleton(show.robot)
         self._common = Common(
             show=show, skeleton=skeleton, parts=robot_parts(skeleton, show.robot), recordings=recordings,
@@ -64,14 +67,6 @@ class App:
     def _adopt(self, recorder: Recorder) -> None:
         recorder.robot, recorder.report = self._show.robot, lambda report: self.post(self.show_report, report)
 
-    def _record_first(self, recorder: Recorder) -> None:
-        """Have the first elite recorded before a page is open."""
-        show = self._show
-        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
-        wanted = show.wanted(first, next(iter(show.controllers), None), minimal=show.minimal)
-        if wanted is not None and self._recordings.may_keep(wanted):
-            recorder.record(wanted, tab="first")
-
     def _films(self) -> Recorder:
         if len(self._recorders) == 1:
             self._recorders.append(Recorder())
@@ -79,7 +74,7 @@ class App:
         return self._recorders[1]
 
     def _come(self, client: viser.ClientHandle) -> None:
-        self._bars[client.client_id] = Bar(client, lambda name, value: self.post(self.act, client, name, value))
+        self.bars[client.client_id] = Bar(client, lambda name, value: self.post(self.act, client, name, value))
 
     def post(self, act: Callable[..., None], *args: Any) -> None:
         """Have the loop call ``act(*args)``; from any thread."""
@@ -96,11 +91,11 @@ class App:
                 window = (int(width), int(height))
             except (TypeError, ValueError, OverflowError):  # anybody may write it; the page's own comes, too
                 return
-            self.tabs[number] = Tab(client, self._bars[number], self._common, window, str(query))
+            self.tabs[number] = Tab(client, self.bars[number], self._common, window, str(query))
 
     def leave(self, number: int) -> None:
         """Forget a closed tab."""
-        self._bars.pop(number, None)
+        self.bars.pop(number, None)
         tab = self.tabs.pop(number, None)
         if tab is not None:
             tab.leave()

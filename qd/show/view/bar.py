@@ -14,11 +14,6 @@ from viser import _messages
 _SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 
 
-def run_script(client: viser.ClientHandle, script: str) -> None:
-    """Run a script in a browser; viser does so for its plots, and has no public name for it."""
-    client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))
-
-
 class Bar:
     """The bar of one browser tab."""
 
@@ -34,7 +29,7 @@ class Bar:
             client.gui.add_html('<i class="faultline-channel"></i>')
             field = client.gui.add_text("channel", "")
         field.on_update(lambda event: self._take(field.value) if event.client is not None else None)
-        run_script(client, _SCRIPT)
+        self._run(_SCRIPT)
 
     def _take(self, text: str) -> None:
         try:
@@ -50,4 +45,17 @@ class Bar:
         changed = {name: value for name, value in values.items() if self.shown.get(name, ...) != value}
         if changed:
             self.shown |= changed
-            run_script(self._client, f"window.faultline?.show({json.dumps(changed)});")
+            self._run(f"window.faultline?.show({json.dumps(changed)});")
+
+    def show_address(self, query: str, *, is_new: bool) -> None:
+        """Have the browser show another address, without loading anything; a new one is an entry in its history."""
+        self._run(f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
+
+    def copy(self, text: str) -> None:
+        """Have the browser copy a text; if it may not, it shows that to be copied by hand."""
+        self._run(f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
+             "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip
+
+    def _run(self, script: str) -> None:
+        """Run a script in the browser; viser does so for its plots, and has no public name for it."""
+        self._client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))

@@ -1,12 +1,31 @@
-"""A controller on the terrain that a tab shows: its recording, and one episode of that."""
+"""What all tabs share, and a controller on the terrain that a tab shows: its recording, and one episode of that."""
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 
-from qd.show.recordings import Wanted
-from qd.show.view.common import Common
+from qd.show.recordings import Recordings, Wanted
+from qd.show.view.meshes import Part
 from qd.show.view.playing import Crossing, crossing_of
-from qd.show.view.recorder import Report
+from qd.show.view.recorder import Recorder, Report
+from qd.show.view.show import Show
 from sim.recording.recorder import Recording
+from sim.robots.skeleton import Skeleton
+
+
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """What all tabs share."""
+
+    show: Show
+    skeleton: Skeleton
+    parts: list[Part]
+    """Of the robot."""
+    recordings: Recordings
+    recorder: Recorder
+    films: Callable[[], Recorder]
+    """What makes films, in a process of its own from the first call on."""
+    post: Callable[..., None]
+    """:meth:`qd.show.view.app.App.post`."""
 
 
 class Crosser:

@@ -7,8 +7,8 @@ from typing import Any
 import viser
 
 from qd.run.directory import folder_for
-from qd.show.film import FilmCfg, film
-from qd.show.view.common import Common
+from qd.show.film import film
+from qd.show.view.crosser import Common
 from qd.show.view.recorder import Report
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
@@ -29,13 +29,13 @@ class Filming:
         opened_run = self._common.show.opened_run
         by = f"-{how['by']}" if how["by"] else ""
         name = f"{stem}{by}-episode-{replica + 1}.mp4"
-        file, cfg = folder_for(opened_run.path, opened_run.robot.name) / name, FilmCfg(episode=replica)
+        file = folder_for(opened_run.path, opened_run.robot.name) / name
         try:
             prepare_output(file)
         except (OSError, ValueError) as error:
             self._say(f"No film: {error}")
             return
-        self._wanted = partial(film, recording, opened_run.robot, out=file, cfg=cfg, **how)
+        self._wanted = partial(film, recording, opened_run.robot, out=file, episode=replica, **how)
         self._say("Filming: the film process starts …")
         self._common.films().record(self._wanted, tab=self._client.client_id)
 

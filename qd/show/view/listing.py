@@ -8,13 +8,14 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import OUTCOMES, Archive
+from qd.archive import Archive
 from qd.faults import certifier_of, elite_words
-from qd.groups import ORDERS, VERDICTS, Elites, Ranking, rank, summary_of
+from qd.groups import ORDERS, VERDICTS, Ranking, rank
 from qd.minimise import MinimalTerrains
-from qd.show.crossed import ARRIVED, FAILED, Crossed
+from qd.show.crossed import ARRIVED, FAILED, rates_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
+from sim.recording.recorder import Recording
 from sim.spaces.base import TerrainSpace
 
 _GREY, _LISTED, _PICKED = "#d8d8d8", "#2171b5", "#d55e00"
@@ -31,33 +32,20 @@ Column = tuple[str, int, Mapping[str, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
-    """Which elites are listed, and in which order."""
-
-    cause: str = ""
-    """What stops the robot; empty for all."""
-    order: str = next(iter(ORDERS))
-    """One of the :data:`qd.groups.ORDERS`."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Listing:
     """All elites of an archive."""
 
     archive: Archive
-    ranking: Ranking
+    """It has at least one."""
+    space: TerrainSpace
+    """What its genes mean."""
     minima: MinimalTerrains | None = None
     """Minimal terrains of the elites, if there are some."""
 
-    @property
-    def elites(self) -> Elites:
-        """All elites."""
-        return self.ranking.elites
-
     @cached_property
-    def summary(self) -> str:
-        """What the archive says of the controller, in a sentence."""
-        return summary_of(self.ranking, self.archive)
+    def ranking(self) -> Ranking:
+        """All elites, their causes and families."""
+        return rank(self.archive, self.space, self.minima)
 
     @cached_property
     def _orders(self) -> dict[str, NDArray[np.int64]]:
@@ -67,10 +55,10 @@ class Listing:
     def _rows_by_cause(self) -> dict[str, NDArray[np.int64]]:
         return self.ranking.by_cause()
 
-    def listed(self, choice: Choice) -> NDArray[np.int64]:
-        """Numbers of the elites that are chosen, in the chosen order."""
-        order = self._orders[choice.order]
-        return order[np.isin(order, self._rows_by_cause[choice.cause])] if choice.cause else order
+    def listed(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
+        """Numbers of the elites of a cause, or of all, in one of the :data:`qd.groups.ORDERS`."""
+        numbers = self._orders[order]
+        return numbers[np.isin(numbers, self._rows_by_cause[cause])] if cause else numbers
 
     def causes(self) -> dict[str, str]:
         """What stops the robot by its words with the number of elites; empty for all."""
@@ -79,7 +67,7 @@ class Listing:
 
     def verdict(self, number: int) -> str:
         """One of :data:`qd.groups.VERDICTS`."""
-        return VERDICTS[int(self.elites.verdict[number])]
+        return VERDICTS[int(self.ranking.elites.verdict[number])]
 
     def rows_html(self, numbers: Sequence[int]) -> str:
         """Elites one below the other, as HTML; a click on one shows it (``page.js``)."""
@@ -90,7 +78,7 @@ class Listing:
 
     def columns(self, number: int) -> Sequence[Column]:
         """What is known of the whole terrain: fresh episodes, finer contact, and the best certifier."""
-        elites, faults = self.elites, self.archive.faults
+        elites, faults = self.ranking.elites, self.archive.faults
         count = int(elites.counted[number])
         head = "fresh" if elites.fresh[number] else "as found"
         columns = [(head, count, {name: elites.hits(name, number) for name in RATES})]
@@ -105,7 +93,7 @@ class Listing:
         """All else that is known of an elite, as Markdown."""
         archive, ranking, minima = self.archive, self.ranking, self.minima
         others = int((ranking.families == ranking.families[number]).sum()) - 1
-        fitness, before, iteration = self.elites.fitness[number], archive.fitness[number], archive.iteration[number]
+        fitness, before, iteration = (of[number] for of in (ranking.elites.fitness, archive.fitness, archive.iteration))
         parts = [
             *elite_words(archive, number),
             f"{others or 'No'} other elite{'s' * (others > 1)} like it (within 6 cm).",
@@ -116,26 +104,21 @@ class Listing:
         return "\n\n".join(parts)
 
 
-def listing_of(archive: Archive, space: TerrainSpace, minima: MinimalTerrains | None = None) -> Listing:
-    """The elites of an archive with at least one, and their minimal terrains."""
-    return Listing(archive=archive, ranking=rank(archive, space, minima), minima=minima)
-
-
 def _counts_of(outcomes: NDArray[np.integer]) -> tuple[int, dict[str, int]]:
     """Valid episodes, and how they ended, of counts by :data:`qd.archive.OUTCOMES`."""
-    by_name = dict(zip(OUTCOMES, outcomes.tolist(), strict=True))
-    goal, collided, *others = (count for name, count in by_name.items() if name != "invalid")
-    return goal + collided + sum(others), {"goal_rate": goal, "collision_rate": collided, "other_rate": sum(others)}
+    goal, collided, other, _ = outcomes.tolist()
+    return goal + collided + other, {"goal_rate": goal, "collision_rate": collided, "other_rate": other}
 
 
-def column_of(head: str, crossed: Crossed) -> Column:
+def column_of(head: str, recording: Recording) -> Column:
     """What was recorded of a controller."""
-    hits = {words: rate.hits for words, rate in crossed.rates.items()}
+    rates = rates_of(recording)
+    hits = {words: rate.hits for words, rate in rates.items()}
     counts = {
         "goal_rate": hits[ARRIVED], "collision_rate": hits[FAILED[0]], "other_rate": sum(hits[w] for w in FAILED[1:]),
         "fallen_rate": hits["fallen"],
     }  # fmt: skip
-    return head, len(crossed.chosen), counts
+    return head, rates[ARRIVED].count, counts
 
 
 def table_html(columns: Sequence[Column]) -> str:
@@ -153,10 +136,9 @@ def table_html(columns: Sequence[Column]) -> str:
 
 def map_svg(listing: Listing, listed: NDArray[np.int64], picked: int) -> str:
     """From above, where the typical episode of each elite ends: grey if it is not listed; a click on one shows it."""
-    numbers = [*np.setdiff1d(listing.elites.numbers, listed).tolist(), *reversed(listed.tolist()), picked]
-    shown, dots = set(listed.tolist()), []
-    for number in numbers:
-        x, y = listing.elites.end_position[number]
+    elites, shown, dots = listing.ranking.elites, set(listed.tolist()), []
+    for number in (*np.setdiff1d(elites.numbers, listed).tolist(), *reversed(listed.tolist()), picked):
+        x, y = elites.end_position[number]
         if np.isfinite(x + y):
             color, radius = (_PICKED, 6) if number == picked else (_LISTED if number in shown else _GREY, 3)
             words = escape(f"{number}: {listing.ranking.name(number)}")

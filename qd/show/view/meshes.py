@@ -16,8 +16,6 @@ from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
 from sim.terrain import SPACING
 
-Color = tuple[int, int, int]
-
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
 _SEGMENTS = 20  # round an arrow
@@ -32,12 +30,6 @@ class Part:
     """Columns of ``robot.geom_names``."""
     is_foot: bool
     mesh: trimesh.Trimesh
-
-
-def in_bytes(color: tuple[float, float, float]) -> Color:
-    """A colour of 0 to 1 in 0 to 255."""
-    red, green, blue = (round(255.0 * share) for share in color)
-    return red, green, blue
 
 
 def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -84,11 +76,8 @@ def arrow_mesh() -> trimesh.Trimesh:
 
 def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
     """Quaternion w x y z that turns z into the way from one point to another, and the length of that [m], not 0."""
-    length = float(np.linalg.norm(end - begin))
-    x, y, z = (end - begin) / length
-    half = np.array([1.0 + z, -y, x, 0.0])  # the half turn between z and it
-    size = float(np.linalg.norm(half))
-    return (half / size if size > 1e-6 else np.array([0.0, 1.0, 0.0, 0.0])), length
+    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end - begin)
+    return trimesh.transformations.quaternion_from_matrix(turn), float(np.linalg.norm(end - begin))
 
 
 def robot_parts(skeleton: Skeleton, robot: RobotCfg) -> list[Part]:

@@ -4,7 +4,7 @@ They hand on what a visitor does to the :class:`qd.show.view.tab.Tab`, by the vi
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from html import escape
 from typing import Any
@@ -14,10 +14,10 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
-from qd.groups import ORDERS
+from qd.groups import ORDERS, summary_of
 from qd.show.figures import label_of, look_of
 from qd.show.view.legend import legend_html
-from qd.show.view.listing import FITNESS_WORDS, Choice, Column, Listing, map_svg, table_html
+from qd.show.view.listing import FITNESS_WORDS, Column, Listing, map_svg, table_html
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import PHONE, first_view_of
 
@@ -37,24 +37,23 @@ class Selection:
     """Which elites are listed in which order, and which of them is picked; at first all, and the first of them."""
 
     def __init__(self, listing: Listing) -> None:
-        self._listing = listing
-        self.choice = Choice()
-        self.matching: NDArray[np.int64] = listing.listed(self.choice)
+        self._listing, self._choice = listing, dict[str, str]()
+        self.matching: NDArray[np.int64] = listing.listed()
         """Numbers of the elites of the list, in their order."""
         self.picked = int(self.matching[0])
         """Number of the elite that is shown; it stays when it is not listed any more."""
 
-    def choose(self, **changes: Any) -> None:
-        """List other elites, or in another order: fields of :class:`qd.show.view.listing.Choice`."""
-        self.choice = replace(self.choice, **changes)
-        self.matching = self._listing.listed(self.choice)
+    def choose(self, **changes: str) -> None:
+        """List the elites of another ``cause``, or in another ``order``, as :class:`Listing` has them."""
+        self._choice |= changes
+        self.matching = self._listing.listed(**self._choice)
 
     def step(self, by: int) -> int:
         """Number of the next (1) or previous (-1) elite of the list; the picked one at the end of the list.
 
         If the picked one is not listed any more, its neighbours are those of its place among all elites.
         """
-        place = np.argsort(self._listing.listed(Choice(order=self.choice.order)))  # of each elite by its number
+        place = np.argsort(self._listing.listed(**self._choice | {"cause": ""}))  # of each elite by its number
         ahead = place[self.matching] - place[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
         return int(near[0]) if len(near) else self.picked
@@ -105,7 +104,7 @@ class ArchivePanel:
         if tab.window[0] < _WIDE:
             panel.minimize()
         with panel.add_tab("Archive"):
-            gui.add_html(_small(f"{escape(title)}<br><b>{escape(listing.summary)}.</b>"))
+            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary_of(listing.ranking, listing.archive))}.</b>"))
             orders = {words: name for name, words in ORDERS.items()}
             _add_choice(gui, "Cause", listing.causes(), partial(self._choose, "cause"))
             _add_choice(gui, "Sort", orders, partial(self._choose, "order"), f"Fitness is {FITNESS_WORDS}.")
@@ -125,7 +124,7 @@ class ArchivePanel:
         self._map.content = _small(
             f"Where the typical episode of each ends:{map_svg(listing, selection.matching, picked)}"
         )
-        count = f"<b>{len(matching):,}</b> of {len(listing.elites):,} elites"
+        count = f"<b>{len(matching):,}</b> of {len(listing.archive):,} elites"
         number = '<input class="faultline-number" placeholder="number, Enter" size="14" aria-label="Number">'
         shown = "" if picked in matching else f"Shown, but not in this list:{listing.rows_html([picked])}"
         rows = listing.rows_html(matching)
@@ -138,7 +137,6 @@ class CrossingPanel:
     def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: Any) -> None:
         """Lay it out; the ``tab`` does what a visitor asks for."""
         gui, post = client.gui, tab.common.post
-        self._gui, self._penalties = gui, tab.common.show.opened_run.archive.penalties
         if tab.window[0] >= PHONE:  # in a narrower window viser makes a sheet of all panels
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
@@ -151,8 +149,12 @@ class CrossingPanel:
         whole = {words: bool(k) for k, words in enumerate(_TERRAINS)}
         self.terrain = _add_choice(gui, "Terrain", whole, lambda minimal: post(tab.choose_terrain, minimal))
         self.rates = gui.add_html("")
-        self._curves_place = gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True)
-        self._curves: Any = None
+        names = tab.common.show.opened_run.archive.penalties
+        series = [uplot.Series(label=label_of(name), stroke=look_of(name).color, width=2.0) for name in names]
+        with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):
+            look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
+            nothing = (np.zeros(2),) * (1 + len(names))
+            self._curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, first_view_of)}, post)
         _add_buttons(gui, "Share", {"copy command": (tab.copy_command,)}, post)
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.filming.cancel,)}, post)
@@ -180,25 +182,14 @@ class CrossingPanel:
 
     def show_curves(self, crossing: Crossing | None) -> None:
         """Show the penalties of a crossing over its time; ``page.js`` draws the line of the present."""
-        if self._curves is not None:
-            self._curves.visible = crossing is not None
-        if crossing is None:
-            return
-        chosen = np.unique(np.linspace(0, crossing.num_frames - 1, _CURVE_POINTS).astype(int))
-        data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
-        if self._curves is None:
-            series = [uplot.Series(label=label_of(n), stroke=look_of(n).color, width=2.0) for n in self._penalties]
-            with self._curves_place:
-                self._curves = self._gui.add_uplot(
-                    data, (uplot.Series(label="time [s]"), *series), height=170, padding=(12, 12, 0, 0)
-                )
-        self._curves.data = data
-        self.stretch_curves(crossing.duration_s)
+        self._curves.visible = crossing is not None
+        if crossing is not None:
+            chosen = np.unique(np.linspace(0, crossing.num_frames - 1, _CURVE_POINTS).astype(int))
+            self._curves.data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
 
     def stretch_curves(self, duration_s: float) -> None:
         """Have the curves' time last as long as the bar's [s]."""
-        if self._curves is not None:
-            self._curves.scales = {"x": uplot.Scale(time=False, range=(0.0, max(duration_s, 0.02)))}
+        self._curves.scales = {"x": uplot.Scale(time=False, range=(0.0, max(duration_s, 0.02)))}
 
 
 def _small(text: str) -> str:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,8 @@ _LEAST_FORCE = 5.0  # shown [N]
 _COMMAND_HEIGHT = 0.45  # over the base [m]
 
 
-class Mark(NamedTuple):
-    """An event on the timeline."""
-
-    time_s: float
-    words: str
+Mark = tuple[float, str]
+"""When something happens [s], and what."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,11 +108,11 @@ def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
         "first collision": _collides(recording, replica),
         "fall": leans(recording, replica),
     }
-    marks = [Mark(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
+    marks = [(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
     if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
-        marks.append(Mark(moment_of_failure(recording, replica), "stuck"))
-    marks.append(Mark(recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
-    return tuple(sorted(marks, key=lambda mark: mark.time_s))
+        marks.append((moment_of_failure(recording, replica), "stuck"))
+    marks.append((recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
+    return tuple(sorted(marks, key=lambda mark: mark[0]))
 
 
 def _grows(recording: Recording, replica: int, penalty: str) -> NDArray[np.bool_]:

@@ -8,18 +8,16 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from qd.show.view.meshes import Color, Part, arrow_mesh, arrow_pose, in_bytes, in_linear_light, terrain_mesh
+from qd.show.view.meshes import Part, arrow_mesh, arrow_pose, in_linear_light, terrain_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
+from sim.mujoco_c.model import surface_heights
+from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
 from sim.terrain import SPACING
 
-TOUCH_COLOR, FOOT_TOUCH_COLOR = in_bytes(TOUCH), in_bytes(FOOT_TOUCH)
-"""Of base and limbs, and of feet, while they touch."""
-FORCE_COLOR, COMMAND_COLOR = (215, 25, 28), (0, 158, 115)
-GHOST_COLOR = in_bytes(OTHER_CONTROLLER)
-"""Of the second robot, which is translucent."""
+FORCE_COLOR, COMMAND_COLOR = (0.84, 0.10, 0.11), (0.0, 0.62, 0.45)
+"""Of arrows, RGB, 0 to 1."""
 _START_COLOR, _GOAL_COLOR, _WAY_COLOR = (255, 255, 255), (0, 158, 115), (240, 200, 60)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
 """What is behind all, blue above and pale below, as an image of one column."""
@@ -68,7 +66,7 @@ class Scene:
         for k, part in enumerate(parts):
             name = f"/robot/{part.body}/{k}"
             self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
-            color = FOOT_TOUCH_COLOR if part.is_foot else TOUCH_COLOR
+            color = FOOT_TOUCH if part.is_foot else TOUCH
             self.touched.append(self._add_mesh(f"{name}-touched", part.mesh, color, cast_shadow=True))
         self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
         self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
@@ -95,7 +93,7 @@ class Scene:
             self.hide_crossing()
             mesh = terrain_mesh(heights, ground)
             scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=0.45)
-            low, high = _heights_at(heights, np.array([start, goal])).tolist()
+            low, high = surface_heights(heights, *np.array([start, goal]).T).tolist()
             disc: Any = {"height": _DISC_HEIGHT, "opacity": _DISC_OPACITY, "cast_shadow": False}
             scene.add_cylinder("/start/disc", _START_RADIUS, color=_START_COLOR, position=(*start, low), **disc)
             before = (start[0] - _START_RADIUS, start[1], low)
@@ -112,20 +110,20 @@ class Scene:
         length = float(np.linalg.norm(goal - start))
         share = np.linspace(0.0, 1.0, round(length / SPACING) + 1)
         places = start + share[:, None] * (goal - start)
-        points = np.column_stack([places, _heights_at(heights, places) + _WAY_LIFT])
+        points = np.column_stack([places, surface_heights(heights, *places.T) + _WAY_LIFT])
         segments = np.stack([points[:-1], points[1:]], axis=1)[::2]
         self._client.scene.add_line_segments("/way/line", segments, colors=_WAY_COLOR, thickness=0.02)
 
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
         self.robot.visible = False
-        self.hide_ghost()
+        self.ghost.visible = False
         self._followed = None
         for handle in (*self.forces, self._command):
             handle.visible = False
         self.set_paths(())
 
-    def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], Color]]) -> None:
+    def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], tuple[int, ...]]]) -> None:
         """Show the way of the base in every episode as points [m] and colour, thin."""
         for handle in self.paths:
             handle.remove()
@@ -147,36 +145,28 @@ class Scene:
 
     def show_frame(self, crossing: Crossing, frame: int) -> None:
         """Put the robot where it is at a frame of a crossing, with what touches, its forces and command."""
-        positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
             self.robot.visible = True
-            for handle, position, quaternion in zip(self.bodies, positions, quaternions, strict=True):
-                _place(handle, position, quaternion)
+            _place(self.bodies, crossing, frame)
             for part, alone, touched in zip(self._parts, self.parts, self.touched, strict=True):
                 touched.visible = bool(crossing.touching[frame, list(part.touches)].any())
                 alone.visible = not touched.visible
             _set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
                 _set_arrow(handle, arrow)
-        self._go_along(positions[0])
+        self._go_along(crossing.positions[frame, 0])
 
     def show_ghost(self, crossing: Crossing, frame: int, name: str = "") -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a name over it."""
-        positions, quaternions = crossing.positions[frame], crossing.quaternions[frame]
         with self._client.atomic():
             if not self._ghost_parts:
                 for k, part in enumerate(self._parts):
                     name_of_part, look = f"/ghost/{part.body}/{k}", {"opacity": _GHOST_OPACITY, "visible": True}
-                    self._ghost_parts.append(self._add_mesh(name_of_part, part.mesh, GHOST_COLOR, **look))
+                    self._ghost_parts.append(self._add_mesh(name_of_part, part.mesh, OTHER_CONTROLLER, **look))
             self.ghost.visible = True
-            for handle, position, quaternion in zip(self.ghost_bodies, positions, quaternions, strict=True):
-                _place(handle, position, quaternion)
+            _place(self.ghost_bodies, crossing, frame)
             self._ghost_name.text, self._ghost_name.visible = name, bool(name)
-            self._ghost_name.position = tuple(positions[0] + np.array([0.0, 0.0, _GHOST_NAME_HEIGHT]))
-
-    def hide_ghost(self) -> None:
-        """Show the robot alone."""
-        self.ghost.visible = False
+            self._ghost_name.position = tuple(crossing.positions[frame, 0] + np.array([0.0, 0.0, _GHOST_NAME_HEIGHT]))
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:
         """A shape of one colour, without shadow and not visible yet unless its look is another."""
@@ -205,8 +195,10 @@ class Scene:
             self._client.camera.position, self._client.camera.look_at = view
 
 
-def _place(handle: Any, position: Points, quaternion: Points) -> None:
-    handle.position, handle.wxyz = tuple(position), tuple(quaternion)
+def _place(bodies: Sequence[Any], crossing: Crossing, frame: int) -> None:
+    """Put the bodies of a robot where they are at a frame."""
+    for handle, position, turn in zip(bodies, crossing.positions[frame], crossing.quaternions[frame], strict=True):
+        handle.position, handle.wxyz = tuple(position), tuple(turn)
 
 
 def _set_arrow(handle: Any, arrow: Points) -> None:
@@ -216,10 +208,3 @@ def _set_arrow(handle: Any, arrow: Points) -> None:
         handle.wxyz, length = arrow_pose(arrow[0], arrow[1])
         handle.position = tuple(arrow[0])
         handle.scale = (1.0, 1.0, length)
-
-
-def _heights_at(heights: Points, places: NDArray[np.floating]) -> Points:
-    """Height of the nearest node [m] at x, y of shape (num, 2)."""
-    limits = np.array(heights.shape[::-1]) - 1
-    col, row = np.clip(np.rint(places / SPACING).astype(int), 0, limits).T
-    return heights[row, col]

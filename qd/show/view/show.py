@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Wanted, on_elite
-from qd.show.view.listing import Listing, listing_of
+from qd.show.view.listing import Listing
 from qd.workers.evaluator import check_policy
 from sim.policy.spec import ControllerSpec, controllers_of
 from sim.robots.robot import RobotCfg
@@ -43,7 +43,7 @@ class Show:
     @cached_property
     def listing(self) -> Listing:
         """All elites, and the orders to list them in."""
-        return listing_of(self.opened_run.archive, self.opened_run.space, self.minima)
+        return Listing(archive=self.opened_run.archive, space=self.opened_run.space, minima=self.minima)
 
     @property
     def robot(self) -> RobotCfg:
@@ -83,16 +83,7 @@ def find_show(
     policies: Sequence[str] = (),
     space: str | None = None,
 ) -> Show:
-    """What a user asks to see, as the command line names it.
-
-    Args:
-        run: Run directory or archive file; the newest of the robot, else its published one.
-        robot: Name or settings file of the robot.
-        elite: Number of the elite to show first.
-        minimal: Number of the elite whose minimal terrain to show first, or ``all``.
-        policies: Controllers to choose from, ``NAME=FILE`` each, besides its certifiers; if empty, that of the search.
-        space: A user's own terrain space that the run names.
-    """
+    """What a user asks to see, by the flags of ``faultline view``."""
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")

@@ -1,6 +1,5 @@
 """What the viewer's processes work on: they record crossings and film them."""
 
-from collections import deque
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.synchronize import Event
@@ -21,15 +20,14 @@ class Simulator:
     def __init__(self, drop: Event) -> None:
         self._drop = drop
         self._simulation: Simulation | None = None
-        self._tasks = deque[tuple[Wanted | partial[None], RobotCfg]]()
 
     def put(self, wanted: Wanted | partial[None], robot: RobotCfg) -> None:
-        """Queue a crossing, or a film as :func:`qd.show.film.film` makes it."""
-        self._tasks.append((wanted, robot))
+        """Take on a crossing, or a film as :func:`qd.show.film.film` makes it."""
+        self._task = wanted, robot
 
     def take(self, progress: Callable[[float], None]) -> Any:
-        """The recording or the file of the oldest task; an error of it; None if it was dropped."""
-        wanted, robot = self._tasks.popleft()
+        """The recording or the file of the task; an error of it; None if it was dropped."""
+        wanted, robot = self._task
 
         def report(share: float) -> None:
             progress(share)

@@ -9,11 +9,10 @@ from typing import Any
 
 import viser
 
-from qd.show.crossed import crossed_of, episode_beside, typical_episode
-from qd.show.view.address import Address, copy_text, read_address, show_query
+from qd.show.crossed import episode_beside, typical_episode
+from qd.show.view.address import Address, read_address
 from qd.show.view.bar import Bar
-from qd.show.view.common import Common
-from qd.show.view.crosser import Crosser
+from qd.show.view.crosser import Common, Crosser
 from qd.show.view.filming import Filming
 from qd.show.view.listing import column_of
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
@@ -154,7 +153,7 @@ class Tab:
             before, _ = read_address(self.query)
             is_new = before.elite not in (None, address.elite)
             self.query = query
-            show_query(self.client, query, is_new=is_new)
+            self.bar.show_address(query, is_new=is_new)
 
     def copy_command(self) -> None:
         """Have the browser copy the command that replays what the tab shows."""
@@ -164,7 +163,7 @@ class Tab:
             policy=None if name is None or name == SEARCHED else show.controllers[name], replicas=show.replicas,
             **{"minimal" if self.minimal else "elite": self.selection.picked},
         )  # fmt: skip
-        copy_text(self.client, text)
+        self.bar.copy(text)
         self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
 
     def film(self) -> None:
@@ -321,7 +320,7 @@ class Tab:
         columns = [] if self.minimal else [*self.common.show.listing.columns(self.selection.picked)]
         for crosser in crossers:
             if crosser.recording is not None:
-                columns.append(column_of(str(crosser.name), crossed_of(crosser.recording)))
+                columns.append(column_of(str(crosser.name), crosser.recording))
         self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
@@ -341,7 +340,7 @@ class Tab:
         beside = replica if recording is None else episode_beside(recording, replica, self._scales)
         self.ghost.show_episode(beside)
         crossing, ghost = self.robot.crossing, self.ghost.crossing
-        self.scene.hide_ghost()
+        self.scene.ghost.visible = False
         if crossing is not None:
             words = self._note if self.ghost.name is None else f"Ghost, {self.ghost.name}: {words or 'is recorded'}"
             if ghost is not None:

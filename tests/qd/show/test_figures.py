@@ -28,7 +28,8 @@ def test_curves_show_what_the_metrics_say():
     assert middle.lines[0].get_ydata().tolist() == [5, 10, 15, 20]
     assert right.lines[0].get_ydata().tolist() == [2, 3, 4, 5]
     # two ratios have 10 reachable cells, so the right-hand scale is ten times the left-hand one
-    coverage = next(axes for axes in figure.axes if "coverage" in axes.get_ylabel())
+    figure.draw_without_rendering()
+    (coverage,) = middle.child_axes
     assert coverage.get_ylim()[1] == pytest.approx(10 * middle.get_ylim()[1])
 
 

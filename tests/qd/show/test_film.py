@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -12,14 +13,12 @@ from PIL import Image
 from kernels.episode import Outcome
 from qd.show.commands import Film
 from qd.show.crossed import moment_of_failure, title_of, typical_episode
-from qd.show.film import Shot, as_gif, as_mp4, follow, pictures_of, pose_at
+from qd.show.film import Shot, as_gif, follow, pictures_of, pose_at
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import open_context
 from tests.builders import small_archive, write_run
 from tests.qd.recordings import recording_of, stand_in_cross
-
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 SCALES = {"yaw_rate": 2.0, "vel_x": 1.0}
 FRAMES = 251
@@ -149,15 +148,6 @@ def test_pictures_show_poses_ghosts_and_touch_of_their_times(recording, anymal, 
                 np.testing.assert_allclose(ghost.qpos, pose_at(other.qpos(0, 4), frame))
 
 
-def test_a_film_plays_as_long_as_it_should(tmp_path):
-    path = tmp_path / "a b.mp4"
-    path.write_bytes(as_mp4((np.full((64, 96, 3), 5 * k, np.uint8) for k in range(30)), (96, 64), 10))
-    assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (30, pytest.approx(3.0, abs=0.1))
-    meta, *read = imageio_ffmpeg.read_frames(str(path))
-    assert meta["size"] == (96, 64) and meta["codec"] == "h264"
-    assert abs(np.frombuffer(read[-1], np.uint8).mean() - 145) < 4
-
-
 def test_a_gif_has_as_many_colours_as_its_size_allows():
     noise = np.random.default_rng(0).integers(0, 255, (8, 20, 30, 3), np.uint8)
     large, small = (Image.open(io.BytesIO(as_gif(noise, most))) for most in (100_000, 5_000))
@@ -192,11 +182,12 @@ def test_films_of_elites_and_of_a_map(run, capsys):
     name = "tests.sim.policies-stand"  # not the search's
     # One of four arrives: one that fails is filmed, 0.4 s in 1.6 s and 1 s more, two pictures a second
     films = [run / f"elite-{elite}-{name}.mp4" for elite in (0, 2)]
-    assert [imageio_ffmpeg.count_frames_and_secs(str(path))[0] for path in films] == [6, 6]
+    for path in films:
+        assert imageio_ffmpeg.count_frames_and_secs(str(path)) == (6, pytest.approx(3.0, abs=0.1))
+        assert next(imageio_ffmpeg.read_frames(str(path)))["codec"] == "h264"
     assert "replaced" not in capsys.readouterr().out
     assert film("--elite", "2", "--episode", "1", "--out", str(films[0]), *crossing) == 0
     assert "replaced" in capsys.readouterr().out
-    assert imageio_ffmpeg.count_frames_and_secs(str(films[0]))[0] == 6  # episode 1 fails too
     np.savez("hill.npz", heights=np.zeros((3, 5)), size_m=[16.0, 8.0])
     assert film("--terrain", "hill.npz", "--beside", "shipped", "--gif", *crossing) == 0
     with Image.open(f"runs/terrains/hill.npz-anymal-{name}.gif") as gif:

@@ -14,7 +14,7 @@ from qd.descriptors import Cells
 from qd.groups import rank
 from qd.run.directory import RunDirectory
 from qd.show.commands import Export, Replay
-from qd.show.crossed import crossed_of, draw_crossing
+from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
@@ -87,29 +87,6 @@ def test_corrected_values_stand_between_the_found_ones_and_those_of_now(opened_r
     assert "base collision 25% (5-70%) 25% (13-42%) 25% (5-70%)" in lines
 
 
-def test_an_elite_is_crossed_by_the_controller_that_is_named_and_drawn_in_the_run(
-    opened_run, recording, monkeypatch, capsys
-):
-    asked = []
-
-    def all_of(recordings, wanted):
-        asked.extend(wanted)
-        return [recording]
-
-    monkeypatch.setattr(Recordings, "all_of", all_of)
-    for _ in range(2):
-        replay(source_of_run(opened_run, replicas=4, seed=2))
-    assert Image.open("elite-0.png").size[0] > 1000
-    assert capsys.readouterr().out.count("(replaced)") == 2  # numbers and figure
-    assert (asked[0].policy, asked[0].replicas, asked[0].seed) == (str(opened_run.robot.policy_file), 4, 2)
-    replay(source_of_run(opened_run, policy=STAND))
-    report = json.loads(Path("elite-0-tests.sim.policies-stand.json").read_text())
-    assert report["elite"] == 0 and report["rates"]["goal"]["hits"] == 3
-    np.testing.assert_array_equal(asked[2].terrain, opened_run.archive.genes[0])
-    with pytest.raises(ValueError, match="out"):
-        replay(source_of_run(opened_run), out=Path("a.jpg"))
-
-
 def test_rates_of_ones_own_terrain_with_their_intervals():
     gray = np.zeros((81, 161), np.uint8)
     gray[:, 100:] = 200  # a wall of 2 m before the goal
@@ -123,11 +100,9 @@ def test_rates_of_ones_own_terrain_with_their_intervals():
     assert report["rates"]["goal"] == {"rate": 0.0, "hits": 0, "interval": [0.0, pytest.approx(0.4899, abs=1e-4)]}
     assert report["outcomes"] == {"goal": 0, "base_collision": 0, "time_out": 4, "out": 0, "invalid": 0}
     assert report["heights_m"] == [0.0, 2.0] and report["duration_s"] == 20.0
-    # 20 s at rest against 0.75 m/s: 20 * 0.75^2
-    assert report["penalties"]["vel_x"]["mean"] == pytest.approx(11.25, rel=0.1)
     keys = {"command", "commit", "device", "versions", "seed", "date", "policy_sha256", "terrain_sha256"}
     assert keys <= report.keys()
-    assert Image.open(f"{stem}.png").size[0] > 1000
+    assert Path(f"{stem}.png").exists()
 
 
 def test_invalid_episodes_are_left_out_of_the_rates():
@@ -137,7 +112,7 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     made = dataclasses.replace(
         made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
     )
-    numbers = numbers_of(crossed_of(made))
+    numbers = numbers_of(made)
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
     assert numbers["duration_s"] == 10.0  # of 4 and 16
@@ -146,7 +121,7 @@ def test_invalid_episodes_are_left_out_of_the_rates():
 
 def test_the_drawing_has_all_paths():
     recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0])
-    figure = draw_crossing(crossed_of(recording), "a hill")
+    figure = draw_crossing(recording, "a hill")
     axes = figure.axes[0]
     assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 2
     assert axes.images[0].get_array().shape == (161, 321)
@@ -190,9 +165,6 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     (terrain,) = opened_run.terrains()
     assert terrain.number == rank(opened_run.archive, opened_run.space).worst(1)[0] != 0
     assert [terrain.stem for terrain in opened_run.terrains("all")] == ["elite-0", "elite-1", "elite-2"]
-    for elite in ("3", "-1", "x"):
-        with pytest.raises(ValueError, match="elite"):
-            opened_run.terrains(elite)
     with pytest.raises(FileNotFoundError, match="minimal"):
         opened_run.terrains("0", "all")
     with pytest.raises(ValueError, match="cassie"):
@@ -222,9 +194,14 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
         ]
 
     monkeypatch.setattr(Recordings, "all_of", all_of)
-    replay(source_of_run(opened_run, minimal=str(number), replicas=2, policy="shipped"))
+    source = source_of_run(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
+    (report,) = replay(source)
     np.testing.assert_array_equal(wanted[0].terrain, genes[number])
+    assert (wanted[0].policy, wanted[0].replicas, wanted[0].seed) == (str(opened_run.robot.policy_file), 2, 3)
     assert (run / f"minimal-{number}.png").is_file()
+    assert json.loads((run / f"minimal-{number}.json").read_text()) == report and report["elite"] == number
+    with pytest.raises(ValueError, match="out"):
+        replay(source, out=Path("a.jpg"))
     assert opened_run.minima().words(number) in " ".join(capsys.readouterr().out.split())
     Export(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}

@@ -3,7 +3,7 @@
 import pytest
 
 from qd.show.report.report import write_report
-from sim.files.atomic import read_json, to_json
+from sim.files.atomic import to_json
 from tests.qd.evaluate.made import make_report
 from tests.qd.show.report.pages import text_of
 
@@ -24,18 +24,15 @@ def content():
     return {"command": "faultline harden <b>", "robot": "anymal", "rounds": rounds, "tables": tables}
 
 
-@pytest.fixture
-def run(tmp_path):
-    (tmp_path / "rounds.json").write_bytes(to_json(content()))
-    return tmp_path
+def written(run, **changes):
+    """The run with its file."""
+    (run / "rounds.json").write_bytes(to_json(content() | changes))
+    return run
 
 
-def write(run, **changes):
-    (run / "rounds.json").write_bytes(to_json(read_json(run / "rounds.json") | changes))
-
-
-def test_the_page_has_the_numbers_of_the_rounds(run):
-    write(run, choices={"tune-1": {"kept": True, "why": "better"}, "tune-2": {"kept": False, "why": "<i>worse"}})
+def test_the_page_has_the_numbers_of_the_rounds(tmp_path):
+    choices = {"tune-1": {"kept": True, "why": "better"}, "tune-2": {"kept": False, "why": "<i>worse"}}
+    run = written(tmp_path, choices=choices)
     text = text_of(write_report(run).read_bytes())
     for part in (
         "1 round of search and training: searches find 12 faults of anymal's controller before and 3 after",
@@ -44,14 +41,13 @@ def test_the_page_has_the_numbers_of_the_rounds(run):
         "tune-1 kept better tune-2 not kept <i>worse", "faultline harden <b>",
     ):  # fmt: skip
         assert part in text
-    write(run, rounds=[row("base", None)], tables={**content()["tables"], "differences": {}})  # one search alone
+    written(run, rounds=[row("base", None)], tables={**content()["tables"], "differences": {}})  # one search alone
     assert "search-0: base" not in text_of(write_report(run).read_bytes())
 
 
-def test_what_is_no_hardening_is_refused(run):
+def test_what_is_no_hardening_is_refused(tmp_path):
     with pytest.raises(ValueError, match="cassie"):
-        write_report(run, robot="cassie")
+        write_report(written(tmp_path), robot="cassie")
     for changes in ({"rounds": []}, {"rounds": [{"controller": 3}]}, {"tables": {"episodes": 20}}):
-        (run / "rounds.json").write_bytes(to_json(content() | changes))
         with pytest.raises(ValueError, match="rounds"):
-            write_report(run)
+            write_report(written(tmp_path, **changes))

@@ -40,7 +40,7 @@ def test_of_several_trainings_each_is_shown_and_the_mean_over_their_seeds():
         "over_seeds": {measure: {"near": {"C-G": over}} for measure in MEASURES},
     }  # fmt: skip
     compared = compared_of(several, searched="1")
-    words, goals = compared.measures[0]
-    assert not compared.of_searched and words == "goal reached" and goals.head == ["controller", "near (4)"]
+    words, goals = compared["measures"][0]
+    assert not compared["of_searched"] and words == "goal reached" and goals.head == ["controller", "near (4)"]
     expected = [["base", "50 % (40 to 60)"], ["C-G", "60 % (50 to 70)"], ["C-G@1", "80 %"], ["C-G, mean of 2", "70 %"]]
     assert goals.rows == expected

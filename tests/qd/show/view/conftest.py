@@ -1,17 +1,13 @@
-"""What tests of the page share; those of its widgets need viser."""
+"""What tests of the page share."""
 
 import dataclasses
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-from qd.show.view.listing import listing_of
+from qd.show.view.listing import Listing
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
-
-_NEED_VISER = ("test_app.py", "test_listing.py", "test_address.py", "test_browser.py", "test_show.py")
-collect_ignore = [] if find_spec("viser") else list(_NEED_VISER)
 
 
 @pytest.fixture(scope="session")
@@ -31,4 +27,4 @@ def listing():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return listing_of(archive, SUPER_GAUSSIAN)
+    return Listing(archive=archive, space=SUPER_GAUSSIAN)

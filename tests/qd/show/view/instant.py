@@ -1,13 +1,8 @@
 """A simulation that takes no time, in a module that a process imports at once."""
 
-import time
-
 
 class Instant:
-    """A simulation that names what it would cross; elite 13 breaks it, and policy `slow` takes its time.
-
-    Policy `droppable` takes long and can be dropped.
-    """
+    """A simulation that names what it would cross; elite 13 breaks it, and policy `slow` takes its time."""
 
     def __init__(self, drop):
         self.wanted, self.drop = [], drop
@@ -22,9 +17,7 @@ class Instant:
         if wanted.terrain_seed == 13:
             raise RuntimeError("broken")
         progress(0.5)
-        if wanted.policy == "slow":
-            time.sleep(1.0)
-        if wanted.policy == "droppable" and self.drop.wait(1.0):
+        if wanted.policy == "slow" and self.drop.wait(1.0):
             return None
         return f"{robot}: {wanted.policy} on {wanted.terrain_seed}"
 

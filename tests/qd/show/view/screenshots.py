@@ -1,7 +1,6 @@
 """Pictures of the viewer and of the report's top: ``python -m tests.qd.show.view.screenshots [--report PAGE]``.
 
-It serves the published archive of ANYmal and drives a browser as the tests of the page do. docs/pictures gets the
-picture of a laptop and the report's; those of a large screen and a phone are for the eye, in runs/.
+It serves the published archive of ANYmal and drives a browser as the tests of the page do.
 """
 
 import argparse
@@ -13,9 +12,7 @@ from PIL import Image
 from tests.qd.show.view.browser import LIMIT_MS, open_chromium, until_it_plays, wait_for
 from tests.qd.show.view.visitor import ROOT, serve
 
-DOCS, RUNS = ROOT / "docs" / "pictures", ROOT / "runs"
-WINDOWS = {DOCS / "viewer.jpg": (1366, 768, 1), RUNS / "viewer-wide.jpg": (1920, 1080, 1),
-           RUNS / "viewer-phone.jpg": (390, 844, 3)}  # fmt: skip
+DOCS = ROOT / "docs" / "pictures"
 SETTLE_MS = 4000  # for the last frames of a browser that draws without a GPU
 
 
@@ -24,7 +21,6 @@ def take(page, file: Path) -> None:
     for close in page.locator(".mantine-Notification-closeButton").all():  # such as that there is no GPU
         close.click()
     page.wait_for_timeout(SETTLE_MS)
-    file.parent.mkdir(parents=True, exist_ok=True)
     Image.open(io.BytesIO(page.screenshot(timeout=LIMIT_MS))).convert("RGB").save(file, quality=78)
     print(file, flush=True)
 
@@ -35,16 +31,14 @@ def main() -> None:
     flags.add_argument("--report", type=Path, help="a page that `faultline report` wrote")
     report = flags.parse_args().report
     with open_chromium() as browser:
-        with serve("--run", "results/anymal/archive") as (address, _):
-            for file, (width, height, ratio) in WINDOWS.items():
-                page = browser.new_page(viewport={"width": width, "height": height}, device_scale_factor=ratio)
-                page.goto(address, timeout=LIMIT_MS)
-                until_it_plays(page)
-                wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
-                page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
-                page.keyboard.press("Space")
-                take(page, file)
-                page.close()
+        with serve("--run", "results/anymal/archive") as address:
+            page = browser.new_page(viewport={"width": 1366, "height": 768})
+            page.goto(address, timeout=LIMIT_MS)
+            until_it_plays(page)
+            wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
+            page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
+            page.keyboard.press("Space")
+            take(page, DOCS / "viewer.jpg")
         if report is not None:
             page = browser.new_page(viewport={"width": 1400, "height": 1400})
             page.goto(report.absolute().as_uri())

@@ -19,7 +19,7 @@ def address(tmp_path_factory, published):
     """Of a viewer of the published archive, with one controller under two names."""
     cache, run = tmp_path_factory.mktemp("cache"), published / "anymal" / "archive"
     flags = f"--run {run} --elite 0 --cache {cache} --policies base=shipped C-G=shipped"
-    with serve(*flags.split()) as (address, _):
+    with serve(*flags.split()) as address:
         yield address
 
 

@@ -3,8 +3,7 @@ import re
 
 import numpy as np
 
-from qd.show.crossed import crossed_of
-from qd.show.view.listing import column_of, listing_of, table_html
+from qd.show.view.listing import Listing, column_of, table_html
 from qd.show.view.panels import Clock, Selection
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
@@ -36,7 +35,7 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(lis
 
 
 def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
-    listing = listing_of(judged_archive(), SUPER_GAUSSIAN)
+    listing = Listing(archive=judged_archive(), space=SUPER_GAUSSIAN)
     assert "It is a fault" in listing.details(0)
     fresh, resolved, certifier = listing.columns(0)
     assert all(len(listing.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
@@ -45,7 +44,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
     assert resolved == ("finer contact", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
     assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
     recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
-    recorded = column_of("here", crossed_of(recording))
+    recorded = column_of("here", recording)
     assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
     table = table_html([resolved, recorded])
     assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]
@@ -59,7 +58,7 @@ def test_numbers_of_fresh_episodes_come_first():
     fresh = dataclasses.replace(
         fresh, collision_rate=np.array([0.5, 0.25, 0.0]), invalid_episodes=np.array([0, 0, 39]), fitness=np.zeros(3)
     )
-    listing = listing_of(dataclasses.replace(archive, fresh=fresh), SUPER_GAUSSIAN)
+    listing = Listing(archive=dataclasses.replace(archive, fresh=fresh), space=SUPER_GAUSSIAN)
     (column,), (other,) = listing.columns(0), listing.columns(2)
     assert (column[0], column[1], column[2]["collision_rate"]) == ("fresh", 40, 20)
     assert (other[0], other[1], other[2]["collision_rate"]) == ("as found", 4, 4)
@@ -79,9 +78,5 @@ def test_time_goes_by_at_its_speed_and_begins_again():
     assert clock.time_s == 2.0
     clock.tick(0.5)
     assert (clock.time_s, clock.playing) == (0.5, True)
-    clock.seek(1.23)
-    assert clock.frame(0.02, 101) == 62  # 61.5, to the even one
     clock.seek(99.0)
     assert clock.time_s == 2.0 and clock.frame(0.02, 90) == 89
-    clock.seek(-1.0)
-    assert clock.frame(0.02, 90) == 0

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 
 from qd.show.view.meshes import arrow_mesh, arrow_pose, robot_parts
 from qd.show.view.playing import rotated
@@ -28,12 +27,8 @@ def test_a_robots_parts_hold_together_and_each_shows_one_touch(robot):
         assert any((low <= top).all() and (high >= bottom).all() for bottom, top in others)
 
 
-@pytest.mark.parametrize("way", [(0.3, -0.4, 1.2), (0.0, 0.0, 2.0), (0.0, 0.0, -0.5), (1.0, 0.0, 0.0)])
-def test_an_arrow_points_from_its_beginning_to_its_end(way):
-    begin = np.array([1.0, 2.0, 3.0])
+def test_an_arrow_points_from_its_beginning_to_its_end():
+    begin, way = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.4, 1.2])
     quaternion, length = arrow_pose(begin, begin + way)
-    vertices = arrow_mesh().vertices
-    tip = vertices[np.argmax(vertices[:, 2])]
-    np.testing.assert_allclose(tip, [0.0, 0.0, 1.0], atol=1e-6)
-    assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
-    np.testing.assert_allclose(begin + rotated(quaternion, tip * [1.0, 1.0, length]), begin + way, atol=1e-5)
+    np.testing.assert_allclose(arrow_mesh().bounds[:, 2], [0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(rotated(quaternion, np.array([0.0, 0.0, length])), way, atol=1e-5)

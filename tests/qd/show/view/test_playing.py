@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.show.view.playing import Mark, crossing_of, episodes_by_ending, marks_of, paths_of
+from qd.show.view.playing import crossing_of, episodes_by_ending, marks_of, paths_of
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
@@ -75,16 +75,15 @@ def test_marks_stand_where_things_happen_first():
     quaternion[0, 0] = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
     made = dataclasses.replace(made, penalties=sums, base_quaternion=quaternion)
     marks = marks_of(made, 0)
-    assert [mark.words for mark in marks] == ["first stumble", "first collision", "fall", "end: base collision"]
-    np.testing.assert_allclose([mark.time_s for mark in marks], [0.16, 0.24, 0.30, 0.40])
-    assert marks_of(made, 1) == (Mark(pytest.approx(0.4), "end: reached the goal"),)
+    assert [words for _, words in marks] == ["first stumble", "first collision", "fall", "end: base collision"]
+    np.testing.assert_allclose([time_s for time_s, _ in marks], [0.16, 0.24, 0.30, 0.40])
+    assert marks_of(made, 1) == ((pytest.approx(0.4), "end: reached the goal"),)
 
 
 def test_a_robot_that_gets_stuck_has_a_mark_where_it_stays():
     made = recording_of([Outcome.TIME_OUT], [6.0], penalties=np.zeros((1, 6)))  # 0.2 m a frame, from 2 m to 6 m
-    crossing = marks_of(made, 0)
-    assert [mark.words for mark in crossing] == ["stuck", "end: out of time"]
-    assert [mark.time_s for mark in crossing] == pytest.approx([0.38, 0.40])  # frame 19 lies within 0.3 m of the end
+    # frame 19 lies within 0.3 m of the end
+    assert marks_of(made, 0) == ((pytest.approx(0.38), "stuck"), (pytest.approx(0.40), "end: out of time"))
 
 
 def test_episodes_are_offered_by_how_they_ended():

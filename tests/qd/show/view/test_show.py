@@ -17,17 +17,13 @@ from sim.robots.find import get_robot
 from tests.builders import small_archive
 
 
-@pytest.fixture
-def copied(tmp_path, run):
-    return Path(shutil.copytree(run, tmp_path / "run"))
-
-
 def test_the_controller_of_the_search_comes_first_and_certifiers_follow(anymal, run):
     controllers = find_show(run).controllers
     assert next(iter(controllers.items())) == ("searched controller", str(anymal.policy_file)) and "C-G" in controllers
 
 
-def test_terrains_are_shown_when_the_controller_of_the_search_is_code(copied):
+def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path, run):
+    copied = Path(shutil.copytree(run, tmp_path / "run"))
     settings = json.loads((copied / "config.json").read_text())
     settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
     (copied / "config.json").write_text(json.dumps(settings))
