@@ -11,11 +11,27 @@ from qd.archive import read_archive
 from qd.run.settings import as_settings, preset
 from qd.show.report import report
 from sim.files.atomic import to_json
+from sim.files.records import robot_digest
 from sim.robots.find import get_robot
-from tests.builders import fresh_values, write_run
+from tests.builders import fresh_values, small_archive, write_run
 from tests.qd.recordings import stand_in_cross
 from tests.qd.show.test_figures import rows
-from tests.qd.test_groups import grouped_archive
+
+
+def grouped_archive(sizes=(6, 9, 5)):
+    """Elites of three kinds, far apart: stuck with the first penalty, collided with the second, across with both."""
+    kinds, archive = np.repeat(np.arange(3), sizes), small_archive(sum(sizes))
+    shares, noise = np.array([0.9, 0.1, 0.5])[kinds], np.random.default_rng(0).uniform(-0.01, 0.01, len(kinds))
+    return dataclasses.replace(
+        archive,
+        robot_sha256=robot_digest(get_robot("anymal")),
+        ratios=np.column_stack([shares + noise, 1.0 - shares - noise]),
+        goal_rate=(kinds == 2).astype(float),
+        collision_rate=(kinds == 1).astype(float),
+        fallen_rate=np.zeros(len(kinds)),
+        fitness=np.linspace(9.0, 1.0, len(kinds)),
+        cell=np.arange(len(kinds)) % archive.cells.num_cells,
+    )
 
 
 def text_of(content: bytes) -> str:
@@ -26,8 +42,7 @@ def text_of(content: bytes) -> str:
 
 def make_run(root):
     """A whole run of 20 elites with fresh values."""
-    archive, _ = grouped_archive()
-    archive = dataclasses.replace(archive, iterations=4)
+    archive = dataclasses.replace(grouped_archive(), iterations=4)
     archive = archive.corrected_by(fresh_values(archive))
     folder = write_run(root / "run", archive)
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows(4)))

@@ -21,8 +21,7 @@ from sim.files.atomic import to_json
 from sim.policy.spec import controller_hash
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd.recordings import recording_of
-from tests.qd.show.report.pages import make_run, minimal_of, reporter, text_of
-from tests.qd.test_groups import grouped_archive
+from tests.qd.show.report.pages import grouped_archive, make_run, minimal_of, reporter, text_of
 
 SOURCE = r"data:image/webp;base64,([A-Za-z0-9+/=]+)"
 
@@ -63,8 +62,7 @@ def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whol
 
 
 def test_bars_count_terrains_and_faults_by_cause():
-    archive, _ = grouped_archive((6, 9, 5))
-    elites = elites_of(archive)
+    elites = elites_of(grouped_archive())
     verdict = elites.verdict.copy()
     verdict[[0, 6, 7]] = VERDICTS.index("fault")
     causes = ("ridge",) * 6 + ("drop",) * 9 + ("",) * 5
@@ -128,7 +126,7 @@ def test_minimal_terrains_are_shown_where_there_are_some(reported, run):
 def test_archives_of_any_size_alone_and_without_fresh_values(reported, run, sizes):
     (run / "metrics.jsonl").unlink()
     (run / "config.json").unlink()
-    write_archive(run / "archive.npz", dataclasses.replace(grouped_archive(sizes)[0], iterations=4))
+    write_archive(run / "archive.npz", dataclasses.replace(grouped_archive(sizes), iterations=4))
     text = text_of(reported()[0].read_bytes())
     assert "metrics.jsonl" in text and "config.json" in text
     assert text.count("Not judged yet") == 1 and "confirmed" not in text
@@ -155,7 +153,7 @@ def test_bad_input_is_refused_and_the_page_stays_as_it_was(reported, run, tmp_pa
     ):  # fmt: skip
         with pytest.raises((ValueError, OSError), match=field):
             reported(**changes)
-    write_archive(run / "archive.npz", dataclasses.replace(grouped_archive((0, 0, 0))[0], iterations=4))
+    write_archive(run / "archive.npz", dataclasses.replace(grouped_archive((0, 0, 0)), iterations=4))
     with pytest.raises(ValueError, match="elites"):
         reported()
     assert [file.read_bytes() for file in tmp_path.rglob("*.html")] == [before]
