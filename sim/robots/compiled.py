@@ -4,6 +4,7 @@ Of each joint there is at most one position actuator, of the joint's name; every
 ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 """
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.files.command import with_traceback
-from sim.robots.model_files import read_model_files
+from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -80,16 +81,22 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
         spec.fuse_static()
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
-        reason = " ".join(str(error).split())
+        reason = _with_element(" ".join(str(error).split()), files)
         raise ValueError(with_traceback(error, f"{model_file} cannot be read by MuJoCo: {reason}")) from None
     drives = _Drives(spec, model)
     problems = _structure_problems(model)
     if strange := strange + drives.problems:
         problems.append(f"{', '.join(strange)} cannot be simulated: take it out, or write it otherwise")
     if problems:
-        raise ValueError("; ".join(f"{model_file}: {problem}" for problem in problems))
+        raise ValueError("; ".join(f"{model_file}: {_with_element(problem, files)}" for problem in problems))
     pose = home[7:] if len(home) == model.nq else None
     return RobotFile(spec=spec, model=model, drives=drives, home=pose, is_urdf=files.is_urdf)
+
+
+def _with_element(text: str, files: ModelFiles) -> str:
+    """What MuJoCo says of a URDF with the element itself in place of its line, which is not that of the file."""
+    lines = ET.tostring(files.root, encoding="unicode").splitlines() if files.is_urdf else []
+    return re.sub(r"line (\d+)", lambda line: lines[int(line[1]) - 1].strip() if lines else line[0], text)
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
@@ -110,6 +117,7 @@ def _of_urdf(root: ET.Element) -> Any:
     extension = ET.SubElement(root, "mujoco")
     ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false",
                   inertiafromgeom="false")  # fmt: skip
+    ET.indent(root)  # every element on a line of its own
     spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     for body in spec.bodies:
         touching = touching_geoms(body)

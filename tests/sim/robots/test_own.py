@@ -178,14 +178,14 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
     ("urdf", LIMIT, "", "FL_hip has no <limit>"),
-    ("urdf", FIRST_MASS, '<mass value="0,8"/>', '<mass value="0,8">'),
+    ("urdf", FIRST_MASS, '<mass value="0,8"/>', '<mass value="0,8" />'),
     ("urdf", FIRST_MASS, '<mass value="${m}"/>', "xacro"),
     ("urdf", 'effort="30"', 'effort="-30"', "effort"),
     ("xml", 'mass="0.8"', 'mass="0,8"', "'mass'"),
-    ("urdf", '<parent link="trunk"/>', "", "<parent link"),
+    ("urdf", '<parent link="trunk"/>', "", '<joint name="FL_hip"'),
     ("urdf", '<child link="FL_thigh"/>', '<child link="leg"/>', "leg"),
-    ("urdf", '"revolute"', '"hinge"', "hinge"),
-    ("urdf", '"trunk">', '"">', "link without a name"),
+    ("urdf", '"revolute"', '"hinge"', '<joint name="FL_hip" type="hinge">'),
+    ("urdf", '"trunk">', '"">', "no link named trunk"),
 ]
 
 
