@@ -1,4 +1,4 @@
-"""What a physics step tells mujoco_warp of the robots, and what it reads back.
+"""What a physics step tells mujoco_warp of the robots and their drives, and what it reads back.
 
 The coordinates are those of :mod:`kernels.state` here. mujoco_warp has the base's quaternion as wxyz, its velocity at
 the base's origin, and its rotation rate in the base's frame. All other joints have one axis, and the same numbers in
@@ -70,6 +70,62 @@ def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, solver_out: SolverSta
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
     inputs = [joint_q, joint_qd, targets]
     wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=[solver_out], device=joint_q.device)
+
+
+@wp.struct
+class Delay:
+    """Joint targets that have yet to count."""
+
+    steps: wp.array[int]
+    """Physics steps after which a target counts, shape (num_envs,)."""
+    age: wp.array2d[int]
+    """Physics steps since the episode began, shape (num_envs, 1)."""
+    former: wp.array3d[float]
+    """Targets of the last steps [rad], shape (num_envs, 1 + most steps, num_joints)."""
+
+
+@wp.kernel
+def _delay_targets_kernel(
+    targets: wp.array2d[float], default_joint_pos: wp.array[float], delay_out: Delay, due_out: wp.array2d[float]
+):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    age, size = delay_out.age[env, 0], delay_out.former.shape[1]
+    before = age - delay_out.steps[env]
+    for joint in range(default_joint_pos.shape[0]):
+        delay_out.former[env, age % size, joint] = targets[env, 7 + joint]
+        if before >= 0:
+            due_out[env, 7 + joint] = delay_out.former[env, before % size, joint]
+        else:
+            due_out[env, 7 + joint] = default_joint_pos[joint]
+    delay_out.age[env, 0] = age + 1
+
+
+def delay_targets(targets: Any, default_joint_pos: Any, delay_out: Delay, due_out: Any) -> None:
+    """Keep the targets of a physics step, and find those that count in it: the default pose until there are some."""
+    inputs, outputs = [targets, default_joint_pos], [delay_out, due_out]
+    wp.launch(_delay_targets_kernel, targets.shape[0], inputs, outputs=outputs, device=targets.device)
+
+
+@wp.kernel
+def _limit_torques_kernel(
+    joint_qd: wp.array2d[float], solver: SolverState, motors: wp.array[wp.vec3], ranges_out: wp.array2d[wp.vec2]
+):
+    """Grid (num_envs, num_actuators)."""
+    env, k = wp.tid()
+    effort, saturation, limit = motors[k][0], motors[k][1], motors[k][2]
+    lost = saturation * joint_qd[env, solver.target_of_actuator[k] - 1] / limit
+    least, most = wp.clamp(-saturation - lost, -effort, effort), wp.clamp(saturation - lost, -effort, effort)
+    ranges_out[env, k] = wp.vec2(least, most)
+
+
+def limit_torques(joint_qd: Any, solver: SolverState, motors: Any, ranges_out: Any) -> None:
+    """Find the least and most torque [N m] of DC motors at the present velocities, shape (num_envs, num_actuators).
+
+    ``motors`` are effort limit [N m], stall torque [N m] and speed limit [rad/s] of each, shape (num_actuators,).
+    """
+    inputs = [joint_qd, solver, motors]
+    wp.launch(_limit_torques_kernel, ranges_out.shape, inputs, outputs=[ranges_out], device=joint_qd.device)
 
 
 @wp.kernel

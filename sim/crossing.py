@@ -99,7 +99,6 @@ def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
 
     Four times the steps: about five times the time.
     """
-    steps = round(robot.control_dt / _RESOLVED_DT)
-    return replace(robot, physics_dt=_RESOLVED_DT, decimation=steps), SolverCfg(
-        time_constant_s=_RESOLVED_TIME_CONSTANT_S
-    )
+    finer = robot.physics_dt / _RESOLVED_DT
+    steps = {name: round(getattr(robot, name) * finer) for name in ("decimation", "drive_delay_steps")}
+    return replace(robot, physics_dt=_RESOLVED_DT, **steps), SolverCfg(time_constant_s=_RESOLVED_TIME_CONSTANT_S)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from kernels.contact import ContactBuffer, Layout, collide_strips
-from kernels.coordinates import SolverState, ask_poses, ask_solver, tell_solver
+from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay_targets, limit_torques, tell_solver
 from kernels.ground import GroundRecords, make_bodies, tell_contacts
 from kernels.observation import Sensors
 from kernels.penalties import SolverContacts, sum_geom_forces
@@ -43,6 +43,8 @@ class Simulation:
             transforms of shape (num_envs * bodies_per_env,).
         solver_contacts: Contacts and constraint forces of the last step, as the solver keeps them.
         column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
+        motors: Effort limit [N m], stall torque [N m] and speed limit [rad/s] of each actuator, vectors of shape
+            (num_actuators,); None without DC motors.
     """
 
     def __init__(
@@ -210,7 +212,23 @@ class Simulation:
         self.sensors.scan_y = wp.array(scan_y, dtype=float)
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
         self._coordinates = self._build_coordinates()
+        self._build_drives()
         self._dynamics = dynamics_of(self.solver.mjw_model, data)
+
+    def _build_drives(self) -> None:
+        """What ideal drives lack: torque limits that depend on the speed, and a delay of targets."""
+        robot, self.motors, self._delay, self._due_targets = self.robot, None, None, self.targets
+        if robot.saturation_effort is not None:
+            effort = self.solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
+            joints = self._coordinates.target_of_actuator.numpy() - 7
+            motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
+            self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
+        if robot.drive_delay_steps:
+            delay = self._delay = Delay()
+            delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
+            delay.age = wp.zeros((self.num_envs, 1), dtype=int)
+            delay.former = wp.zeros((self.num_envs, 1 + robot.drive_delay_steps, robot.num_joints), dtype=float)
+            self._due_targets = wp.zeros_like(self.targets)
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
@@ -264,7 +282,11 @@ class Simulation:
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
-            tell_solver(self.joint_q, self.joint_qd, self.targets, coordinates)
+            if self._delay is not None:
+                delay_targets(self.targets, self.sensors.default_joint_pos, self._delay, self._due_targets)
+            tell_solver(self.joint_q, self.joint_qd, self._due_targets, coordinates)
+            if self.motors is not None:
+                limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self._dynamics.find()
             ask_poses(coordinates, self.body_q.reshape((self.num_envs, -1)))
             self.collide()
@@ -278,7 +300,7 @@ class Simulation:
         sum_geom_forces(self.solver_contacts, self.column_of_geom, self.geom_force)
 
     def clear_solver(self, mask: Any) -> None:
-        """Forget the solver's memory in the environments where ``mask`` (num_envs,) is not 0: warm start and Jacobian.
+        """Forget warm start, Jacobian and former targets in the environments where ``mask`` (num_envs,) is not 0.
 
         The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not
         finite would stay so, whatever state it is reset to.
@@ -286,6 +308,8 @@ class Simulation:
         data = self.solver.mjw_data
         clear_rows(mask, data.qacc_warmstart)
         clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
+        if self._delay is not None:
+            clear_rows(mask, self._delay.age.view(float))  # whose 0 has the same bits
 
     def capture(self, launch_all: Callable[[], None]) -> Any:
         """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.

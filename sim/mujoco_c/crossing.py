@@ -5,10 +5,12 @@ import os
 import signal
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -91,27 +93,38 @@ class Episodes:
     """States of the episodes of one terrain, stepped one by one."""
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
-        self._model, self._robot = model, robot
+        self._model, self._robot = copy(model), robot  # whose torque limits change with the speed
         self.data = [_mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel
         self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
         self.warned = np.zeros(len(self.data), bool)
+        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1].copy()
+        motors = np.array([robot.saturation_effort, robot.velocity_limit])
+        self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
+        self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
+        self._delayed = deque([self._targets.copy()] * robot.drive_delay_steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
         """One physics step of the numbered episodes."""
+        self._delayed.append(self._targets.copy())
+        targets = self._delayed.popleft()[:, self._joints]
         for k in running:
             data = self.data[k]
+            data.ctrl[:] = targets[k]
+            if self._motors is not None:
+                (stall, limit), effort = self._motors, self._effort
+                lost = stall * data.qvel[6 + self._joints] / limit
+                self._model.actuator_forcerange[:] = np.clip([-stall - lost, stall - lost], -effort, effort).T
             _mj.mj_step(self._model, data)
             self.qpos[k], self.qvel[k] = data.qpos, data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
 
     def hold(self, running: NDArray[np.intp], targets: Array) -> None:
-        """Sets the joint targets [rad] of the numbered episodes."""
-        for k, target in zip(running, targets, strict=True):
-            self.data[k].ctrl[:] = target
+        """Sets the joint targets [rad] of the numbered episodes; they count after the delay of the robot's drives."""
+        self._targets[running] = targets
 
 
 def _judge(

@@ -20,7 +20,8 @@ from sim.robots.own import PER_JOINT, per_joint
 from sim.robots.robot import RobotCfg
 
 _FILES = {
-    "robot.toml": ("model_file", *PER_JOINT, "physics_dt", "decimation", "speed", "max_duration_s"),
+    "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
+                   "max_duration_s"),
     "controller.toml": ("policy", "joints", "action_scale", "action_offset", "action_clip", "observation_clip",
                         "activation", "history", "observation"),
 }  # fmt: skip
@@ -34,6 +35,7 @@ _TERMS = {
 _ISAAC_TERMS = {"base_lin_vel": "lin_vel", "base_ang_vel": "ang_vel", "projected_gravity": "gravity",
                 "generated_commands": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel",
                 "last_action": "last_action", "height_scan": "scan", "gait_phase": "clock"}  # fmt: skip
+_NO_MOTOR = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # of an ideal drive, beside others with a DC motor
 _RL_SAR = {"default_dof_pos": "default_joint_pos", "rl_kp": "stiffness", "rl_kd": "damping", "dt": "physics_dt",
            "decimation": "decimation", "action_scale": "action_scale"}  # fmt: skip
 _RL_SAR_MORE = {"torque_limits": "effort_limit", "clip_obs": "observation_clip"}
@@ -342,12 +344,16 @@ def _isaac_robot(env: dict[str, Any], found: _Found) -> None:
     articulation, joints, file = env["scene"]["robot"], found.joints, found.file
     pose = per_joint(articulation["init_state"]["joint_pos"], joints, f"{file}: init_state.joint_pos", partly=True)
     found.put(default_joint_pos=_one_of([angle or 0.0 for angle in pose]))
-    values: dict[str, dict[str, Any]] = {name: dict.fromkeys(joints) for name in PER_JOINT[1:]}
-    notes = []
-    for name, group in articulation["actuators"].items():
+    groups, notes = articulation["actuators"], list[str]()
+    ideal = [name for name, group in groups.items() if group.get("saturation_effort") is None]
+    idle = _NO_MOTOR if len(ideal) == len(groups) else ()
+    values: dict[str, dict[str, Any]] = {name: dict.fromkeys(joints) for name in PER_JOINT[1:] if name not in idle}
+    for name, group in groups.items():
         kind = str(group.get("class_type", "")).rpartition(":")[2]
-        if kind not in ("", "ImplicitActuator", "IdealPDActuator"):
-            notes.append(f"{name} is a {kind}, simulated as PD gains with a limit")
+        known, drive = ("DelayedPDActuator", "PD gains with a limit") if name in ideal else ("DCMotor", "a DC motor")
+        if kind not in ("", "ImplicitActuator", "IdealPDActuator", known):
+            notes.append(f"{name} is a {kind}, simulated as {drive}")
+        group |= _NO_MOTOR if name in ideal else {}
         moved = _chosen(group["joint_names_expr"], joints)
         for key, of_key in values.items():
             given = group.get(f"{key}_sim") if group.get(key) is None else group[key]
@@ -356,9 +362,14 @@ def _isaac_robot(env: dict[str, Any], found: _Found) -> None:
         without = [joint for joint, value in of_key.items() if value is None]
         asked = f"a gain of each joint: none is said of {', '.join(without)}"
         if not without:
-            found.put(**{key: _one_of([*of_key.values()])}, why="; ".join(notes) if key == "stiffness" else "")
+            why = f"1e6 is that of an ideal drive, {', '.join(ideal)}" * bool(ideal and key in _NO_MOTOR)
+            found.put(**{key: _one_of([*of_key.values()])}, why="; ".join(notes) if key == "stiffness" else why)
         elif key in ("stiffness", "damping"):
             found.put(**{key: None}, why="; ".join([asked, *notes]))
+    delays = {name: (group.get("min_delay") or 0, group.get("max_delay") or 0) for name, group in groups.items()}
+    if any(most for _, most in delays.values()):
+        spans = ", ".join(f"{name} ({least} to {most})" for name, (least, most) in delays.items())
+        found.put(drive_delay_steps=int(np.mean([*delays.values()]) + 0.5), why=f"the mean of the delays of {spans}")
     found.put(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
     ranges = [command["ranges"]["lin_vel_x"][1] for command in (env.get("commands") or {}).values()
               if isinstance(command, dict) and "lin_vel_x" in (command.get("ranges") or {})]  # fmt: skip

@@ -26,13 +26,16 @@ _URDF_TIME_CONSTANT_S = 0.01
 _SLACK = 1e-3  # files round [rad]
 _SKEW = 0.01  # share by which a principal axis may miss a joint's
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
-_UNITS = {
+UNITS = {
     "default_joint_pos": "angles",
     "stiffness": "gains [N m/rad]",
     "damping": "gains [N m s/rad]",
     "effort_limit": "limits [N m]",
     "armature": "inertias [kg m^2]",
+    "saturation_effort": "torques [N m]",
+    "velocity_limit": "speeds [rad/s]",
 }
+"""Settings with a value for each joint, and what these are."""
 _NEEDED = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper", "gravity", "clampctrl",
            "actuation", "refsafe")  # fmt: skip
 
@@ -263,9 +266,9 @@ def _joint_problems(robot: RobotCfg, of_file: RobotFile, wrong: Collection[str])
         return problems
     if names != joint_names(model):
         return [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
-    values = {name: getattr(robot, name) for name in _UNITS if name not in wrong}
+    values = {name: getattr(robot, name) for name in UNITS if name not in wrong}
     short = {name: len(given) for name, given in values.items() if given is not None and len(given) != len(names)}
-    problems = [f"{name} needs {len(names)} {_UNITS[name]}, got {got}" for name, got in short.items()]
+    problems = [f"{name} needs {len(names)} {UNITS[name]}, got {got}" for name, got in short.items()]
     for name in ("armature", "damping", "frictionloss"):
         of_joints = zip(names, getattr(model, f"dof_{name}")[6:], strict=True)
         if beyond := [f"{joint} ({value:g})" for joint, value in of_joints if not value >= 0.0]:
@@ -278,9 +281,9 @@ def _joint_problems(robot: RobotCfg, of_file: RobotFile, wrong: Collection[str])
         if beyond:
             degrees = ": angles are in radians" if any(abs(angle) > 2.0 * np.pi for angle in pose) else ""
             problems.append(f"default_joint_pos is outside of the file's range for {', '.join(beyond)}{degrees}")
-    if of_file.is_urdf and robot.effort_limit is None and np.isinf(drives.effort).any():
+    if (of_file.is_urdf or robot.saturation_effort) and robot.effort_limit is None and np.isinf(drives.effort).any():
         weak = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
-        problems.append(f"no <limit effort> above 0 for {weak}: give it, or effort_limit in the settings")
+        problems.append(f"no torque limit above 0 for {weak}: give it in the file, or effort_limit in the settings")
     if not problems and {"stiffness", "damping"}.isdisjoint(wrong):
         gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
         limp = [name for k, name in enumerate(names) if not gains[k] > 0.0 and k not in drives.follow]

@@ -17,7 +17,7 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import from_builtins, problems, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import RobotFile, file_problems, joint_names, read_robot_file
+from sim.robots.compiled import UNITS, RobotFile, file_problems, joint_names, read_robot_file
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import extents, make_probes, start_height
@@ -28,7 +28,7 @@ _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
             "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
 """Settings that a robot.toml may leave out though there is no default."""
-PER_JOINT = ("default_joint_pos", "stiffness", "damping", "effort_limit", "armature")
+PER_JOINT = tuple(UNITS)
 """Settings that a robot.toml may give as one number, or as a table of joint names or regular expressions, too."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
 
@@ -183,8 +183,9 @@ def settings_problems(robot: RobotCfg) -> list[str]:
         mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
     if wrong.isdisjoint(_NAMES):
         mistakes += _name_problems(robot)
-    if (robot.stiffness is None) != (robot.damping is None):
-        mistakes.append("stiffness and damping must be given together")
+    for one, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
+        if (getattr(robot, one) is None) != (getattr(robot, other) is None):
+            mistakes.append(f"{one} and {other} must be given together")
     fine = wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
     given, step = robot.contact_time_constant_s if fine else None, robot.physics_dt
     if given is not None and given < 2.0 * step * (1.0 - 1e-9):

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from sim.files.command import command_line
-from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
+from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from sim.robots.training import LearningCfg, TrainingCfg, TuningCfg
 
 ROBOTS_DIR = Path(__file__).parent
@@ -75,6 +75,17 @@ class RobotCfg:
     """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
     armature: tuple[NonNegativeFloat, ...] | None = None
     """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
+    saturation_effort: tuple[PositiveFloat, ...] | None = None
+    """Stall torque of each joint's DC motor [N m], together with ``velocity_limit``; None for ideal PD.
+
+    The motor is Isaac Lab's ``DCMotor`` since its pull request 2300: at a joint velocity v the torque of the PD gains
+    is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
+    may be more or less. So beyond the speed limit a motor brakes, whatever it is told.
+    """
+    velocity_limit: tuple[PositiveFloat, ...] | None = None
+    """Speed of each joint at which its motor has no torque left [rad/s]."""
+    drive_delay_steps: NonNegativeInt = 0
+    """Physics steps after which a joint target counts. Until the first one does, the default pose is held."""
     friction: PositiveFloat | None = None
     """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
     .3."""

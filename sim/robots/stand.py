@@ -140,7 +140,10 @@ def describe_model(robot: RobotCfg) -> str:
     builder: Any = build_robot(robot)
     sim = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
     model: Any = sim.solver.mj_model
-    joints = [("joint", "default", "range [rad]", "kp", "kd", "effort", "armature", "damping", "friction")]
+    delay = f"; a target counts {robot.drive_delay_steps} physics steps later" * bool(robot.drive_delay_steps)
+    motors = np.zeros((model.nu, 0)) if sim.motors is None else sim.motors.numpy()[:, 1:]
+    limits = ["saturation", "speed limit [rad/s]"][: motors.shape[1]]
+    joints = [("joint", "default", "range [rad]", "kp", "kd", "effort", "armature", "damping", "friction", *limits)]
     drive_of = {int(joint): k for k, (joint, _) in enumerate(model.actuator_trnid)}
     for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True), start=1):
         drive, (low, high), dof = drive_of.get(k), model.jnt_range[k], int(model.jnt_dofadr[k])
@@ -151,7 +154,8 @@ def describe_model(robot: RobotCfg) -> str:
         most = "follows" if drive is None else f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
         span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[k] else "free"
         passive = f"{model.dof_armature[dof]:.3g}", f"{model.dof_damping[dof]:g}", f"{model.dof_frictionloss[dof]:g}"
-        joints.append((name, f"{angle:.3f}", span, f"{kp:g}", f"{kd:g}", most, *passive))
+        limits = ["-" if drive is None else f"{limit:g}" for limit in motors[drive or 0]]
+        joints.append((name, f"{angle:.3f}", span, f"{kp:g}", f"{kd:g}", most, *passive, *limits))
     geoms = [("geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]")]
     numbers_of = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
     for k, name in enumerate(geom_names(builder)):
@@ -163,7 +167,7 @@ def describe_model(robot: RobotCfg) -> str:
     lines = [
         f"{robot.name}: {robot.model_file}",
         f"  {model.body_subtreemass[0]:.2f} kg in {builder.body_count} bodies, {robot.num_joints} joints, "
-        f"{robot.observation_size} observations",
+        f"{robot.observation_size} observations{delay}",
         *(_columns(joints) + _columns(geoms)),
         *(f"Warning: {text}" for text in _unit_warnings(robot, builder)),
     ]

@@ -1,14 +1,16 @@
 """The second simulator: written from the definitions, it must say what the kernels say about the same state."""
 
 import dataclasses
+from collections import deque
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from kernels.episode import Invalidity, Outcome
-from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
+from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg, resolved
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import (
     crossing_model,
@@ -23,9 +25,10 @@ from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
-from tests.sim.dogs import GAINS, KINDS, with_mesh, write_dog
+from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
 from tests.sim.plain_mujoco import on_plane, rays_from_above
 from tests.sim.policies import Remembers, stand
+from tests.sim.scenes import put, simulate, standing
 
 EPISODES = 3
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
@@ -83,6 +86,7 @@ def test_plain_mujoco_takes_any_robot_that_the_search_takes(tmp_path):
 
 
 FINE = {"physics_dt": 0.001, "decimation": 20}
+DRIVES = {"saturation_effort": (90.0,) * 12, "velocity_limit": (6.0,) * 12, "drive_delay_steps": 3}
 
 
 def walk(robot, policy, plain, seconds):
@@ -103,7 +107,9 @@ def walk(robot, policy, plain, seconds):
 
 
 @pytest.mark.parametrize(
-    ("changes", "time_constant_s"), [({}, None), (FINE, 0.003), (FINE, 0.02)], ids=["shipped", "stiff", "soft"]
+    ("changes", "time_constant_s"),
+    [({}, None), (FINE, 0.003), (FINE, 0.02), (DRIVES, None)],
+    ids=["shipped", "stiff", "soft", "motors and delay"],
 )
 def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s):
     # ANYmal walks for 0.2 s. Cassie needs 0.15 s to come down, and swings on its legs for 0.25 s, since to balance it
@@ -113,7 +119,7 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     if robot.name == "cassie" and time_constant_s == 0.003:
         metres, radians = 5e-4, 0.01
     policy = robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
-    robot, solver = dataclasses.replace(robot, **changes), SolverCfg(time_constant_s=time_constant_s)
+    shipped, robot, solver = robot, dataclasses.replace(robot, **changes), SolverCfg(time_constant_s=time_constant_s)
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
     rollout.put(FLAT[None], np.array([1000], np.uint32))
     # MuJoCo's heightfield is replaced by its plane: the same contacts.
@@ -130,6 +136,58 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     assert (pushed * robot.physics_dt > 10.0).all()  # and the ground has a part in it
     np.testing.assert_allclose(joint_q[:, :3], plain.qpos[:, :3], atol=metres)
     np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
+    if changes is DRIVES:
+        ideal = Episodes(shipped, on_plane(shipped), starts)
+        deque(walk(shipped, policy, ideal, seconds), maxlen=0)
+        assert np.abs(ideal.qpos[:, 7:] - plain.qpos[:, 7:]).max() > 0.2
+
+
+SPEEDS = [0.0, 5.0, 10.0, 13.0, 25.0, -5.0]  # [rad/s]
+TORQUES = [20.0, 15.0, 0.0, -9.0, -20.0, 20.0]
+"""Of a motor of 30 N m and 10 rad/s with a limit of 20 N m that is asked for more: 30 (1 - v / 10), within 20 N m."""
+MIMIC = {"model": urdf().replace('<joint name="FL_knee" type="revolute">', '<joint name="FL_knee" type="revolute">'
+                                 '<mimic joint="FL_hip" multiplier="-2.0"/>'), "suffix": "urdf"}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [{}, MIMIC], ids=["mjcf", "with a joint that has no motor"])
+def test_a_motor_gives_what_its_speed_leaves_it_in_both(tmp_path, device, kind):
+    gains = GAINS.replace("30.0", "20.0") + "saturation_effort=(30.0,) * 8, velocity_limit=(9.0, *(10.0,) * 7),"
+    robot = get_robot(str(write_dog(tmp_path, **kind, more=gains)))
+    pose, joint = standing(robot, len(SPEEDS), z=5.0), 7  # the last one
+    joint_qd = np.zeros((len(SPEEDS), 6 + 8))
+    joint_qd[:, 6 + joint] = SPEEDS
+    sim = simulate(robot, np.repeat(FLAT[None], len(SPEEDS), axis=0), device)
+    put(sim, pose, joint_qd)
+    pose[:, 7 + joint] += 5.0  # by a gain of 60 N m/rad
+    sim.targets.assign(np.float32(pose))
+    sim.physics_step()
+    np.testing.assert_allclose(sim.joint_torque.numpy()[:, 6 + joint], TORQUES, atol=1e-4)
+    everyone, starts = np.arange(len(SPEEDS)), to_mujoco(standing(robot, len(SPEEDS), z=5.0), joint_qd, np.zeros(3))
+    plain = Episodes(robot, crossing_model(robot, FLAT), starts)
+    plain.hold(everyone, pose[:, 7:])
+    plain.step(everyone)
+    np.testing.assert_allclose([data.qfrc_actuator[6 + joint] for data in plain.data], TORQUES, atol=1e-9)
+
+
+def test_a_target_counts_after_the_delay_in_both(tmp_path, device):
+    robot = get_robot(str(write_dog(tmp_path, more="\n    drive_delay_steps=3,")))
+    assert resolved(robot)[0].drive_delay_steps == 15  # of 1 ms
+    pose, everyone = standing(robot, 2, z=5.0), np.arange(2)
+    sim = simulate(robot, np.repeat(FLAT[None], 2, axis=0), device)
+    put(sim, pose)
+    plain = Episodes(robot, crossing_model(robot, FLAT), to_mujoco(pose, np.zeros((2, 14)), np.zeros(3)))
+    pose[:, 7] += 0.1  # 6 N m
+    sim.targets.assign(np.float32(pose))
+    plain.hold(everyone, pose[:, 7:])
+    torques = []
+    for step in range(5):
+        sim.physics_step()
+        plain.step(everyone)
+        torques.append([*sim.joint_torque.numpy()[:, 6], plain.data[0].qfrc_actuator[6]])
+        if step == 1:  # an episode begins anew
+            sim.clear_solver(wp.array([0, 1], dtype=int, device=device))
+    np.testing.assert_allclose(torques[:4], [[0.0] * 3] * 3 + [[6.0, 0.0, 6.0]], atol=0.1)
+    assert torques[4] == [pytest.approx(torques[4][2], rel=1e-3), pytest.approx(0.0, abs=0.1), torques[4][2]]
 
 
 def test_what_ends_a_crossing(robot):

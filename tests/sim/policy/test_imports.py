@@ -51,9 +51,9 @@ scene:
       joint_pos: {.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}
     actuators:
       hips: {class_type: 'isaaclab.actuators.actuator_pd:DCMotor', joint_names_expr: [.*_hip], effort_limit: 20.0,
-             stiffness: {.*: 25.0}, damping: 0.5}
+             velocity_limit: 30.0, stiffness: {.*: 25.0}, damping: 0.5}
       knees: {class_type: 'isaaclab.actuators:ImplicitActuator', joint_names_expr: [.*_knee], effort_limit: null,
-              effort_limit_sim: 30.0, stiffness: 35.0, damping: 0.5}
+              effort_limit_sim: 30.0, velocity_limit_sim: 21.0, stiffness: 35.0, damping: 0.5}
   height_scanner:
     ray_alignment: yaw
     offset: {pos: !!python/tuple [0.1, 0.0, 20.0]}
@@ -167,6 +167,7 @@ def test_a_run_of_isaac_lab_is_read(tmp_path):
     robot, controller = imported(isaac_lab(tmp_path / "run"), tmp_path)
     assert (robot.default_joint_pos, robot.stiffness) == ((0.6, -1.2) * 2 + (0.6, -1.1) * 2, (25.0, 35.0) * 4)
     assert (robot.effort_limit, robot.speed, robot.max_duration_s) == ((20.0, 30.0) * 4, 0.5, 30.0)
+    assert robot.saturation_effort is None and robot.velocity_limit is None  # which without a motor mean nothing here
     assert (controller.joints, controller.action_scale) == (HIPS_FIRST, (0.125,) * 4 + (0.25,) * 4)
     assert tags(controller) == ["ang_vel", "command", "joint_pos", "last_action", "scan"]
     # 0.4 m by 0.2 m in steps of 0.2 m about a point 0.1 m ahead.
@@ -175,6 +176,16 @@ def test_a_run_of_isaac_lab_is_read(tmp_path):
     assert (scan.order, scan.offset, scan.clip, controller.action_clip) == ("x fastest", 0.4, (-1.0, 1.0), 5.0)
     assert "a guess: breadth first" in robot.policy_file.read_text() and "DCMotor" in robot.settings_file.read_text()
     load_policy(robot.policy_file, robot, "cpu")
+
+
+def test_motors_and_delays_of_isaac_lab_are_kept(tmp_path, capsys):
+    more = "saturation_effort: 25.0, min_delay: 1, max_delay: 6, damping: 0.5}\n      knees"
+    robot, _ = imported(isaac_lab(tmp_path / "run", "damping: 0.5}\n      knees", more), tmp_path)
+    # 1e6 N m at a speed limit of 1e6 rad/s are the knees' ideal drives.
+    assert (robot.saturation_effort, robot.velocity_limit) == ((25.0, 1e6) * 4, (30.0, 1e6) * 4)
+    assert robot.drive_delay_steps == 2  # (1 + 6 + 0 + 0) / 4 = 1.75
+    lines = capsys.readouterr().out
+    assert "a guess: the mean of the delays of hips (1 to 6)" in lines and "simulated as PD gains" not in lines
 
 
 def test_descriptors_say_the_order_of_joints(tmp_path):

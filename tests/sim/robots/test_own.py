@@ -86,10 +86,12 @@ def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
 
 def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path):
     text = 'stiffness = 50\ndamping = {".*_hip" = 2, ".*_knee" = 3, HR_knee = 4}\nspeed = 0.5\n'
+    text += 'saturation_effort = 40\nvelocity_limit = {".*_hip" = 20, ".*_knee" = 15}\n'
     file = write_toml(tmp_path / "dog", f"{text}default_joint_pos = {{'.*hip' = 0.6, '.*knee' = -1.2}}")
     (file.parent / "controller.toml").write_text('observation = [{term = "scan", x = [0.0, 0.2], y = [0]}]')
     dog = get_robot(str(file))
     assert (dog.stiffness, dog.damping, dog.default_joint_pos) == ((50,) * 8, (2, 3) * 3 + (2, 4), (0.6, -1.2) * 4)
+    assert (dog.saturation_effort, dog.velocity_limit) == ((40,) * 8, (20, 15) * 4)
     assert (dog.speed, dog.scan_x, dog.scan_y, dog.policy_file.name) == (0.5, (0.0, 0.2), (0.0,), "controller.toml")
 
 
@@ -150,6 +152,9 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("py", "(0.6, -1.2) * 4", "(0.6, 1.2) * 4", "FL_knee"),
     ("py", '"vel_y", "collision"', '"vel_z"', "penalties"),
     ("py", MORE, f"{MORE} stiffness=(60.0,) * 8,", "damping"),
+    ("py", MORE, f"{MORE} velocity_limit=(20.0,) * 8,", "saturation_effort"),
+    ("py", MORE, f"{MORE} saturation_effort=(30.0,) * 8, velocity_limit=(9.0,) * 7,", "velocity_limit needs 8"),
+    ("py", MORE, f"{MORE} drive_delay_steps=-1,", "drive_delay_steps"),
     ("py", MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
     ("xml", FIRST_DRIVE, "", "FL_hip"),
     ("xml", FREE, "", "first body"),
@@ -221,6 +226,12 @@ def test_effort_is_the_settings_or_the_urdfs(tmp_path):
     replace_once(file, "effort_limit=(30.0,) * 8,", "")
     with pytest.raises(ValueError, match="effort_limit"):
         get_robot(str(file))
+
+
+def test_a_dc_motor_needs_a_limit_of_effort(tmp_path):
+    more = "stiffness=(60.0,) * 8, damping=(2.0,) * 8, saturation_effort=(40.0,) * 8, velocity_limit=(20.0,) * 8,"
+    with pytest.raises(ValueError, match=r"no torque limit .* FL_hip"):
+        get_robot(str(write_dog(tmp_path, model=mjcf(drive=""), more=more)))
 
 
 def test_geoms_without_a_name_are_called_by_their_body_and_shown_so(tmp_path):

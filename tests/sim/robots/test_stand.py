@@ -48,6 +48,13 @@ def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     assert not standing.stands and "pelvis" in standing.carried and describe_standing(cassie, standing)[1]
 
 
+def test_motors_and_delay_are_listed(tmp_path):
+    more = "saturation_effort=(35.0,) * 8, velocity_limit=(21.5,) * 8, drive_delay_steps=3,"
+    first, heads, *rows = describe_model(get_robot(str(write_dog(tmp_path, more=more)))).splitlines()[1:11]
+    assert "3 physics steps" in first and "saturation" in heads
+    assert all(row.split()[-2:] == ["35", "21.5"] for row in rows)
+
+
 def test_shipped_robots_are_in_the_right_units_and_grams_are_not(robot, tmp_path):
     assert "Warning" not in describe_model(robot)
     file = write_dog(tmp_path)
