@@ -153,12 +153,7 @@ def _cache_remedy(error: Exception) -> str:
 
 
 def say(*parts: str | tuple[str, str], error: bool = False) -> None:
-    """Prints parts of a text, some with a style of rich, which a terminal shows; a terminal breaks lines at words.
-
-    Args:
-        parts: Texts, or pairs of text and style.
-        error: Whether it goes to stderr.
-    """
+    """Prints texts, some paired with a style of rich, which a terminal shows; a terminal breaks lines at words."""
     from rich.console import Console
     from rich.text import Text
 
@@ -289,11 +284,7 @@ def publish(
 ) -> dict[str, Any]:
     """Measures, shows and writes a report, which is returned; where to write is tried before the work.
 
-    Args:
-        out: File of the report, a ``.json`` if there is a figure; it is shown alone if left out.
-        measure: Makes the report.
-        show: Prints it.
-        draw: Makes a PNG of it, which is written beside it.
+    Without a file ``out`` it is shown alone; of a ``.json`` ``draw`` makes a PNG that is written beside it.
     """
     makers: dict[Path, Callable[[Any], bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:

@@ -38,11 +38,9 @@ Margins = tuple[tuple[int, int], tuple[int, int]]
 
 
 def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0) -> Hfield:
-    """A height grid as a heightfield with the same surface.
+    """A height grid as a heightfield with the same surface, with ``margin`` nodes of edge height more.
 
-    Args:
-        heights: [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
-        margin: Nodes of edge height to add, on every side or on each.
+    Heights [m] have shape (nrow, ncol), at :data:`sim.terrain.SPACING`; node (0, 0) stands at x = y = 0.
     """
     margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
     grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")

@@ -187,11 +187,8 @@ def write_terrain(
 ) -> list[Path]:
     """Writes a terrain as ``<name>.<format>``, and as ``<name>.json`` what the files mean; each atomically.
 
-    Args:
-        folder: It exists.
-        terrain: The terrain.
-        formats: Some of :data:`FORMATS`; the npz holds genes and ground too.
-        about: Further keys of the JSON.
+    The folder exists; formats are some of :data:`FORMATS`, of which the npz holds genes and ground too; ``about`` are
+    further keys of the JSON.
     """
     check_formats(formats)
     if terrain.ground is not None and "npz" not in formats:

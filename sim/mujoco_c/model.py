@@ -48,10 +48,8 @@ class Starts:
 def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
     """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
 
-    Args:
-        joint_q: Shape (num, 7 + num_joints), quaternion xyzw.
-        joint_qd: Shape (num, 6 + num_joints), velocity of the base's mass centre and angular velocity, world frame.
-        base_com: Mass centre of the base in its frame [m].
+    Newton's has shapes (num, 7 + num_joints), quaternion xyzw, and (num, 6 + num_joints), velocity of the base's mass
+    centre, which is at ``base_com`` in its frame [m], and angular velocity, world frame.
     """
     qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
     qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
@@ -76,11 +74,8 @@ def crossing_model(
     the robot: a box where the patch is level, else a heightfield. Patches that follow each other along the way are one
     where they are alike in every row.
 
-    Args:
-        robot: Robot settings.
-        heights: Height grid [m], shape (nrow, ncol), at :data:`sim.terrain.SPACING`.
-        time_constant_s: Contact time constant of all geoms [s], critically damped; the file's if None.
-        ground: Friction and softness of this one terrain.
+    Heights [m] have shape (nrow, ncol), at :data:`sim.terrain.SPACING`; ``ground`` is that of this one terrain. The
+    contact time constant [s] is of all geoms, critically damped; the file's if None.
     """
     spec = robot_spec(robot)
     spec.memory = _MEMORY
@@ -231,12 +226,8 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
 def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
     """Height [m] of the triangulated grid at world-local points.
 
-    Each cell is cut from its (low x, high y) to its (high x, low y) corner.
-
-    Args:
-        heights: Height grid [m], shape (nrow, ncol); beyond its edge the edge height continues.
-        x: Points [m], any shape.
-        y: Points [m], of the same shape.
+    Each cell is cut from its (low x, high y) to its (high x, low y) corner. Heights [m] have shape (nrow, ncol); beyond
+    its edge the edge height continues. Points are x and y [m] of any one shape.
     """
     limit_row, limit_col = heights.shape[0] - 1, heights.shape[1] - 1
     column = np.clip(x / SPACING, 0.0, limit_col)
@@ -287,14 +278,8 @@ def observations(
 ) -> Array:  # fmt: skip
     """Observation rows, shape (num, observation_size); order and scales as the controllers of the field expect them.
 
-    Args:
-        heights: Height grid [m], shape (nrow, ncol).
-        qpos: Shape (num, 7 + num_joints).
-        qvel: Shape (num, 6 + num_joints).
-        command: Shape (num, 3).
-        last_action: Shape (num, num_joints).
-        default_joint_pos: Default pose [rad], shape (num_joints,).
-        scan: Scan points ahead and left of the base, yaw frame [m], shape (num_scan_points, 2).
+    States have shapes (num, 7 + num_joints) and (num, 6 + num_joints), commands (num, 3), actions (num, num_joints);
+    heights [m] (nrow, ncol); scan points ahead and left of the base, yaw frame [m], (num_scan_points, 2).
     """
     rotations = _rotations(qpos)
     heading = _heading(qpos)[:, None]
@@ -321,15 +306,9 @@ def step_penalties(
 ) -> Array:
     """Raw penalties of one physics step, before times dt, in the order of :data:`PENALTIES`; shape (num, 6).
 
-    An added penalty that has no formula here is NaN: how episodes end can be compared without it.
-
-    Args:
-        qpos: Shape (num, 7 + num_joints).
-        qvel: Shape (num, 6 + num_joints).
-        command: Shape (num, 3).
-        forces: Contact force on each geom with a role, world frame [N], shape (num, num_geoms, 3).
-        feet: Which of them are feet, shape (num_geoms,).
-        force_limit: Highest foot contact force that costs nothing [N].
+    An added penalty that has no formula here is NaN: how episodes end can be compared without it. States and commands
+    are those of :func:`observations`; contact forces on each geom with a role, world frame [N], have shape (num,
+    num_geoms, 3); ``feet``, shape (num_geoms,), are those whose force up to the limit [N] costs nothing.
     """
     velocity = _base_velocity(qpos, qvel)
     size = np.linalg.norm(forces, axis=2)

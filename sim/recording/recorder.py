@@ -205,15 +205,8 @@ def record(
 
     On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
 
-    Args:
-        rollout: The crossing, on any device.
-        terrains: Genes, shape (T, num_genes), or heights [m], shape (T, nrow, ncol).
-        seeds: One a terrain, shape (T,), uint32.
-        policy: What the rollout's controller was loaded from, to name and hash it.
-        ground: As of ``rollout.evaluate``.
-        labels: What each terrain is, in words.
-        seed: What the seeds were drawn with, for the record.
-        progress: As of ``rollout.evaluate``.
+    Terrains, seeds, ground and progress are those of ``rollout.evaluate``. The recording names and hashes ``policy``,
+    which the rollout's controller was loaded from, and has the terrains' labels and what their seeds were drawn with.
     """
     frames = _Frames(rollout, len(terrains))
     result = rollout.evaluate(terrains, seeds, ground=ground, watcher=frames, progress=progress)

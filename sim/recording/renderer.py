@@ -124,18 +124,11 @@ class Renderer:
         touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
     ) -> NDArray[np.uint8]:
-        """A picture of one pose.
+        """A picture of one pose in MuJoCo's joint coordinates, shape (7 + num_joints,): RGB, (height, width, 3).
 
-        Args:
-            qpos: MuJoCo's joint coordinates, shape (7 + num_joints,).
-            camera: Where from.
-            ghosts: Other robots.
-            touching: Whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do are
-                yellow, base and limbs magenta.
-            foot_force: Contact force on each foot, world frame [N], shape (num_feet, 3), shown as arrows.
-
-        Returns:
-            RGB, shape (height, width, 3).
+        ``touching`` says whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do
+        are yellow, base and limbs magenta. ``foot_force`` is the contact force on each foot, world frame [N], shape
+        (num_feet, 3), shown as arrows.
         """
         data = self._posed(0, qpos)
         self._camera.lookat[:] = camera.target

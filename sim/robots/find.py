@@ -16,9 +16,8 @@ from sim.robots.shipped import ROBOTS
 def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     """Settings of a robot that the command line names; :func:`robot_of` is for what a file names.
 
-    Args:
-        spec: Name of a shipped robot, or the file of another: a robot.toml, or Python, which is run and must set
-            ``ROBOT``; None is ANYmal; settings are returned as they are.
+    It names a shipped robot, or the file of another: a robot.toml, or Python, which is run and must set ``ROBOT``. None
+    is ANYmal; settings are returned as they are.
     """
     if isinstance(spec, RobotCfg):
         return spec
@@ -39,13 +38,8 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
     """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
-    file names.
-
-    Args:
-        record: What the file says: ``robot``, its name, and the rest of :func:`sim.files.records.identity`.
-        given: What the command line names, if anything.
-        file: The file, for errors.
-        flag: The flag that names it, for errors.
+    file names. The record is a file's :func:`sim.files.records.identity`; ``given`` is what the command line names, if
+    anything; errors name the file and its flag.
     """
     name, robot = record["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:

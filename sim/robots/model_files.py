@@ -26,12 +26,10 @@ class ModelFiles:
 
 
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
-    """Reads a model file and looks for the files that it names.
+    """Reads an MJCF or URDF and looks for the files that it names.
 
-    Args:
-        model_file: The MJCF or URDF.
-        visuals: Whether a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and
-            can be read; the simulation needs none of it.
+    With ``visuals`` a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and can be
+    read; the simulation needs none of it.
     """
     root = _parse(model_file, visuals=visuals)
     if root.tag not in ("mujoco", "robot"):

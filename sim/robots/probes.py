@@ -170,8 +170,7 @@ def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
     Rows are of one radius, in order along the mesh's longest side, and not straight. No probe sticks out; every point
     of the hull's surface lies at most the tolerance outside of the nearest one [m].
 
-    Args:
-        vertices: Shape (num_vertices, 3) [m].
+    Vertices have shape (num_vertices, 3) [m].
     """
     return _probes_of(np.ascontiguousarray(vertices, dtype=np.float64).tobytes())
 
@@ -254,13 +253,10 @@ _PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., list[Strip]]]] = {
 
 
 def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
-    """Strips of one collision shape, in the shape's frame.
+    """Strips of one collision shape, in the shape's frame; a mesh collides as its convex hull.
 
-    Args:
-        shape_type: Sphere, capsule, box, cylinder or mesh.
-        scale: Newton's shape scale [m]: (radius,), (radius, half height) or (half x, half y, half z); of a mesh its
-            factors along x, y and z.
-        mesh: Newton's mesh, which collides as its convex hull.
+    ``scale`` is Newton's: (radius,), (radius, half height) or (half x, half y, half z) [m]; of a mesh its factors along
+    x, y and z.
     """
     num_sizes, make_strips = _PRIMITIVES.get(shape_type, (0, None))
     sizes = np.asarray(scale, dtype=np.float64)[:num_sizes]
