@@ -33,7 +33,6 @@ class SolverState:
     column_of_body: wp.array[int]
     """Column of each body of a robot in ``xpos``, shape (bodies_per_env,); the base comes first."""
     base_com: wp.vec3
-    """Mass centre of the base in its own frame [m]."""
 
 
 @wp.kernel

@@ -283,7 +283,7 @@ def _relief(element: Element, s: int, row: int) -> float:
 
 
 @wp.kernel
-def _rasterise_elements_kernel(elements: wp.array2d[Element], heights_out: wp.array3d[float]):
+def _rasterise_elements_kernel(elements: wp.array2d[Element], factor: float, heights_out: wp.array3d[float]):
     """Grid (num_terrains, nrow, ncol)."""
     t, row, col = wp.tid()
     height = float(0.0)
@@ -295,7 +295,7 @@ def _rasterise_elements_kernel(elements: wp.array2d[Element], heights_out: wp.ar
                 height = element.ground + element.rise
         elif s > 0:
             height = element.ground + _relief(element, s, row)
-    heights_out[t, row, col] = height
+    heights_out[t, row, col] = factor * height
 
 
 def lay_out(genes: Any) -> Any:
@@ -326,18 +326,20 @@ def place(elements: Any) -> None:
     wp.launch(_place_kernel, elements.shape, [elements], device=elements.device)
 
 
-def rasterise_elements(elements: Any, heights_out: Any) -> None:
+def rasterise_elements(elements: Any, heights_out: Any, factor: float = 1.0) -> None:
     """Rasterise elements that :func:`lay_out` or :func:`place` laid, shape (num_terrains, num_elements)."""
-    wp.launch(_rasterise_elements_kernel, heights_out.shape, [elements], outputs=[heights_out], device=elements.device)
+    inputs, size = [elements, factor], heights_out.shape
+    wp.launch(_rasterise_elements_kernel, size, inputs, outputs=[heights_out], device=elements.device)
 
 
-def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
+def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0) -> None:
     """Rasterise one course a terrain.
 
     Args:
         genes: As of :func:`lay_out`.
         spacing: Distance of neighbouring grid nodes [m]: 0.05, in which elements are measured.
         heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+        factor: Of all heights.
     """
     if spacing != SPACING:
         raise ValueError(f"spacing must be {SPACING} m, got {spacing}: elements have whole numbers of such cells")
@@ -346,4 +348,4 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
             f"heights_out must have shape ({genes.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}: "
             "one grid per row of genes"
         )
-    rasterise_elements(lay_out(genes), heights_out)
+    rasterise_elements(lay_out(genes), heights_out, factor)

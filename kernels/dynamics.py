@@ -128,13 +128,10 @@ def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
 
 
 def find_dynamics(tree: Tree, robots: Robots, sizes: TreeSizes, codes: dict[str, Any]) -> None:
-    """Poses, inertias and all forces but those of constraints, of every world.
+    """Poses, inertias and all forces but those of constraints, of every world: the arrays from ``xpos`` on.
 
-    Args:
-        tree: The model.
-        robots: Its arrays are read, and from ``xpos`` on written.
-        sizes: Sizes of the model, whose words :func:`kernels.lanes.fits`.
-        codes: The solver's numbers of the types of joints, by their names in dynamics.cu.
+    The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are the solver's numbers of the types of joints,
+    by their names in dynamics.cu.
     """
     kernel = _kernel(sizes, tuple(codes.items()))
     num_worlds = robots.qpos.shape[0]

@@ -165,11 +165,8 @@ def make_ground(num_terrains: int, device: str) -> Ground:
 def make_bodies(inverse_weight: np.ndarray, impedance: np.ndarray, time_constant: np.ndarray, device: str) -> Bodies:
     """What a solver makes of stiffness and damping, from arrays of shape (num_shapes,).
 
-    Args:
-        inverse_weight: MuJoCo's ``invweight0`` of each shape's body, translational [1/kg].
-        impedance: Upper impedance of each shape's contacts, below 1.
-        time_constant: Contact time constant of each shape on firm ground [s].
-        device: Warp device name.
+    They are MuJoCo's translational ``invweight0`` of each shape's body [1/kg], the upper impedance of its contacts,
+    below 1, and their time constant on firm ground [s].
     """
     bodies = Bodies()
     bodies.inverse_gain = wp.array(inverse_weight * (1.0 - impedance), dtype=float, device=device)

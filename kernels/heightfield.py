@@ -218,14 +218,3 @@ def max_blocks(heights: Any, ceilings_out: Any) -> None:
             "allocate it with ceiling_shape()"
         )
     wp.launch(_max_blocks_kernel, dim=expected, inputs=[heights], outputs=[ceilings_out], device=heights.device)
-
-
-@wp.kernel
-def _scale_heights_kernel(factor: float, heights: wp.array3d[float]):
-    t, row, col = wp.tid()
-    heights[t, row, col] *= factor
-
-
-def scale_heights(heights: Any, factor: float) -> None:
-    """Multiplies ``heights`` (num_terrains, nrow, ncol) [m] in place."""
-    wp.launch(_scale_heights_kernel, dim=heights.shape, inputs=[factor], outputs=[heights], device=heights.device)

@@ -26,12 +26,9 @@ def worlds_of_block(words: int) -> int:
 
 
 def snippet(body: Path, *, words: int, **values: Any) -> str:
-    """The body of a native function of an int ``thread``, after what lanes.cu declares.
+    """The body of a native function of an int ``thread`` from a C++ file, after what lanes.cu declares.
 
-    Args:
-        body: C++ file.
-        words: Words of memory that a world needs.
-        values: What takes the place of the ``$names`` in it.
+    A world needs so many ``words`` of memory. ``values`` take the place of the ``$names`` in the file.
     """
     source = Template(_PROLOGUE.read_text() + body.read_text())
     return source.substitute(values, words=words, worlds=worlds_of_block(words), warp=_WARP)

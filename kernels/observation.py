@@ -33,7 +33,6 @@ class Sensors:
     scan_y: wp.array[float]
     """Scan points left of the base in its yaw frame [m], shape (num_scan_points,)."""
     base_com: wp.vec3
-    """Mass centre of the base in its own frame [m]."""
 
 
 @wp.struct

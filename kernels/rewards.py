@@ -21,23 +21,19 @@ MIN_COMMANDED_SPEED = wp.constant(0.1)
 
 @wp.struct
 class Motion:
-    """What a control step ended in; one row an environment."""
+    """What a control step ended in; one row an environment. :mod:`kernels` has the arrays without a line."""
 
     joint_q: wp.array2d[float]
-    """Joint coordinates (:mod:`kernels.state`)."""
     joint_qd: wp.array2d[float]
     joint_torque: wp.array2d[float]
     """Actuator torques [N m] in columns 6 and up."""
     geom_force: wp.array2d[wp.vec3]
-    """Contact force on each geom, world frame [N]."""
     geom_role: wp.array[int]
-    """Role bits of :mod:`kernels.penalties`, one a geom."""
     command: wp.array2d[float]
-    """Command the action answered: vx, vy [m/s], yaw rate [rad/s]."""
+    """The one that the action answered."""
     action: wp.array2d[float]
-    """Clipped action of the step, shape (num_envs, num_joints)."""
+    """Clipped."""
     base_com: wp.vec3
-    """Mass centre of the base in its frame [m]."""
     force_limit: float
     """Foot contact force beyond which it is penalised [N]."""
     dt: float
@@ -267,13 +263,7 @@ class RewardWeights:
 
 
 def make_weights(weights: dict[str, float], *, only_positive: bool, falls: Collection[Outcome]) -> RewardWeights:
-    """Weights of :data:`REWARDS` per second as a kernel argument.
-
-    Args:
-        weights: By name.
-        only_positive: Clip the sum of the terms at 0; a fall is not clipped.
-        falls: Outcomes that cost ``termination``.
-    """
+    """A kernel argument of weights of :data:`REWARDS` per second by name; ``falls`` cost ``termination``, unclipped."""
     packed = RewardWeights()
     packed.terms = _TermWeights(*(weights[name] for name in _TERMS))
     packed.termination = weights["termination"]

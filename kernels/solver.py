@@ -128,12 +128,10 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> Any
 def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any], motion: Any = None) -> None:
     """Joint accelerations and constraint forces of every world, from a warm start.
 
-    Args:
-        problem: Its arrays are read, and from ``qacc`` on written: of ``overflow`` bits are added.
-        sizes: Sizes of the model, whose words :func:`kernels.lanes.fits`.
-        codes: The solver's own numbers, by their names in solver.cu: of constraint states, of an elliptic contact's
-            rows, of a free joint, of the bits in ``overflow``, and the least divisor.
-        motion: ``qpos`` and ``qvel`` are moved on by a step, and ``qacc_warmstart`` is written; None moves nothing.
+    The problem's arrays are written from ``qacc`` on: of ``overflow`` bits are added. With a motion ``qpos`` and
+    ``qvel`` are moved on by a step, and ``qacc_warmstart`` is written. The words of the sizes must
+    :func:`kernels.lanes.fits`. ``codes`` are the solver's own numbers, by their names in solver.cu: of constraint
+    states, of an elliptic contact's rows, of a free joint, of the bits in ``overflow``, and the least divisor.
     """
     kernel = _kernel(sizes, tuple(codes.items()), motion is not None)
     inputs, num_worlds = [problem, motion or Motion()], problem.qacc.shape[0]

@@ -71,7 +71,7 @@ def _decode_genes_kernel(genes: wp.array2d[float], lower: _genes, upper: _genes,
 
 
 @wp.kernel
-def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, heights_out: wp.array3d[float]):
+def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, factor: float, heights_out: wp.array3d[float]):
     """Grid (num_terrains, nrow, ncol)."""
     t, row, col = wp.tid()
     x = float(col) * spacing
@@ -79,16 +79,17 @@ def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, heights_out
     height = float(0.0)
     for b in range(bumps.shape[1]):
         height += super_gaussian(bumps[t, b], x, y)
-    heights_out[t, row, col] = height
+    heights_out[t, row, col] = factor * height
 
 
-def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
+def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0) -> None:
     """Rasterise one Super-Gaussian mixture a terrain (equation 1; genes clipped to [-1, 1], rescaled by Table I).
 
     Args:
         genes: Warp array, shape (num_terrains, 8 * num_bumps); per bump in the order of :data:`PARAMETERS`.
         spacing: Distance of neighbouring grid nodes [m].
         heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
+        factor: Of all heights.
     """
     if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
         raise ValueError(
@@ -103,5 +104,5 @@ def rasterise(genes: Any, spacing: float, heights_out: Any) -> None:
     bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
     inputs = [genes, _genes(*LOWER), _genes(*UPPER)]
     wp.launch(_decode_genes_kernel, bumps.shape, inputs, outputs=[bumps], device=genes.device)
-    inputs = [bumps, spacing]
+    inputs = [bumps, spacing, factor]
     wp.launch(_rasterise_bumps_kernel, heights_out.shape, inputs, outputs=[heights_out], device=genes.device)

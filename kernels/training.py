@@ -56,7 +56,7 @@ class Rules:
 
 @wp.struct
 class Training:
-    """What training keeps beside the episodes, shape (num_envs,) unless said otherwise."""
+    """What training keeps beside the episodes, shape (num_envs,) unless it is said here or in :mod:`kernels`."""
 
     counter: wp.array[int]
     """Control steps so far, counted from a seed: what all random numbers come from; shape (1,)."""
@@ -67,11 +67,8 @@ class Training:
     heading: wp.array[float]
     """Commanded heading [rad]."""
     command: wp.array2d[float]
-    """vx, vy [m/s], yaw rate [rad/s]; shape (num_envs, 3)."""
     action: wp.array2d[float]
-    """What the policy put out, shape (num_envs, num_joints)."""
     last_action: wp.array2d[float]
-    """Clipped action of the step, shape (num_envs, num_joints)."""
     observation: wp.array2d[float]
     """What the policy sees next, shape (num_envs, observation_size)."""
     statistics: wp.array2d[float]

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
-from qd.evaluate.sets import EliteSplit, elites_sha256, read_elites, space_of, split_elites
+from qd.evaluate.sets import elites_sha256, read_elites, space_of, split_elites
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
 from qd.run.directory import RunDirectory, find_run
@@ -128,7 +127,7 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
         return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]
-    splits = [_split(cfg, archive) for archive in archives]
+    splits = [split_elites(archive, held_out=cfg.recipe.held_out) for archive in archives]
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
         held_out.update(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
@@ -153,14 +152,6 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
              "sha256": elites_sha256(archive)} for archive, rows, split in chosen
         ],
     )  # fmt: skip
-
-
-def _split(cfg: FinetuneCfg, archive: Archive) -> EliteSplit:
-    """Which elites of an archive to train on: as the evaluation splits them, or all."""
-    if cfg.recipe.held_out:
-        return split_elites(archive)
-    nobody = np.zeros(0, np.int64)  # beside all, in an order that does not depend on that of the file
-    return EliteSplit(train=np.lexsort(archive.genes.T[::-1]), validation=nobody, test=nobody)
 
 
 class FineTuning(Training):

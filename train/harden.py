@@ -7,7 +7,7 @@ begun again and does what is left.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -30,7 +30,6 @@ from sim.files.intervals import value_words
 from sim.files.records import identity
 from sim.files.settings import check
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
 from sim.spaces.registry import load_space, space_at
 from train.cfg import LARGE, FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
@@ -69,12 +68,8 @@ def harden(
         The content of ``rounds.json``, which is written after each round: the counts of all searches, which trainings
         were kept and why, and the tables of all controllers.
     """
-    cfg, content = _begin(robot, cfg, run_dir, compute)
-    hardening = _Hardening(
-        robot=robot, cfg=cfg, path=run_dir, compute=compute, space=space_at(load_space(cfg.space), None, robot),
-        certifiers=certifiers, content=content,
-        policies={"base": cfg.policy or str(robot.policy_file)}, start=cfg.policy,
-    )  # fmt: skip
+    hardening = _Hardening(robot, cfg, run_dir, compute, certifiers)
+    content = hardening.content
     hardening.search_cfg(0, cfg.policy)  # refuses what no search can be
     try:
         with claimed(run_dir):
@@ -91,50 +86,45 @@ def harden(
     return content
 
 
-def _begin(robot: RobotCfg, cfg: HardenCfg, run_dir: Path, compute: Compute) -> tuple[HardenCfg, dict[str, Any]]:
-    """Checked settings with their sizes, and what ``rounds.json`` has, or is to begin with."""
-    check(cfg)
-    base = cfg.policy or str(robot.policy_file)
-    read_start(Path(base), robot)
-    check_policy(base, robot, compute.device)
-    tune = cfg.tune.sized(robot, compute.device, **({} if robot.name == "cassie" else LARGE))
-    tune.check(robot)
-    full = (paper_terrains(robot.name), EPISODES)
-    terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
-    terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=(24, 4))
-    cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
-    settings = json.loads(to_json({**asdict(cfg), **identity(robot, base)}))  # as they are read again
-    del settings["rounds"]
-    if (run_dir / ROUNDS_FILE).exists():
-        content = read_json(run_dir / ROUNDS_FILE)
-        if different := differences(content.get("settings", {}), settings):
-            raise ValueError(f"{run_dir} holds a hardening of other settings: {', '.join(different)}: give those")
-        done = len(content["rounds"]) - 1
-        if cfg.rounds < done:
-            raise ValueError(f"rounds must be at least {done}, which {run_dir} has done, got {cfg.rounds}")
-        return cfg, content
-    if run_dir.is_dir() and not all(map(is_leftover, run_dir.iterdir())):
-        raise ValueError(f"{run_dir} must be empty or hold a hardening, got neither: give another directory")
-    origin = origin_of(compute.device, cfg.seed, compute.workers)
-    return cfg, {**origin, "robot": robot.name, "settings": settings, "rounds": [], "choices": {}}
-
-
-@dataclass(kw_only=True)
 class _Hardening:
-    robot: RobotCfg
-    cfg: HardenCfg
-    path: Path
-    compute: Compute
-    space: TerrainSpace
-    certifiers: Mapping[str, str] | None
-    content: dict[str, Any]
-    """What ``rounds.json`` has."""
-    policies: dict[str, str]
-    """Controller after each round so far, by its name."""
-    start: str | None
-    """What the next training begins with: the base, or the checkpoint of the last training kept, with its critic."""
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    choices: dict[str, dict[str, Any]] = field(default_factory=dict)
+    def __init__(
+        self, robot: RobotCfg, cfg: HardenCfg, path: Path, compute: Compute, certifiers: Mapping[str, str] | None
+    ) -> None:
+        check(cfg)
+        base = cfg.policy or str(robot.policy_file)
+        read_start(Path(base), robot)
+        check_policy(base, robot, compute.device)
+        tune = cfg.tune.sized(robot, compute.device, **({} if robot.name == "cassie" else LARGE))
+        tune.check(robot)
+        full = (paper_terrains(robot.name), EPISODES)
+        terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
+        terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=(24, 4))
+        self.cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
+        self.robot, self.path, self.compute, self.certifiers = robot, path, compute, certifiers
+        self.space = space_at(load_space(cfg.space), None, robot)
+        self.policies = {"base": base}  # after each round so far
+        self.start = cfg.policy  # of the next training: the base, or the last checkpoint kept, with its critic
+        self.rows: list[dict[str, Any]] = []
+        self.choices: dict[str, dict[str, Any]] = {}
+        self.content = self._read_content(base)
+
+    def _read_content(self, base: str) -> dict[str, Any]:
+        """What ``rounds.json`` has, or is to begin with."""
+        settings = json.loads(to_json({**asdict(self.cfg), **identity(self.robot, base)}))  # as they are read again
+        del settings["rounds"]
+        file = self.path / ROUNDS_FILE
+        if file.exists():
+            content = read_json(file)
+            if different := differences(content.get("settings", {}), settings):
+                raise ValueError(f"{self.path} holds a hardening of other settings: {', '.join(different)}: give those")
+            done = len(content["rounds"]) - 1
+            if self.cfg.rounds < done:
+                raise ValueError(f"rounds must be at least {done}, which {self.path} has done, got {self.cfg.rounds}")
+            return content
+        if self.path.is_dir() and not all(map(is_leftover, self.path.iterdir())):
+            raise ValueError(f"{self.path} must be empty or hold a hardening, got neither: give another directory")
+        origin = origin_of(self.compute.device, self.cfg.seed, self.compute.workers)
+        return {**origin, "robot": self.robot.name, "settings": settings, "rounds": [], "choices": {}}
 
     def _seed(self, number: int) -> int:
         """Seed of a round, from 100 on: controllers are tested on elites of searches with seeds 0, 1 and so on."""

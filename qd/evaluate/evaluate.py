@@ -68,10 +68,7 @@ def cross_sets(
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Lets every controller cross every set, as :meth:`qd.workers.cross.Crossings.cross` does; prints how each fared.
-
-    The result is set -> controller -> crossings.
-    """
+    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them; prints its rates."""
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))
     with Crossings(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crossings:

@@ -32,8 +32,6 @@ class Measured:
     """Valid episodes that reached the goal, shape (T,)."""
     episodes: NDArray[np.int64]
     """Valid episodes, shape (T,); 0 on an invalid terrain."""
-    outcomes: dict[str, int]
-    """Episodes by how they ended."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -69,13 +67,6 @@ def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
     return {name: terrain_means(hit, counted) for name, hit in hits.items()}
 
 
-def count_outcomes(result: RolloutResult) -> dict[str, int]:
-    """Episodes by how they ended."""
-    return {
-        outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in Outcome if outcome != Outcome.TILT
-    }
-
-
 def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
     """Everything that the tables say of crossings with their reward; ``scales`` are of the penalties in order."""
     if result.reward is None:
@@ -90,7 +81,6 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
         },
         goals=(result.reached_goal & counted).sum(axis=1),
         episodes=counted.sum(axis=1),
-        outcomes=count_outcomes(result),
     )
 
 
@@ -110,14 +100,15 @@ def summarise(
     for name, values in rates.items():
         summary[f"{name}_interval"] = bootstrap_interval(values[~np.isnan(values)], seed)
     summary["episodes"] = int(result.outcome.size)
-    summary["outcomes"] = count_outcomes(result)
+    ends = [outcome for outcome in Outcome if outcome != Outcome.TILT]
+    summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in ends}
     summary["invalid_terrains"] = int(np.isnan(rates["success_rate"]).sum())
-    by_type = by_level = None
+    summary["by_type"] = summary["by_level"] = None
     if types is not None:
-        by_type = {CROSSING_TYPES[k]: _group(rates, types == k) for k in np.unique(types)}
+        summary["by_type"] = {CROSSING_TYPES[k]: _group(rates, types == k) for k in np.unique(types)}
     if levels is not None:
-        by_level = {str(level): _group(rates, levels == level) for level in np.unique(levels)}
-    return {**summary, "by_type": by_type, "by_level": by_level}
+        summary["by_level"] = {str(level): _group(rates, levels == level) for level in np.unique(levels)}
+    return summary
 
 
 def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:

@@ -144,23 +144,12 @@ def make_pack(
     seed: int = 0,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Chooses terrains of a judged run, lets controllers cross them, and writes the pack.
+    """Chooses terrains of a judged run, lets controllers cross them, and writes the pack; returns what its JSON has.
 
-    Args:
-        run: Run directory.
-        controllers: Policy of each by its name; if empty, the shipped one and the run's certifiers. The searched one is
-            always among them.
-        compute: Where terrains are crossed.
-        robot: Robot that the command line names.
-        policy: The searched controller, where it is code or its file has moved.
-        space: Terrain space that the command line names.
-        size: How many terrains; fewer if the run has fewer.
-        episodes: On each terrain.
-        seed: Draws the episodes.
-        out: Folder to write to; under runs/ if None.
-
-    Returns:
-        The content of ``pack.json``.
+    Without ``controllers`` (policies by name) these are the shipped one and the run's certifiers. The searched one is
+    always among them; ``policy`` names it where it is code or its file has moved. Robot and space are those that the
+    command line names. There are ``size`` terrains, fewer if the run has fewer, and ``episodes`` on each, which
+    ``seed`` draws. Without ``out`` the folder lies under runs/.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     body, searched, archive = search.robot, search.policy, search.read_archive()

@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,32 +53,6 @@ class EliteSplit:
     """Held out to be reported: the first n are a random choice of n of them."""
 
 
-class Certificates(NamedTuple):
-    """Who is known to cross T elites that the controller of their search fails (:class:`qd.archive.FaultCounts`)."""
-
-    certifiers: tuple[str, ...]
-    """Names of C controllers."""
-    sha256: tuple[str, ...]
-    """Their hashes."""
-    given: NDArray[np.bool_]
-    """Whether each certifies each elite, shape (T, C)."""
-    searched_sha256: str | None
-    """Hash of the controller of the search."""
-
-    @property
-    def certified(self) -> NDArray[np.bool_]:
-        """Whether anybody certifies each elite, shape (T,)."""
-        return np.any(self.given, axis=1)
-
-
-def certificates_of(archive: Archive, rows: NDArray[np.int64]) -> Certificates | None:
-    """Who certifies some elites of an archive; None where no certifier was asked."""
-    if (faults := archive.faults) is None or not faults.certifiers:
-        return None
-    given = faults.certificates() & archive.failing[:, None]
-    return Certificates(faults.certifiers, faults.certifier_sha256, given[rows], archive.policy_sha256)
-
-
 @dataclass(frozen=True, kw_only=True)
 class TerrainSet:
     """T terrains with the seeds of their episodes."""
@@ -97,21 +71,25 @@ class TerrainSet:
     """Terrain space of genes, as :func:`sim.spaces.registry.load_space` takes it."""
     families: NDArray[np.int64] | None = None
     """Number of each elite's family (:func:`qd.groups.families_of`), shape (T,); None of independent terrains."""
-    certificates: Certificates | None = None
-    """Who crosses elites; None of other terrains, and where nobody was asked."""
+    elites: Archive | None = None
+    """The elites, with what is known of them; None of other terrains."""
 
     def __len__(self) -> int:
         """Number of terrains."""
         return len(self.seeds)
+
+    @property
+    def certified(self) -> NDArray[np.bool_] | None:
+        """Whether anybody crosses each elite that its search's controller fails, shape (T,); None if none was asked."""
+        faults = None if self.elites is None else self.elites.faults
+        return None if self.elites is None or faults is None or not faults.certifiers else self.elites.certified
 
     def rows(self, places: NDArray[np.int64]) -> "TerrainSet":
         """The terrains in some places."""
         arrays: dict[str, Any] = {
             name: value[places] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
-        if self.certificates is not None:
-            arrays["certificates"] = self.certificates._replace(given=self.certificates.given[places])
-        return replace(self, **arrays)
+        return replace(self, **arrays, elites=None if self.elites is None else self.elites.rows(places))
 
 
 def paper_terrains(robot: str) -> int:
@@ -119,8 +97,8 @@ def paper_terrains(robot: str) -> int:
     return 180 if robot == "cassie" else 300
 
 
-def split_elites(archive: Archive) -> EliteSplit:
-    """Draw at random which elites are trained on and which are held out.
+def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
+    """Draw at random which elites are trained on and which are held out; without ``held_out`` all are trained on.
 
     The paper's numbers where the archive has so many: 750 to train on, 300 (ANYmal) or 180 (Cassie) for the test; else
     80 % and 20 %. A tenth as many as are to be trained on are for validation, at least one. They are those that
@@ -128,6 +106,9 @@ def split_elites(archive: Archive) -> EliteSplit:
     alone, not on their order in the file: judging an archive again, which reorders it, moves no elite from one part to
     the other.
     """
+    if not held_out:
+        nobody = np.zeros(0, np.int64)
+        return EliteSplit(train=_in_order_of_genes(archive), validation=nobody, test=nobody)
     if len(archive) < MIN_ELITES:
         raise ValueError(
             f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites, got "
@@ -226,10 +207,10 @@ def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on
 
 
 def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
-    genes, space = archive.genes[rows], space_of(archive)
+    elites, space = archive.rows(rows), space_of(archive)
     return TerrainSet(
-        terrains=genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(genes, space),
-        certificates=certificates_of(archive, rows),
+        terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(elites.genes, space),
+        elites=elites,
     )  # fmt: skip
 
 

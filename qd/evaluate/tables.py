@@ -39,7 +39,7 @@ Tables = dict[str, Any]
 - ``differences``: set -> ``first -> second`` -> ``compared`` terrains, which are valid for both; ``mended``,
   ``still_failing``, ``newly_broken`` and ``fine``, each with its ``count`` and the numbers of its ``terrains`` (not of
   the fine ones); how many changes are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
-- ``outcomes``: set -> controller -> episodes that ended so; ``terrains``: how many, by set; ``episodes``: on each.
+- ``terrains``: how many, by set; ``episodes``: on each.
 - ``controllers``: ``policy`` and ``sha256`` by name.
 """
 _MEASURES = (*MEASURES, *CERTIFIED)
@@ -94,10 +94,6 @@ def make_tables(
         "over_seeds": over_seeds(means, _MEASURES),
         "intervals": _statistics(crossed, sets, lambda values, families: interval_of(values, seed, families)),
         "terrains": {name: len(terrains) for name, terrains in sets.items()},
-        "outcomes": {
-            name: {controller: measured.outcomes for controller, measured in row.items()}
-            for name, row in crossed.items()
-        },
         "differences": {
             name: {
                 f"{first} -> {second}": difference(row[first], row[second], sets[name], seed)
@@ -114,11 +110,11 @@ def _statistics(
     """Each measure and ``penalties``: set -> controller -> a statistic of the terrains' values and families."""
     tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
     for name, row in crossed.items():
-        families, certificates = sets[name].families, sets[name].certificates
+        families, certified = sets[name].families, sets[name].certified
         everywhere = np.ones(len(sets[name]), bool)
         groups = [(key, key, everywhere) for key in MEASURES]
-        if certificates is not None:
-            groups += [(key, measure, certificates.certified) for key, measure in CERTIFIED.items()]
+        if certified is not None:
+            groups += [(key, measure, certified) for key, measure in CERTIFIED.items()]
         for key, measure, member in groups:
             kin = of_terrains(families, member)
             tables[key][name] = {who: statistic(measured.values[measure][member], kin) for who, measured in row.items()}
@@ -134,15 +130,16 @@ def _about_certified(
 ) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
-        if (certificates := terrains.certificates) is None:
+        if terrains.certified is None or terrains.elites is None or (faults := terrains.elites.faults) is None:
             continue
-        counts = dict(zip(certificates.certifiers, certificates.given.sum(axis=0).tolist(), strict=True))
-        roles: dict[str | None, str] = {certificates.searched_sha256: "searched"}
-        by_hash = zip(certificates.sha256, certificates.certifiers, strict=True)
+        given = faults.certificates() & terrains.elites.failing[:, None]
+        counts = dict(zip(faults.certifiers, given.sum(axis=0).tolist(), strict=True))
+        roles: dict[str | None, str] = {terrains.elites.policy_sha256: "searched"}
+        by_hash = zip(faults.certifier_sha256, faults.certifiers, strict=True)
         roles |= {sha256: "certifier" for sha256, certifier in by_hash if counts[certifier]}
         hashes = {controller: about["sha256"] for controller, about in controllers.items()}
         certified[name] = {
-            "terrains": int(certificates.certified.sum()),
+            "terrains": int(terrains.certified.sum()),
             "certifiers": counts,
             "chosen_by": {controller: roles[sha] for controller, sha in hashes.items() if sha and sha in roles},
         }
@@ -208,10 +205,8 @@ def _kind_of(name: str) -> str:
 
 def _firsts(names: Iterable[str]) -> list[str]:
     """The first controller of each kind, in order."""
-    first: dict[str, str] = {}
-    for name in names:
-        first.setdefault(_kind_of(name), name)
-    return list(first.values())
+    first = {_kind_of(name): name for name in reversed([*names])}
+    return [first[kind] for kind in dict.fromkeys(map(_kind_of, names))]
 
 
 def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -221,17 +216,13 @@ def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, 
         for name, row in tables[measure].items():
             for kind in dict.fromkeys(map(_kind_of, row)):
                 values = [value for controller, value in row.items() if _kind_of(controller) == kind]
-                if len(values) > 1:
-                    summary = _mean_over_seeds(values, is_rate=measure in RATES)
-                    summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary
+                if len(values) < 2:
+                    continue
+                mean = interval = None
+                if None not in values:
+                    mean, interval = sum(values) / len(values), t_interval(np.array(values))
+                    if interval is not None and measure in RATES:
+                        interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
+                summary = {"mean": mean, "interval": interval, "values": values}
+                summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary
     return summaries
-
-
-def _mean_over_seeds(values: list[float | None], *, is_rate: bool) -> dict[str, Any]:
-    numbers = [value for value in values if value is not None]
-    if len(numbers) < len(values):
-        return {"mean": None, "interval": None, "values": values}
-    interval = t_interval(np.array(numbers))
-    if interval is not None and is_rate:
-        interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
-    return {"mean": sum(numbers) / len(numbers), "interval": interval, "values": values}

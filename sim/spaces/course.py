@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, SPACING, Kind
-from kernels.heightfield import scale_heights
 from sim.device import host_device
 from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
 
@@ -41,9 +40,7 @@ class Course(TerrainSpace):
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""
-        course.rasterise(genes, spacing, heights_out)
-        if self.height != MOST_HEIGHT:
-            scale_heights(heights_out, self.height / MOST_HEIGHT)
+        course.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Kinds drawn evenly, every parameter that makes an element hard at its hard end, the others uniform."""

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
-from kernels.heightfield import scale_heights
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
 from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
 
@@ -41,9 +40,7 @@ class SuperGaussian(TerrainSpace):
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
-        super_gaussian.rasterise(genes, spacing, heights_out)
-        if self.height != MOST_HEIGHT:
-            scale_heights(heights_out, self.height / MOST_HEIGHT)
+        super_gaussian.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Uniform genes, but every bump at its lowest or highest height: the paper's hard-random terrains."""

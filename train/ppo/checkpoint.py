@@ -66,10 +66,12 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
     A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
     such a file is left: its own normaliser is another.
     """
-    described = _load_described(path, robot)
-    if described is not None:
-        return _start_described(described, path, robot)
-    policy = load_policy(path, robot, "cpu")
+    if path.name == CHECKPOINT and path.is_file() and DESCRIPTION in (saved := read_checkpoint(path)):
+        policy = load_described(read_controller(path, saved[DESCRIPTION]), path, robot, "cpu", path)
+    else:
+        policy = load_policy(path, robot, "cpu")
+    if isinstance(policy, Described):
+        return _start_described(policy, path, robot)
     content = read_weights(path) if isinstance(policy, MlpPolicy) else {}
     if not isinstance(policy, MlpPolicy) or policy.activation != "elu" or "actor_state_dict" not in content:
         raise ValueError(
@@ -96,17 +98,6 @@ def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, pat
     if critic is not None:
         _check_critic(critic, (robot.observation_size, *hidden, 1), path)
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
-
-
-def _load_described(path: Path, robot: RobotCfg) -> Described | None:
-    """The described controller of a controller.toml, or of the checkpoint of its training."""
-    if path.suffix == ".toml":
-        policy = load_policy(path, robot, "cpu")
-        assert isinstance(policy, Described)
-        return policy
-    if path.name != CHECKPOINT or not path.is_file() or DESCRIPTION not in (saved := read_checkpoint(path)):
-        return None
-    return load_described(read_controller(path, saved[DESCRIPTION]), path, robot, "cpu", path)
 
 
 def _start_described(described: Described, path: Path, robot: RobotCfg) -> Start:

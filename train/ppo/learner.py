@@ -156,12 +156,13 @@ class Learner:
             torch.cuda.synchronize()  # or the simulation's time would be counted as learning
         collected = time.perf_counter()
         losses = alg.update()
+        where, remedy = f"iteration {self.iteration}", "begin again with a lower --ppo.learning-rate"
         if not all(map(torch.isfinite, torch.tensor(list(losses.values())))):
-            raise FloatingPointError(f"iteration {self.iteration}: losses are not finite, got {losses}")
+            raise FloatingPointError(f"{where}: losses are not finite, got {losses}: {remedy}")
         # The last step may have spoiled the networks after their losses were computed.
         parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
         if not torch.isfinite(torch.stack([parameter.detach().sum() for parameter in parameters])).all():
-            raise FloatingPointError(f"iteration {self.iteration}: the networks' weights are not finite")
+            raise FloatingPointError(f"{where}: the networks' weights are not finite: {remedy}")
         self.iteration += 1
         return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
 

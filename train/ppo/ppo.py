@@ -158,7 +158,10 @@ class CapturedPPO(PPO):
         ratio = torch.exp(log_prob - stored.actions_log_prob.flatten(0, 1)[index].squeeze(1))
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
-        value_loss = self._value_loss(observations)
+        values, returns = self.critic(observations), stored.returns.flatten(0, 1)[index]
+        old_values = stored.values.flatten(0, 1)[index]
+        clipped = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+        value_loss = torch.max((values - returns).pow(2), (clipped - returns).pow(2)).mean()
         actor_loss = surrogate_loss - self.entropy_coef * entropy
         loss = self._actor_learns * actor_loss + self.value_loss_coef * value_loss
         self.optimizer.zero_grad(set_to_none=True)
@@ -169,13 +172,6 @@ class CapturedPPO(PPO):
         nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
         self.optimizer.step()
         self._losses.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
-
-    def _value_loss(self, observations: Any) -> torch.Tensor:
-        values = self.critic(observations)
-        old_values = self.storage.values.flatten(0, 1)[self._index]
-        returns = self.storage.returns.flatten(0, 1)[self._index]
-        clipped = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
-        return torch.max((values - returns).pow(2), (clipped - returns).pow(2)).mean()
 
     @torch.no_grad()
     def _adapt_learning_rate(self, old_mean_std: tuple[torch.Tensor, ...]) -> None:

@@ -198,12 +198,7 @@ class Training:
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))
         with stop_request() as stop:
-            try:
-                self._iterate(stop)
-            except FloatingPointError as error:
-                raise FloatingPointError(
-                    f"{error}, in {self._run_dir}: begin again with a lower --ppo.learning-rate"
-                ) from error
+            self._iterate(stop)
             self._finish(export)
         if stop.is_set():
             done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
@@ -256,14 +251,11 @@ def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> No
     """
     buffer = io.BytesIO()
     marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
-    actor = {key: _in_half(value) if value.ndim > 1 else value for key, value in learner.mean_actor_state().items()}
+    actor = learner.mean_actor_state()
+    for key, half in {key: value.half() for key, value in actor.items() if value.ndim > 1}.items():
+        if half.isfinite().all():  # else it has numbers too large for it
+            actor[key] = half
     activation = "elu" if learner.env.controller is None else learner.env.controller.activation
     torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **marks}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))
-
-
-def _in_half(weights: torch.Tensor) -> torch.Tensor:
-    """In half precision; as they are where it has no such large numbers."""
-    half = weights.half()
-    return half if bool(half.isfinite().all()) else weights

@@ -16,6 +16,7 @@ from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossin
 from train.task.curriculum import Tiles
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
+_REMEMBERED = ("rows", "episodes", "crossed")
 _LEAST_WEIGHT = 0.1  # of a terrain that is drawn least, beside 1 more for one that is drawn most
 
 
@@ -62,11 +63,14 @@ class Mix:
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
         """The terrains of the next exchange.
 
-        Args:
-            counts: What became of the episodes on the present ones (:meth:`train.task.task.CommandTask.counts`).
+        ``counts`` say what became of the present ones (:meth:`train.task.task.CommandTask.counts`). It replaces what
+        was known of their elites: the controller was another then.
         """
         if counts is not None:
-            self._remember(counts)
+            episodes, crossed = self._present(counts)
+            known = episodes > 0
+            self.episodes[known], self.crossed[known] = episodes[known], crossed[known]
+            self._before_resume[:] = 0
         self.swap += 1
         self.rows = self.draw_rows()
         return self.terrains()
@@ -95,9 +99,7 @@ class Mix:
         return {
             "swap": self.swap,
             "goal_rate": None if self.goal_rate is None else self.goal_rate.tolist(),
-            "rows": self.rows.tolist(),
-            "episodes": self.episodes.tolist(),
-            "crossed": self.crossed.tolist(),
+            **{name: getattr(self, name).tolist() for name in _REMEMBERED},
             "present_episodes": present[0].tolist(),
             "present_crossed": present[1].tolist(),
         }
@@ -107,9 +109,7 @@ class Mix:
         if state["goal_rate"] is not None:
             self.goal_rate = np.asarray(state["goal_rate"], np.float64)
         self.swap = state["swap"]
-        self.rows, self.episodes, self.crossed = (
-            np.asarray(state[name], np.int64) for name in ("rows", "episodes", "crossed")
-        )
+        self.rows, self.episodes, self.crossed = (np.asarray(state[name], np.int64) for name in _REMEMBERED)
         self._before_resume = np.asarray([state["present_episodes"], state["present_crossed"]], np.int64)
         return self.terrains()
 
@@ -155,13 +155,6 @@ class Mix:
         """The same with a sum of 1 in each part that has elites, shape (E,)."""
         parts = np.split(preferred, np.cumsum([len(part) for part in self.genes])[:-1])
         return np.concatenate([part / part.sum() if len(part) else part for part in parts])
-
-    def _remember(self, counts: dict[str, NDArray[Any]]) -> None:
-        """What became of the present elites replaces what was known of them: the controller was another then."""
-        episodes, crossed = self._present(counts)
-        known = episodes > 0
-        self.episodes[known], self.crossed[known] = episodes[known], crossed[known]
-        self._before_resume[:] = 0
 
     def _present(self, counts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """Valid episodes on each elite since the last exchange, and those that crossed it, shape (2, E)."""

@@ -81,7 +81,19 @@ class CommandTask:
             device=device,
         )
         self._reward = Reward(self.sim, cfg, command=training.command, action=training.last_action, falls=_FALLS)
-        self._make_views()
+        rewards = self._reward.state
+        self._action = torch.from_dlpack(training.action)
+        self.observation = torch.from_dlpack(training.observation)
+        self.reward = torch.from_dlpack(rewards.step)
+        self.end = torch.from_dlpack(training.ended)
+        self.episode_steps = torch.from_dlpack(self._episodes.steps)
+        self.levels = torch.from_dlpack(training.level)
+        self.counter = torch.from_dlpack(training.counter)
+        self._column = torch.from_dlpack(training.column)
+        self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
+        self._statistics = torch.from_dlpack(training.statistics)
+        self._counted = torch.zeros_like(self._statistics)
+        self._reward_terms = torch.from_dlpack(rewards.terms)
         # Capturing makes a step, which is undone after. At its file's pose a robot may be deep in the ground, with more
         # contacts than there is room for: it is put at a start before.
         self.restart_all(torch.from_numpy(levels))
@@ -101,27 +113,8 @@ class CommandTask:
             added_base_mass=rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32),
         )
 
-    def _make_views(self) -> None:
-        training, rewards = self._training, self._reward.state
-        self._action = torch.from_dlpack(training.action)
-        self.observation = torch.from_dlpack(training.observation)
-        self.reward = torch.from_dlpack(rewards.step)
-        self.end = torch.from_dlpack(training.ended)
-        self.episode_steps = torch.from_dlpack(self._episodes.steps)
-        self.levels = torch.from_dlpack(training.level)
-        self.counter = torch.from_dlpack(training.counter)
-        self._column = torch.from_dlpack(training.column)
-        self._terrain_of_env = torch.from_dlpack(self.sim.terrain_of_env)
-        self._statistics = torch.from_dlpack(training.statistics)
-        self._counted = torch.zeros_like(self._statistics)
-        self._reward_terms = torch.from_dlpack(rewards.terms)
-
     def step(self, action: torch.Tensor) -> None:
-        """Make one control step; an episode that ends restarts within it.
-
-        Args:
-            action: Policy output, shape (num_envs, num_joints).
-        """
+        """Make one control step with actions (num_envs, num_joints); an episode that ends restarts within it."""
         if action.shape != self._action.shape:
             raise ValueError(f"action must have shape {tuple(self._action.shape)}, got {tuple(action.shape)}")
         self._action.copy_(action)

@@ -8,14 +8,16 @@ import pytest
 
 from qd.evaluate.labels import FATES
 from qd.evaluate.measures import measure
-from qd.evaluate.sets import Certificates
 from qd.evaluate.show import show_tables
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
 from sim.files.records import robot_identity
+from tests.builders import judged_archive
 from tests.qd.evaluate.made import make_measured, make_set
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
-ABOUT = {who: {"policy": f"{who}.pt", "sha256": sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))}
+ABOUT = {
+    who: {"policy": f"{who}.pt", "sha256": 64 * sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))
+}
 SET = replace(make_set(5), numbers=np.array([10, 3, 7, 5, 8]))
 
 
@@ -33,10 +35,10 @@ def report(anymal):
 @pytest.fixture(scope="module")
 def certified(anymal):
     """Three controllers on four elites of a search against base, of which C-G certifies the first two."""
-    given = Certificates(("C-G", "S"), ("a", "b"), np.array([[1, 0], [1, 0], [0, 0], [0, 0]], bool), "f")
+    archive = replace(judged_archive(), policy_sha256="f" * 64).rows(np.array([2, 2, 3, 3]))
     goals = {"base": [4, 1, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
     row = {who: make_measured(counts, of=4) for who, counts in goals.items()}
-    elites = replace(make_set(4, 10), certificates=given, families=np.arange(4))
+    elites = replace(make_set(4, 10), elites=archive, families=np.arange(4))
     return tables_of(anymal, {"generated": row, "hard_random": row}, {"generated": elites})
 
 
@@ -53,7 +55,6 @@ def test_values_are_means_over_terrains(report):
     assert report["goal"]["generated"] == {"base": pytest.approx(1.25 / 3), "C-G": 0.5}
     assert report["reward"]["generated"] == {"base": pytest.approx((20 + 6.5 + 8) / 3), "C-G": 14.0}
     assert report["penalties"]["generated"]["base"] == {"yaw_rate": 0.0, "vel_x": 0.0}
-    assert report["outcomes"]["generated"]["C-G"]["invalid"] == 4
     assert report["terrains"] == {"hand_crafted": 3, "generated": 3}
     # Of goal rates 1, .25, 0 a resample of 3 is all 0 in 1 of 27 cases, and all 1 in another: more than 2.5 %.
     assert report["intervals"]["goal"]["generated"]["base"] == [0.0, 1.0]

@@ -87,8 +87,3 @@ def test_settings_reach_rsl_rl(device: str) -> None:
 def test_settings_that_nothing_is_learned_with_are_named(changes: dict[str, Any]) -> None:
     (line,) = ppo_problems(PpoCfg(**changes), NUM_ENVS)
     assert f"ppo.{next(iter(changes))}" in line
-
-
-def test_an_iteration_has_at_least_two_transitions() -> None:
-    assert ppo_problems(PpoCfg(), NUM_ENVS) == ppo_problems(PpoCfg(steps_per_env=2, mini_batches=1), 1) == []
-    assert len(ppo_problems(PpoCfg(steps_per_env=1, mini_batches=1), 1)) == 1
