@@ -139,7 +139,12 @@ class Simulation:
         if cfg.time_constant_s is not None:
             self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))
         self.solver.mjw_model.opt.timestep.fill_(self.robot.physics_dt)
-        self.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+        changed = newton.ModelFlags.BODY_INERTIAL_PROPERTIES
+        # Newton makes a base's joint without armature, damping and friction, which only a change gives it.
+        base = [self.model.joint_armature, self.model.joint_damping, self.model.joint_friction]
+        if any(values.numpy()[:6].any() for values in base):
+            changed |= newton.ModelFlags.JOINT_DOF_PROPERTIES
+        self.solver.notify_model_changed(changed)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
         shape_body = self.model.shape_body.numpy()

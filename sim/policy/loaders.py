@@ -343,7 +343,9 @@ def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> P
     before = {name: value.clone() for name, value in probe.named_buffers()}
     try:
         once, again = (probe(rows[0, :1]) for _ in range(2))
-    except RuntimeError:  # of another width: it is tried afterwards
+    except Exception:  # of another width, or nothing to call: it is tried afterwards
+        return _Script(module)
+    if not isinstance(once, torch.Tensor):  # so is what it returns
         return _Script(module)
     initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
     if not initial and torch.equal(once, again):

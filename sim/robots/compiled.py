@@ -117,9 +117,12 @@ def _of_urdf(root: ET.Element) -> Any:
 
     MuJoCo alone welds the first link to the world, and refuses inertias of fixed links that are those of no body.
     """
-    extension = ET.SubElement(root, "mujoco")
-    ET.SubElement(extension, "compiler", strippath="false", fusestatic="false", discardvisual="false",
-                  inertiafromgeom="false")  # fmt: skip
+    compiler = root
+    for tag in ("mujoco", "compiler"):
+        own = compiler.find(tag)
+        compiler = ET.SubElement(compiler, tag) if own is None else own
+    compiler.attrib.setdefault("inertiafromgeom", "false")
+    compiler.attrib |= dict.fromkeys(("strippath", "fusestatic", "discardvisual"), "false")
     ET.indent(root)  # every element on a line of its own
     spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     for body in spec.bodies:
@@ -128,18 +131,18 @@ def _of_urdf(root: ET.Element) -> Any:
             geom.name = body.name if len(touching) == 1 else f"{body.name}_{number}"
             geom.friction[0], geom.solref = _URDF_FRICTION, (_URDF_TIME_CONSTANT_S, 1.0)
     for first in spec.worldbody.bodies:
-        first.add_freejoint()
+        if not first.joints:  # the world's joint may be floating already
+            first.add_freejoint()
         _sum_masses(first)
     return spec
 
 
 def _sum_masses(body: Any) -> list[Any]:
     """Gives a body what is fixed to it: its mass, and where its own and theirs are in it, [kg], [m], [kg m^2]."""
-    axes = rotation_matrix(body.iquat)
-    inertia = axes @ np.diag(body.inertia) @ axes.T
+    axes, inertia = rotation_matrix(body.iquat), np.diag(body.inertia)
     if not np.isnan(body.fullinertia[0]):
         inertia = body.fullinertia[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
-    parts = [(float(body.mass), np.array(body.ipos), inertia)] if body.mass > 0.0 else []
+    parts = [(float(body.mass), np.array(body.ipos), axes @ inertia @ axes.T)] if body.mass > 0.0 else []
     for child in body.bodies:
         of_child, turn = _sum_masses(child), rotation_matrix(child.quat)
         if not child.joints:
@@ -186,33 +189,43 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _keep_robot(spec: Any) -> list[str]:
     """Leaves what simulations take of a file, under names; returns what they cannot take, by its place."""
-    flags = [
-        name for name in _NEEDED if spec.option.disableflags & getattr(_mj.mjtDisableBit, f"mjDSBL_{name.upper()}")
-    ]
-    medium = [name for name in ("density", "viscosity", "wind", "o_margin") if np.any(getattr(spec.option, name))]
-    gravity = spec.option.gravity.copy()
-    problems = [f'<flag {name}="disable"> in <option>' for name in flags] + [f"<option {name}>" for name in medium]
+    option, gravity = spec.option, spec.option.gravity.copy()
+    flags = [name for name in _NEEDED if option.disableflags & getattr(_mj.mjtDisableBit, f"mjDSBL_{name.upper()}")]
+    others = [name for name in ("density", "viscosity", "wind", "disableactuator") if np.any(getattr(option, name))]
+    problems = [f'<flag {name}="disable"> in <option>' for name in flags] + [f"<option {name}>" for name in others]
+    problems += ['<flag override="enable">'] * bool(option.enableflags & _mj.mjtEnableBit.mjENBL_OVERRIDE)
     if gravity[0] or gravity[1] or not gravity[2] < 0.0:
         problems.append(f"<option gravity> that does not point down, {gravity}")
+    followers, plain = [equality.name1 for equality in spec.equalities], _mj.MjSpec().add_equality()
     for equality in spec.equalities:
         follows = equality.type == _mj.mjtEq.mjEQ_JOINT and equality.name2 and not np.any(equality.data[2:5])
-        if not (follows and equality.active):
+        once = followers.count(equality.name1) == 1 and equality.name2 not in followers
+        usual = all(np.array_equal(getattr(equality, name), getattr(plain, name)) for name in ("solref", "solimp"))
+        if not (follows and once and usual and equality.active):
             kind = _mj.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
-            problems.append(f"<equality> {kind} ({equality.info})")
+            problems.append(f"<equality> {kind} of {equality.name1} ({equality.info})")
+
+    def refuse(kind: str, part: Any, **values: Any) -> None:
+        strange = [name for name, value in values.items() if np.any(value)]
+        problems.extend(f"<{kind} {name}> of {part.name} ({part.info})" for name in strange)
+
     problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
     problems += [f"a flexible body ({flex.info})" for flex in spec.flexes]
     for body in spec.bodies:
         problems += [f"a ball joint ({joint.info})" for joint in body.joints if joint.type == _JOINT.mjJNT_BALL]
-        problems += [f"<joint ref> ({joint.info})" for joint in body.joints if joint.ref]
-        problems += [f"<body {name}> ({body.info})" for name in ("gravcomp", "mocap") if getattr(body, name)]
         for number, geom in enumerate(touching_geoms(body)):
             geom.name = geom.name or f"{body.name}_geom_{number}"
             geom.contype, geom.conaffinity = 1, 0
-            problems += [f"<geom {name}> of {geom.name} ({geom.info})" for name in ("margin", "gap", "adhesion")
-                         if getattr(geom, name)]  # fmt: skip
+            refuse("geom", geom, margin=geom.margin, gap=geom.gap, adhesion=geom.adhesion, surfacevel=geom.surfacevel)
+        refuse("body", body, gravcomp=body.gravcomp, mocap=body.mocap)
+        for joint in body.joints:
+            free = joint.type == _JOINT.mjJNT_FREE
+            refuse("joint", joint, ref=joint.ref, damping=joint.damping[1:], stiffness=joint.stiffness[not free :])
+    for actuator in spec.actuators:
+        refuse("actuator", actuator, armature=actuator.armature, damping=actuator.damping, delay=actuator.delay)
     for part in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs):
         spec.delete(part)
-    impratio = spec.option.impratio
+    impratio = option.impratio
     spec.option = _mj.MjSpec().option
     spec.option.gravity, spec.option.impratio = gravity, impratio
     return problems
@@ -313,6 +326,8 @@ class _Drives:
                 self.problems.append(f"{kind} {where}")
             elif joint in taken:
                 self.problems.append(f"a second actuator {where}")
+            elif joint in self.follow:
+                self.problems.append(f"a drive of a joint that follows another {where}")
             elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
                 self.problems.append(f"a gear other than 1 on a position actuator {where}")
             else:

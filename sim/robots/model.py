@@ -72,7 +72,11 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     )
     name, dof = model.joint(joint).name, int(model.jnt_dofadr[joint])
     if body == 1:
-        return builder.add_joint_free(child=link, label=name)
+        base = builder.add_joint_free(child=link, label=name)
+        builder.joint_armature[:6] = map(float, model.dof_armature[:6])
+        builder.joint_damping[:6] = map(float, model.dof_damping[:6])
+        builder.joint_friction[:6] = map(float, model.dof_frictionloss[:6])
+        return base
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
     turns = model.jnt_type[joint] == _mj.mjtJoint.mjJNT_HINGE

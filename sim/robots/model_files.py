@@ -5,9 +5,10 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = "package://"
-_SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf")  # .msh: MuJoCo's own
+_SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf", ".png")  # .msh: MuJoCo's own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +18,7 @@ class ModelFiles:
     root: ET.Element
     """Of the XML; in a URDF the meshes' file names are absolute."""
     files: tuple[Path, ...]
-    """The model file, included files and meshes."""
+    """The model file, included and attached files, meshes and textures."""
 
     @property
     def is_urdf(self) -> bool:
@@ -44,7 +45,7 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
                 files.append(_mesh_path(mesh, model_file))
                 mesh.set("filename", str(files[-1]))
     else:
-        files += _mjcf_files(root, (Path(os.path.abspath(model_file)),), model_file.parent)
+        files = _mjcf_files(model_file)
     missing = sorted({str(file) for file in files if not file.is_file()})
     if missing:
         raise ValueError(f"{model_file} names files that are not there: {', '.join(missing)}")
@@ -72,6 +73,9 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
         for end in (*joint.findall("parent"), *joint.findall("child")):
             if end.get("link") not in links:
                 yield f"{name}: no link named {end.get('link')}, the file has {', '.join(map(str, links))}"
+        mimic = joint.find("mimic")
+        if mimic is not None and mimic.get("joint") not in [other.get("name") for other in root.findall("joint")]:
+            yield f"{name} follows {mimic.get('joint')}, no joint of the file"
         limit = joint.find("limit")
         lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
         if kind in ("revolute", "prismatic") and (
@@ -124,25 +128,19 @@ def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _mjcf_files(root: ET.Element, within: tuple[Path, ...], main_folder: Path) -> list[Path]:
-    """Meshes and included files of an MJCF, which is the last of ``within``; meshes lie in ``main_folder`` first."""
-    folder = within[-1].parent
-    compiler: dict[str, str] = {}
-    for element in root.iter("compiler"):
-        compiler |= element.attrib
-    folder_of_meshes = compiler.get("meshdir", compiler.get("assetdir", ""))
-    files: list[Path] = []
-    for mesh in root.iter("mesh"):
-        name = mesh.get("file")
-        if name is not None:
-            name = Path(name).name if compiler.get("strippath", "").lower() == "true" else name
-            places = [place / folder_of_meshes / name for place in (main_folder, folder)] + [folder / name]
-            files.append(next((place for place in places if place.is_file()), places[0]))
-    for include in root.iter("include"):
-        included = Path(os.path.abspath(folder / include.get("file", "")))
-        files.append(included)
-        if included in within:
-            raise ValueError(f"{included} includes itself")
-        if included.is_file():
-            files += _mjcf_files(_parse(included), (*within, included), main_folder)
+def _mjcf_files(model_file: Path) -> list[Path]:
+    """An MJCF and what it names, as MuJoCo looks for it: in its own folder first, then beside what it includes."""
+    import mujoco  # takes long to load: not for the help of commands
+
+    mj: Any = mujoco  # its types are not written down
+    try:
+        named = sorted(map(Path, mj.mju_getXMLDependencies(os.path.abspath(model_file))))
+    except mj.FatalError as error:
+        raise ValueError(f"{model_file} cannot be read by MuJoCo: {error}") from None
+    home, folders = os.path.abspath(model_file.parent), [file.parent for file in named if file.suffix == ".xml"]
+    files = [model_file]
+    for file in named:
+        places = [file, *(folder / os.path.relpath(file, home) for folder in folders)]
+        places += [folder / file.name for folder in file.parents]  # by strippath
+        files.append(next((place for place in places if place.is_file()), file))
     return files

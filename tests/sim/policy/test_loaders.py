@@ -34,9 +34,10 @@ def test_torchscript_loads(tmp_path, anymal, device):
     rows = torch.randn(5, OBSERVATIONS)
     actions = load_policy(str(path), anymal, device)(rows.to("cuda" if device.startswith("cuda") else "cpu"))
     torch.testing.assert_close(actions.detach().cpu(), module(rows).detach(), **near(device))
-    torch.jit.trace(torch.nn.Linear(169, 10), torch.zeros(4, 169)).save(str(path))
-    with pytest.raises(ValueError, match=r"policy\.pt"):
-        load_policy(path, anymal, "cpu")
+    for other in (torch.nn.Linear(169, 10), torch.nn.LSTM(OBSERVATIONS, ACTIONS)):  # which returns its state too
+        torch.jit.script(other).save(str(path))
+        with pytest.raises(ValueError, match=r"policy\.pt"):
+            load_policy(path, anymal, "cpu")
 
 
 STATE = rsl_rl_actor().state_dict()

@@ -8,6 +8,7 @@ import shutil
 import newton
 import numpy as np
 import pytest
+from matplotlib.image import imsave
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
@@ -137,6 +138,15 @@ MORE = "collision_bit=False,"
 LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
 FIRST_MASS = '<mass value="0.8"/>'
 ROD = '<connect body1="FL_toe" body2="FR_toe" anchor="0 0 0"/>'
+
+
+def equality(*pairs, more=""):
+    """Hips that follow others, by their legs."""
+    hips = [pair.split() for pair in pairs]
+    joints = "".join(f'<joint joint1="{leg}_hip" joint2="{of}_hip" {more}/>' for leg, of in hips)
+    return f"<equality>{joints}</equality></mujoco>"
+
+
 MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what, and the part that the error names
     ("py", 'name="dog"', 'name="anymal"', "name"),
     ("py", 'name="dog"', 'name="a dog"', "name"),
@@ -163,7 +173,7 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", BALL, 'type="ellipsoid" size="0.02 0.02 0.03"', "FL_foot"),
     ("xml", BALL, 'type="sphere" size="25"', "FL_foot: it is 50 m"),
     ("xml", "</mujoco>", "", "XML"),
-    ("xml", WORLD, f'<include file="dog.xml"/>{WORLD}', "includes itself"),
+    ("xml", WORLD, f'<include file="dog.xml"/>{WORLD}', "included"),
     ("xml", MESH, '<asset><mesh name="m" file="dog.py"/></asset>', "dog.py"),
     ("xml", MESH, '<asset><mesh name="m" file="gone.stl"/></asset>', "gone.stl"),
     ("xml", HIP, f'{HIP} ref="0.3"', "ref"),
@@ -178,11 +188,21 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", 'friction="0.8"', 'friction="0.8" margin="0.02"', "<geom margin> of trunk (line"),
     ("xml", "</mujoco>", '<option gravity="0 0 0"/></mujoco>', "<option gravity>"),
     ("xml", "</mujoco>", '<option><flag contact="disable"/></option></mujoco>', "<flag contact"),
-    ("xml", "</mujoco>", f"<equality>{ROD}</equality></mujoco>", "<equality> connect (line"),
+    ("xml", "</mujoco>", f"<equality>{ROD}</equality></mujoco>", "<equality> connect of FL_toe (line"),
+    ("xml", "</mujoco>", equality("FR FL"), "a drive of a joint that follows another on FR_hip"),
+    ("xml", "</mujoco>", equality("FR FL", "HR FR"), "<equality> joint of HR_hip"),
+    ("xml", "</mujoco>", equality("FR FL", more='solref="0.1 1"'), "<equality> joint of FR_hip"),
+    ("xml", FREE, '<joint type="free" stiffness="0.1"/>', "<joint stiffness>"),
+    ("xml", HIP, f'{HIP} stiffness="1 2"', "<joint stiffness> of FL_hip"),
+    ("xml", FIRST_DRIVE, FIRST_DRIVE.replace("kp", 'armature="0.1" kp'), "<actuator armature> of FL_hip"),
+    ("xml", BALL, f'{BALL} surfacevel="1 0 0 0 0 0"', "<geom surfacevel> of FL_foot"),
+    ("xml", "</mujoco>", '<option actuatorgroupdisable="0"/></mujoco>', "disableactuator"),
+    ("xml", "</mujoco>", '<option><flag override="enable"/></option></mujoco>', "<flag override"),
     ("xml", 'pos="0.2 0.12 0"', 'pos="0.2 nan 0"', "position"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
     ("urdf", LIMIT, "", "FL_hip has no <limit>"),
+    ("urdf", LIMIT, f'{LIMIT}<mimic joint="tail"/>', "tail"),
     ("urdf", FIRST_MASS, '<mass value="0,8"/>', '<mass value="0,8" />'),
     ("urdf", FIRST_MASS, '<mass value="${m}"/>', "xacro"),
     ("urdf", 'effort="30"', 'effort="-30"', "effort"),
@@ -267,6 +287,29 @@ def test_the_digest_tells_models_apart(tmp_path):
     drives.unlink()
     with pytest.raises(ValueError, match=r"drives\.xml"):
         get_robot(str(file))
+
+
+ASSET = '<asset><mesh name="trunk" file="trunk.stl"/></asset>'
+OTHERS = '<asset><model name="toy" file="parts/toy.xml"/><texture name="t" type="2d" file="t.png"/></asset>'
+PLACES = {  # lines of the file, lines of parts/more.xml, where the mesh is
+    "meshdir of the file": ('<compiler meshdir="m"/>', ASSET, "m/trunk.stl"),
+    "meshdir of the part": (ASSET, '<compiler meshdir="m" strippath="true"/>', "m/trunk.stl"),
+    "beside the part": ("", ASSET, "parts/trunk.stl"),
+    "a part of the part": ("", f'{ASSET}<include file="parts/toy.xml"/>', "trunk.stl"),
+    "a model and a texture": (OTHERS, ASSET, "trunk.stl"),
+}
+
+
+@pytest.mark.parametrize(("own", "more", "mesh"), PLACES.values(), ids=PLACES)
+def test_the_parts_of_an_mjcf_lie_where_mujoco_looks(tmp_path, own, more, mesh):
+    texts = {"parts/more.xml": f"<mujoco>{more}</mujoco>", "parts/toy.xml": '<mujoco model="toy"><worldbody/></mujoco>'}
+    for name, content in ({name: text.encode() for name, text in texts.items()} | {mesh: stl(TRUNK)}).items():
+        (tmp_path / "dog" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "dog" / name).write_bytes(content)
+    imsave(tmp_path / "dog" / "t.png", np.zeros((2, 2, 3)))
+    text = mjcf(trunk='type="mesh" mesh="trunk"').replace(MESH, f'{own}<include file="parts/more.xml"/>')
+    packed = pack_robot(get_robot(str(write_dog(tmp_path / "dog", model=text))))
+    assert robot_spec(packed.unpacked(tmp_path / "there")).compile().nmesh == 1
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.robots.compiled import robot_spec
+from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.find import get_robot
 from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, mjcf, urdf, write_dog
 from tests.sim.plain_mujoco import on_plane, to_c
@@ -53,6 +53,8 @@ SPELLINGS = {
                                (' kp="60" kv="2" forcerange="-30 30"/>', "/>")),
     "settotalmass": swap(('autolimits="true"', 'autolimits="true" settotalmass="24"')),
     "springdamper": swap(('armature="0.01"', 'armature="0.01" springdamper="0.2 1"')),
+    "a base with a brake": swap(('<freejoint name="root"/>', '<joint type="free" damping="2" frictionloss="5" '
+                                                             'armature="0.3"/>')),
     "springs and friction": swap(('armature="0.01"', 'armature="0.01" stiffness="9" springref="0.2" damping="0.7" '
                                                      'frictionloss="0.4"')),
     "frames": in_frames(),
@@ -75,7 +77,7 @@ SPELLINGS = {
 
 
 def in_mujoco(robot):
-    """The robot's file in MuJoCo C, as long as :func:`told` is flown: joint angles [rad], and its mass [kg]."""
+    """The robot's file in MuJoCo C, as long as :func:`told` is flown: place [m], joint angles [rad]; its mass [kg]."""
     spec = mujoco.MjSpec.from_file(str(robot.model_file))
     option = spec.option
     option.timestep, option.integrator, option.tolerance = DT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-8
@@ -87,7 +89,8 @@ def in_mujoco(robot):
         data.ctrl[model.actuator(name).id] = angle + OFF
     for _ in range(STEPS):
         mujoco.mj_step(model, data)
-    return data.qpos[[int(model.joint(name).qposadr[0]) for name in JOINTS]], float(model.body_subtreemass[0])
+    joints = [int(model.joint(name).qposadr[0]) for name in JOINTS]
+    return data.qpos[[0, 1, 2, *joints]], float(model.body_subtreemass[0])
 
 
 def told(robot, device, off):
@@ -109,7 +112,7 @@ def test_a_file_flies_as_in_mujoco(tmp_path, device, text):
     assert sim.model.body_mass.numpy().sum() == pytest.approx(mass, rel=1e-6)
     for _ in range(STEPS):
         sim.physics_step()
-    np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], expected, atol=1e-3)
+    np.testing.assert_allclose(np.delete(sim.joint_q.numpy()[0], range(3, 7)), expected, atol=1e-3)
 
 
 FREE_GAINS = GAINS.replace("effort_limit=(30.0,) * 8,", "")
@@ -179,6 +182,24 @@ def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
         sim.physics_step()
     hip, knee = sim.joint_q.numpy()[0, 7:9]
     assert hip == pytest.approx(0.8, abs=0.1) and knee == pytest.approx(-2.0 * hip + 0.1, abs=0.03)
+
+
+WORLD = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="trunk"/></joint>'
+URDFS = {
+    "a turned inertia": ('<origin xyz="0 0 -0.07"/>', '<origin xyz="0 0 -0.07" rpy="0.4 0.3 0.2"/>'),
+    "lines for MuJoCo": ('"dog">', '"dog"><mujoco><compiler fusestatic="true" meshdir="m"/><size njmax="9"/></mujoco>'),
+    "a world": ('"dog">', f'"dog">{WORLD}'),
+}
+
+
+@pytest.mark.parametrize(("old", "new"), URDFS.values(), ids=URDFS)
+def test_a_link_of_a_urdf_turns_as_in_mujoco(tmp_path, old, new):
+    text = re.sub("<visual>.*?</visual>", "", urdf()).replace(old, new, 1)
+    robot = get_robot(str(write_dog(tmp_path, **KINDS["urdf"] | {"model": text})))
+    bodies = [model.body("FL_thigh") for model in (robot_spec(robot).compile(), mujoco.MjModel.from_xml_string(text))]
+    axes = [rotation_matrix(body.iquat) for body in bodies]
+    own, expected = (turn @ np.diag(body.inertia) @ turn.T for turn, body in zip(axes, bodies, strict=True))
+    np.testing.assert_allclose(own, expected, atol=1e-9)
 
 
 def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
