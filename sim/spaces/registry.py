@@ -53,8 +53,8 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     By the hash of its code in the record, code that has moved is known.
     """
     base, kinds = split_name(name)
-    root, at, height = base.rpartition("@")
-    lower = at and root in SPACES and _HEIGHT.fullmatch(height)
+    root, _, height = base.rpartition("@")
+    lower = root in SPACES and _HEIGHT.fullmatch(height)
     space = at_height(SPACES[root], float(height)) if lower else SPACES.get(base) or _find_loaded(base, sha256)
     if kinds and space.ground:
         raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
@@ -65,11 +65,11 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
     """A space at a height [m], or, without one, at the height that fits the robot; says so if that is not its own."""
     if height is not None:
         return at_height(space, height)
-    _, _, fits = split_name(fitting_space(robot) or "")[0].rpartition("@")
-    if not _HEIGHT.fullmatch(fits) or "@" in space.name or is_own(space.name):
+    fits = MOST_HEIGHT * share_of_height(get_space(fitting_space(robot) or SUPER_GAUSSIAN.name))
+    if fits == MOST_HEIGHT or "@" in space.name or is_own(space.name):
         return space
-    print(f"Heights up to {float(fits):g} m, as of the penalty scales of {robot.name} (--height says otherwise).")
-    return at_height(space, float(fits))
+    print(f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} (--height says otherwise).")
+    return at_height(space, fits)
 
 
 def at_height(space: TerrainSpace, height: float) -> TerrainSpace:

@@ -1,5 +1,7 @@
 """What `faultline check` says of robots and controllers."""
 
+import json
+
 import pytest
 
 from qd.check import check, made_ready
@@ -7,6 +9,7 @@ from qd.commands import Check
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot, read_penalty_scales
+from sim.spaces.registry import get_space, space_at
 from tests.qd.robots import Robots
 from tests.qd.stand_in import compute_by
 from tests.sim.dogs import CONTROLLER, write_dog, write_toml
@@ -51,3 +54,8 @@ def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monk
     changed = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
     assert len(read_penalty_scales(changed)) == len(robot.penalties) and changed.speed == 0.5
     assert capsys.readouterr().out.count("measured first") == 2
+    scales = json.loads(robot.scales_file.read_text()) | {"space": "super_gaussian@0.06"}
+    robot.scales_file.write_text(json.dumps(scales))
+    asked = {"course@0.06": ("course", None), "course@0.1": ("course@0.1", None), "course@0.2": ("course", 0.2)}
+    for expected, (name, height) in asked.items():
+        assert space_at(get_space(name), height, robot).name == expected
