@@ -18,6 +18,11 @@ from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 OBSERVATIONS, ACTIONS = 235, 12
 
 
+def rows_of(*shape: int) -> torch.Tensor:
+    """Random observation rows of ANYmal."""
+    return torch.randn((*shape, OBSERVATIONS), generator=torch.Generator().manual_seed(1))
+
+
 def free_port() -> int:
     """A port of this host that nobody listens on."""
     with socket.socket() as probe:

@@ -89,7 +89,7 @@ class OnnxLayers(torch.nn.Module):
             self._nodes.append((_LAYERS[node.op_type], [*node.input], [*node.output], given))
         self._names = list(constants)
         weights = [torch.tensor(numpy_helper.to_array(tensor)) for tensor in constants.values()]
-        self.weights = torch.nn.ParameterList(weights).requires_grad_(False)
+        self.weights = torch.nn.ParameterList(torch.nn.Parameter(weight, requires_grad=False) for weight in weights)
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""

@@ -16,7 +16,7 @@ from sim.policy.loaders import load_policy, prepare_torch
 from sim.policy.runner import PolicyRunner
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.terrain import NUM_COLS, NUM_ROWS
-from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor, save_checkpoint
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
 
 OURS = """{term = "lin_vel", scale = 2.0}, {term = "ang_vel", scale = 0.25}, {term = "gravity"},
   {term = "command", scale = [2, 2, 0.25]}, {term = "joint_pos"}, {term = "joint_vel", scale = 0.05},
@@ -40,19 +40,14 @@ def describe(tmp_path):
 def seen_by(describe, anymal):
     """What a network sees of rows, step after step, that answers with ``output`` of each; robots begin at the first."""
 
-    def run(steps, terms, *lines, robot=anymal, output=lambda seen, n: torch.zeros(len(seen), n)):
-        policy, seen = Described(read_controller(describe(terms, *lines)), robot, "it"), []
-        policy.use(lambda rows: (seen.append(rows[: len(steps[0])]), output(rows, policy.num_actions))[1], wp_cpu)
+    def run(steps, terms, *lines, output=lambda seen, n: torch.zeros(len(seen), n)):
+        policy, seen = Described(read_controller(describe(terms, *lines)), anymal, "it"), []
+        policy.use(lambda rows: seen.append(rows) or output(rows, policy.num_actions), torch.device("cpu"))
         policy.reset(torch.ones(len(steps[0]), dtype=torch.bool))
         actions = [policy(step) for step in steps]
         return torch.stack(seen), torch.stack(actions)
 
-    wp_cpu = torch.device("cpu")
     return run
-
-
-def rows_of(count, seed=0):
-    return torch.randn(count, OBSERVATIONS, generator=torch.Generator().manual_seed(seed))
 
 
 def test_the_shipped_controller_is_the_same_described(anymal, describe):
@@ -249,10 +244,3 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
 def test_what_is_not_understood_is_named(anymal, remembering, describe, terms, line, named):
     with pytest.raises(ValueError, match=rf"(?s)controller\.toml.*{named}|{named}"):
         load_policy(describe(terms, line), anymal, "cpu")
-
-
-def test_a_robot_with_fewer_joints_moved_holds_the_others(anymal, seen_by):
-    robot = replace(anymal, default_joint_pos=tuple(range(12)))
-    _, actions = seen_by([torch.zeros(2, OBSERVATIONS)], '{term = "gravity"}', 'joints = ["RH_KFE"]', robot=robot,
-                         output=lambda rows, n: torch.ones(len(rows), n))  # fmt: skip
-    np.testing.assert_array_equal(actions[0], [[0.0] * 11 + [0.5 / robot.action_scale]] * 2)

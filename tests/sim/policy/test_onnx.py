@@ -12,14 +12,9 @@ from sim.policy.loaders import load_checkpoint, load_policy
 from sim.policy.mlp import MlpPolicy
 from sim.policy.onnx import export_onnx, load_onnx
 from sim.policy.runner import PolicyRunner, is_graph_safe
-from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 
 FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
-
-
-def layer(observations=OBSERVATIONS, actions=ACTIONS):
-    weight = np.random.default_rng(3).normal(size=(actions, observations)).astype(np.float32) / 10
-    return weight, np.linspace(-1, 1, actions, dtype="f4")
 
 
 def port(name, shape, kind=FLOAT):
@@ -33,21 +28,27 @@ def graph_model(nodes, inputs, outputs, weights=()):
 
 def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
     """One layer, as a foreign exporter would write it: other names than ours."""
-    weight, offset = layer(observations, actions)
+    weight = np.random.default_rng(3).normal(size=(actions, observations)).astype(np.float32) / 10
+    offset = np.linspace(-1, 1, actions, dtype="f4")
     weights = [numpy_helper.from_array(weight, "w"), numpy_helper.from_array(offset if bias is None else bias, "b")]
     node = helper.make_node("Gemm", ["obs", "w", "b"], ["actions"], transB=1)
     ports = [port("obs", [batch, columns or observations])], [port("actions", [batch, columns or actions])]
     return graph_model([node], *ports, weights)
 
 
-def chain(last):
-    """As mujoco_playground's exporter: normalised, a layer with swish, one with mean and spread, for one robot."""
+def chain(last, bound=False):
+    """As mujoco_playground's exporter: normalised, a layer with swish, one with mean and spread, for one robot.
+
+    With ``bound`` a node of it knows that there is one.
+    """
     rng = np.random.default_rng(5)
     width = OBSERVATIONS
     shapes = {"mean": width, "factor": width, "w0": (width, 16), "b0": 16, "w1": (16, 24), "b1": 24}
     weights = {name: rng.normal(size=shape).astype(np.float32) / 5 for name, shape in shapes.items()}
+    weights["size"] = np.array([1, width])
     steps = (
-        "Sub obs mean > centred", "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
+        "Reshape obs size > raw" if bound else "Identity obs > raw", "Sub raw mean > centred",
+        "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
         "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
     )  # fmt: skip
     words = [(before.split(), after.split()) for before, after in (step.split(" > ") for step in steps)]
@@ -60,10 +61,6 @@ def chain(last):
 def save(path, model):
     path.write_bytes(model if isinstance(model, bytes) else model.SerializeToString())
     return path
-
-
-def rows_of(count):
-    return torch.randn(count, OBSERVATIONS, generator=torch.Generator().manual_seed(1))
 
 
 @pytest.mark.filterwarnings("ignore:policy.*runs on the CPU")
@@ -95,6 +92,13 @@ def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_pat
         assert torch.equal(torch.cat([policy(part) for part in rows_of(60).split(size)]), together), size
 
 
+def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
+    with pytest.warns(UserWarning, match=r"bound\.onnx.*one robot after the other"):
+        bound = load_policy(save(tmp_path / "bound.onnx", chain("Tanh", bound=True)[0]), anymal, "cpu")
+    known = load_policy(save(tmp_path / "free.onnx", chain("Tanh")[0]), anymal, "cpu")
+    torch.testing.assert_close(bound(rows_of(7)), known(rows_of(7)), rtol=1e-4, atol=1e-4)
+
+
 MODELS = {
     "another robot's rows": linear(48),
     "another robot's rows, of unknown width": linear(48, columns="columns"),
@@ -106,6 +110,11 @@ MODELS = {
     ),
     "two inputs": graph_model(
         [helper.make_node("Sum", ["a", "b"], ["c"])], [port(name, ["n", 12]) for name in "ab"], [port("c", ["n", 12])]
+    ),
+    "no state that comes out": graph_model(
+        [helper.make_node("Identity", [name], [name + "_x"]) for name in ("obs", "h_in")],
+        [port("obs", ["n", OBSERVATIONS]), port("h_in", [1, "n", 3])],
+        [port("obs_x", ["n", OBSERVATIONS]), port("h_in_x", [1, "n", 3])],
     ),
     "no graph": graph_model([], [], []),
     "half a file": linear().SerializeToString()[:-9],

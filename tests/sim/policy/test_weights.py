@@ -1,25 +1,15 @@
 """Weights of other people's training: checkpoints of every rsl_rl, networks that remember, graphs of one robot."""
 
-import numpy as np
-import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
 from rsl_rl.models import RNNModel
 from tensordict import TensorDict
 
 from sim.policy.loaders import load_policy
-from sim.policy.mlp import MlpPolicy
-from sim.policy.onnx import export_onnx, load_onnx
 from sim.policy.runner import memory_of
-from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 
 ACTOR = rsl_rl_actor(normalised=True).state_dict()
-SIZES = OBSERVATIONS, ACTIONS
-
-
-def rows_of(*shape):
-    return torch.randn((*shape, OBSERVATIONS), generator=torch.Generator().manual_seed(1)) * 2
 
 
 def renamed(**names):
@@ -156,46 +146,7 @@ def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
             policies[kind] = load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
     assert memory_of(policies["plain"]) == "none"
     assert memory_of(policies["averages"]) == "reset(rows)"
-    layer, rows = Exported("plain").layer, rows_of(4)
+    rows = rows_of(4)
     torch.manual_seed(0)
     layer = Exported("plain").layer
     torch.testing.assert_close(policies["averages"](rows), layer(rows / 2).detach(), rtol=1e-4, atol=1e-5)
-
-
-def one_robot(path, *, reshaped):
-    """An exported perceptron whose batch is 1; with ``reshaped`` a node of it knows that too."""
-    policy = MlpPolicy(ACTOR)
-    export_onnx(policy, path)
-    model = onnx.load(path)
-    for port in (*model.graph.input, *model.graph.output):
-        port.type.tensor_type.shape.dim[0].dim_value = 1
-    if reshaped:
-        model.graph.initializer.append(numpy_helper.from_array(np.array([1, OBSERVATIONS]), "shape"))
-        model.graph.node.insert(0, helper.make_node("Reshape", ["raw", "shape"], ["observation"]))
-        model.graph.input[0].name = "raw"
-    path.write_bytes(model.SerializeToString())
-    return policy
-
-
-def test_a_graph_of_one_robot_runs_any_number(tmp_path, anymal):
-    policy, rows = one_robot(tmp_path / "free.onnx", reshaped=False), rows_of(7)
-    expected = policy(rows).detach()
-    torch.testing.assert_close(load_policy(tmp_path / "free.onnx", anymal, "cpu")(rows), expected, rtol=1e-4, atol=1e-4)
-    one_robot(tmp_path / "bound.onnx", reshaped=True)
-    with pytest.warns(UserWarning, match=r"bound\.onnx.*one robot after the other"):
-        bound = load_policy(tmp_path / "bound.onnx", anymal, "cpu")
-    torch.testing.assert_close(bound(rows), expected, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("names", [("h_in", "state"), ("time_step", "h_out")])
-def test_a_graph_with_ports_of_unknown_meaning_is_refused_by_their_names(tmp_path, names):
-    def port(name, *shape):
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-
-    nodes = [helper.make_node("Identity", ["obs"], ["act"]), helper.make_node("Identity", [names[0]], [names[1]])]
-    graph = helper.make_graph(nodes, "it", [port("obs", "n", 12), port(names[0], 1, "n", 3)],
-                              [port("act", "n", 12), port(names[1], 1, "n", 3)])  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    (tmp_path / "it.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(ValueError, match=rf"it\.onnx.*{names[0]}.*{names[1]}"):
-        load_onnx(tmp_path / "it.onnx", (12, 12), "cpu")
