@@ -1,7 +1,6 @@
 """Marks of the elites that a controller was trained on, so that it is not tested on them."""
 
 import hashlib
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,9 +39,7 @@ def recorded_marks(policy: str) -> set[str]:
 def _content_of(file: Path) -> dict[str, Any]:
     """What a file of weights holds; nothing of another kind of file."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of TorchScript files, which have none
-            content = read_weights(file)
+        content = read_weights(file)
     except Exception:  # another kind of file, which has no marks
         return {}
     return content if isinstance(content, dict) else {}

@@ -55,10 +55,12 @@ def prepare_torch(device: str) -> None:
 def read_weights(path: Path) -> Any:
     """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
 
-    It raises anything if the file is damaged, foreign, or holds code.
+    It raises a ValueError if the file is damaged, and anything if it is foreign or holds code.
     """
     check_zip(path)
-    return torch.load(path, map_location="cpu", weights_only=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of TorchScript files
+        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
@@ -185,13 +187,9 @@ def load_network(
 
         return load_onnx(path, sizes, device)
     try:
-        check_zip(path)
+        content = read_weights(path)
     except ValueError as error:
         raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back") from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns of TorchScript files
-            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         return _load_script(path, device, sizes, error)
     state = _actor_state(content, path)
