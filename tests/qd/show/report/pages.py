@@ -11,7 +11,6 @@ from qd.archive import read_archive
 from qd.run.settings import as_settings, preset
 from qd.show.report import report
 from sim.files.atomic import to_json
-from sim.files.records import robot_digest
 from sim.robots.find import get_robot
 from tests.builders import fresh_values, small_archive, write_run
 from tests.qd.recordings import stand_in_cross
@@ -19,18 +18,12 @@ from tests.qd.show.test_figures import rows
 
 
 def grouped_archive(sizes=(6, 9, 5)):
-    """Elites of three kinds, far apart: stuck with the first penalty, collided with the second, across with both."""
-    kinds, archive = np.repeat(np.arange(3), sizes), small_archive(sum(sizes))
-    shares, noise = np.array([0.9, 0.1, 0.5])[kinds], np.random.default_rng(0).uniform(-0.01, 0.01, len(kinds))
+    """Elites of three kinds: robots get stuck, collide, and arrive."""
     return dataclasses.replace(
-        archive,
-        robot_sha256=robot_digest(get_robot("anymal")),
-        ratios=np.column_stack([shares + noise, 1.0 - shares - noise]),
-        goal_rate=(kinds == 2).astype(float),
-        collision_rate=(kinds == 1).astype(float),
-        fallen_rate=np.zeros(len(kinds)),
-        fitness=np.linspace(9.0, 1.0, len(kinds)),
-        cell=np.arange(len(kinds)) % archive.cells.num_cells,
+        small_archive(sum(sizes)),
+        goal_rate=np.repeat([0.0, 0.0, 1.0], sizes),
+        collision_rate=np.repeat([0.0, 1.0, 0.0], sizes),
+        fallen_rate=np.zeros(sum(sizes)),
     )
 
 
