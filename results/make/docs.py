@@ -236,9 +236,31 @@ def packs() -> str:
     return table({name: name for name in files["ANYmal C"]["rates"]}, columns)
 
 
+def public_controllers() -> str:
+    """Published controllers of others: how they walk, and what breaks them."""
+    named = {"go2-robot-lab": "Go2, robot_lab", "go2-himloco": "Go2, HIMLoco", "go1-playground": "Go1, Playground",
+             "g1-unitree": "G1, unitree_rl_gym"}  # fmt: skip
+    numbers = read("results/public.json").get("controllers", {})
+
+    def beside(part: str, ways: Sequence[str], key: str | None, form: str) -> Callable[[Any], str]:
+        return lambda one: " / ".join(format(one[part][way][key] if key else one[part][way], form) for way in ways)
+
+    columns: dict[str, Column] = {
+        "level ground: speed [m/s], here / in MuJoCo C": beside("flat", ("searched", "mujoco_c"), "speed", ".3f"),
+        "level ground: share that reaches the goal": beside("flat", ("searched", "mujoco_c"), "goal", ".2f"),
+        "heights up to [m]": lambda one: one["space"].partition("@")[2] or "0.25",
+        "hard-random: reach the goal, here / finer / MuJoCo C, finer":
+            beside("agreement", ("searched", "resolved", "mujoco_c"), None, ".2f"),
+        **{name.replace("_", " "): name for name in ("episodes", "elites", "corrected_elites", "failing", "confirmed",
+                                                     "faults")},
+        "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
+    }  # fmt: skip
+    return table({words: numbers[name] for name, words in named.items() if name in numbers}, columns, upright=True)
+
+
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
     archives, archive_details, training, goals, collisions, beside_paper, methods, hardening, spaces, sizes, agreement,
-    minimal, packs)}  # fmt: skip
+    minimal, packs, public_controllers)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:

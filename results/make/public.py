@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from PIL import Image
@@ -25,8 +25,9 @@ from qd.show.crossed import title_of, typical_episode
 from qd.show.elites import open_run
 from qd.show.film import Shot, pictures_of
 from qd.show.replay import source_of_run
-from qd.workers.cross import Crossings
+from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
+from results.make.common import agreement, crossing_rates
 from results.make.pictures import FOLDER
 from results.make.spaces import COUNTS, causes_of
 from sim.device import resolve_device
@@ -34,6 +35,7 @@ from sim.files.atomic import write_atomically
 from sim.files.records import provenance, sources_sha256
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
+from sim.spaces.registry import SUPER_GAUSSIAN, load_space
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
@@ -81,9 +83,11 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         fill_in(home / "controller.toml", of_controller)
         fill_in(home / "robot.toml", of_robot)
     robot = made_ready(get_robot(str(home / "robot.toml")), None, compute)
+    space = fitting_space(robot) or SUPER_GAUSSIAN.name
     with Crossings(robot, compute, cache=runs / "crossings") as crossings:
         walked = walk(crossings, str(robot.policy_file), seed)
-    cfg = preset("small" if small else "wide", robot, None, space=fitting_space(robot) or "super_gaussian")
+        agreed = agree(crossings, space, seed, 1 if small else 40)
+    cfg = preset("small" if small else "wide", robot, None, space=space)
     began = time.perf_counter()
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
     wall_s = time.perf_counter() - began
@@ -93,7 +97,28 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         archive = judge(run, stages=("others",), compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
     counts = {count: summary.get(count) for count in COUNTS}
-    return {"flat": walked, "space": cfg.space, **counts, "wall_s": wall_s, "causes": causes_of(archive)}
+    return {
+        "flat": walked,
+        "agreement": agreed,
+        "space": space,
+        **counts,
+        "wall_s": wall_s,
+        "causes": causes_of(archive),
+    }
+
+
+def agree(crossings: Crossings, space: str, seed: int, terrains: int) -> dict[str, Any]:
+    """Mean goal rates on hard-random terrains by physics, and how far ours, resolved, lies from MuJoCo C, resolved."""
+    genes, ways = load_space(space).hard_random(terrains, seed + 1), get_args(How)
+    seeds, policy = np.arange(terrains, dtype=np.uint32), str(crossings.robot.policy_file)
+    outcome = {
+        how: crossings.cross(
+            policy, genes, seeds, replicas=10, space=space, how=how, label=f"hard-random, {how}"
+        ).outcome
+        for how in ways
+    }
+    rates = {how: float(np.nanmean(crossing_rates(of_way, "goal"))) for how, of_way in outcome.items()}
+    return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 
 def take_picture(name: str, runs: Path) -> None:
