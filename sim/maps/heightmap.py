@@ -71,13 +71,8 @@ def read_heightmap(
     terrain also ``friction`` and ``time_constant_s``, as :class:`sim.ground.GroundMaps` has them. A ``.png`` is
     8 or 16-bit grayscale seen from above, x to the right and y up; height = offset + scale * gray level. What is not
     given here is taken from the npz, or from the keys ``size_m``, ``scale_m`` and ``offset_m`` of a JSON of the same
-    name beside the image; without an offset it is 0.
-
-    Args:
-        path: The file.
-        size_m: Along x and along y.
-        scale_m: Metres a gray level; heights of an npz are multiplied by it too, if it is given.
-        offset_m: Height of gray level 0; added to the heights of an npz, if it is given.
+    name beside the image; without an offset it is 0. Sizes are along x and along y; a given scale and offset are of the
+    heights of an npz too.
     """
     path = Path(path)
     if not os.path.isfile(path):  # False too for a name that no file can have

@@ -32,12 +32,12 @@ from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ran
 from sim.crossing import resolved as with_contact_resolved
 from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
+    NO_SOFTNESS,
     Array,
     Starts,
     crossing_model,
     goal_commands,
     observations,
-    refuse_softness,
     step_penalties,
     to_mujoco,
 )
@@ -157,16 +157,8 @@ def cross(
 ) -> RolloutResult:
     """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
 
-    It tells neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
-
-    Args:
-        robot: Robot settings.
-        policy: The controller.
-        heights: Height grid [m], shape (nrow, ncol).
-        starts: Initial states.
-        cfg: The crossing.
-        time_constant_s: Contact time constant [s]; that of the robot's file if None.
-        ground: Friction and softness of this one terrain.
+    It does not tell why an episode is invalid. Heights are those of one terrain [m], shape (nrow, ncol), and so is its
+    ground; the contact time constant is that of the robot's file if None.
     """
     cfg = cfg or CrossingCfg()
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
@@ -259,7 +251,7 @@ def cross_terrains(
     """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
 
     Args:
-        robot: Robot settings, those of the search.
+        robot: As in the search.
         policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
         terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
         seeds: One a terrain, uint32.
@@ -272,8 +264,8 @@ def cross_terrains(
     Yields:
         The number of each terrain with its crossings, as they are done.
     """
-    if terrains.ndim == 2:
-        refuse_softness(space)
+    if terrains.ndim == 2 and "softness" in space.ground:  # before any work
+        raise ValueError(NO_SOFTNESS)
     robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
     heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
     with _process_pool(robot, policy, processes) as pool:

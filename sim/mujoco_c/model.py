@@ -20,7 +20,6 @@ from sim.ground import PATCHES, GroundMaps
 from sim.maps.hfield import Margins, as_hfield
 from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
@@ -106,18 +105,11 @@ def crossing_model(
     return model
 
 
-_NO_SOFTNESS = (
+NO_SOFTNESS = (
     "plain MuJoCo cannot have soft ground that is not level, since a foot that sinks into its heightfield is pushed "
     "aside by the facets beside it: leave MuJoCo C out, or +softness"
 )
-
-
-def refuse_softness(space: TerrainSpace) -> None:
-    """Refuses, before any work, a space whose ground is soft."""
-    if "softness" in space.ground:
-        raise ValueError(_NO_SOFTNESS)
-
-
+"""Why spaces of soft ground are refused."""
 _GROUND = "ground"
 _DEPTH = 2.0  # of a level patch [m]
 
@@ -186,7 +178,7 @@ def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]
         part = heights[patch.rows, patch.cols]
         if np.ptp(part) > 0.0:
             if patch.time_constant_s:
-                raise ValueError(_NO_SOFTNESS)
+                raise ValueError(NO_SOFTNESS)
             low = SPACING * patch.cols.start, SPACING * patch.rows.start
             data.append(_add_field(spec, part, number, low, patch.margin))
             continue

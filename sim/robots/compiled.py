@@ -58,9 +58,7 @@ class RobotFile:
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
 
-    Args:
-        robot: Robot settings; what they say of gains, torque limits, armature and contact counts.
-        visuals: Whether a URDF keeps what it shows of its links.
+    What these say of gains, torque limits, armature and contact counts. With ``visuals`` a URDF keeps what it shows.
     """
     of_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, of_file):
@@ -110,6 +108,13 @@ def joint_names(model: Any) -> tuple[str, ...]:
 def touching_geoms(*bodies: Any) -> list[Any]:
     """Geoms of bodies that touch the ground, body by body."""
     return [geom for body in bodies for geom in body.geoms if geom.contype or geom.conaffinity]
+
+
+def mesh_of(model: Any, geom: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices [m] and faces of a compiled geom that is a mesh, shapes (num_vertices, 3) and (num_faces, 3)."""
+    mesh = model.mesh(model.geom_dataid[geom])
+    vertices, faces = model.mesh_vert[int(mesh.vertadr[0]) :], model.mesh_face[int(mesh.faceadr[0]) :]
+    return vertices[: int(mesh.vertnum[0])], faces[: int(mesh.facenum[0])]
 
 
 def _of_urdf(root: ET.Element) -> Any:
@@ -335,18 +340,16 @@ class _Drives:
                 self._add(model, k, joint, kind, where)
 
     def _add(self, model: Any, k: int, joint: int, kind: str, where: str) -> None:
-        gear = abs(float(model.actuator_gear[k, 0]))
+        gear, gain, limits = abs(float(model.actuator_gear[k, 0])), model.actuator_gainprm[k, 0], [self.effort[joint]]
         if model.actuator_forcelimited[k]:
-            most = gear * self._least(model.actuator_forcerange[k], f"forcerange {where}")
-            self.effort[joint] = min(self.effort[joint], most)
+            limits.append(gear * self._least(model.actuator_forcerange[k], f"forcerange {where}"))
         if kind == "position":
-            self.stiffness[joint], self.damping[joint] = model.actuator_gainprm[k, 0], -model.actuator_biasprm[k, 2]
+            self.stiffness[joint], self.damping[joint] = gain, -model.actuator_biasprm[k, 2]
         if model.actuator_ctrllimited[k] and kind == "position":
             self.control[joint] = model.actuator_ctrlrange[k]
         elif model.actuator_ctrllimited[k]:
-            most = gear * abs(model.actuator_gainprm[k, 0])
-            most *= self._least(model.actuator_ctrlrange[k], f"ctrlrange {where}")
-            self.effort[joint] = min(self.effort[joint], most)
+            limits.append(gear * abs(gain) * self._least(model.actuator_ctrlrange[k], f"ctrlrange {where}"))
+        self.effort[joint] = min(limits)
 
     def _least(self, span: NDArray[np.float64], what: str) -> float:
         if span[0] != -span[1]:

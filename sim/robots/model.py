@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec, rotation_matrix
+from sim.robots.compiled import mesh_of, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -136,9 +136,7 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
     """Adds a shape that touches the ground."""
     kind, source, scale = _GEOM(int(model.geom_type[geom])), None, model.geom_size[geom]
     if kind == _GEOM.mjGEOM_MESH:
-        mesh = model.mesh(model.geom_dataid[geom])
-        vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
-        faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
+        vertices, faces = mesh_of(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)
     builder.add_shape(
         body=int(model.geom_bodyid[geom]) - 1,

@@ -113,12 +113,9 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
 
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
     point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
-    the nearest angle that a joint can take. The contact force limit is the weight.
-
-    Args:
-        given: What the file says, one value a joint where a setting is of joints.
-        file: The robot.toml, of whose folder the robot has its name; a controller.toml beside it says its scan.
-        of_file: What the model's file says.
+    the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
+    ``file``, the robot.toml; a controller.toml beside it says the scan. ``given`` has one value a joint where a setting
+    is of joints.
     """
     model = of_file.model
     low, high = model.jnt_range[1:].T

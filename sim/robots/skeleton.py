@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec, touching_geoms
+from sim.robots.compiled import mesh_of, robot_spec, touching_geoms
 from sim.robots.robot import RobotCfg
 
 _mj: Any = mujoco  # its types are not written down
@@ -132,10 +132,7 @@ class Skeleton:
         model = self.model
         kind, size = int(model.geom_type[geom]), model.geom_size[geom]
         if kind == _KIND.mjGEOM_MESH:
-            mesh = model.mesh(model.geom_dataid[geom])
-            vertices = model.mesh_vert[int(mesh.vertadr[0]) :][: int(mesh.vertnum[0])]
-            faces = model.mesh_face[int(mesh.faceadr[0]) :][: int(mesh.facenum[0])]
-            shape = trimesh.Trimesh(vertices, faces, process=False)
+            shape = trimesh.Trimesh(*mesh_of(model, geom), process=False)
         else:
             shape = trimesh.graph.smooth_shade(_primitive(kind, size), angle=_CREASE)
         transform = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])  # w x y z too

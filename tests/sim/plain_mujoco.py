@@ -7,14 +7,13 @@ from sim.mujoco_c.model import crossing_model
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 
-def on_plane(robot, quat_wxyz=(1, 0, 0, 0), *, time_constant_s=None) -> mujoco.MjModel:
-    """The robot on an infinite plane through (8, 4, 0), in place of the heightfield."""
-    model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), time_constant_s=time_constant_s)
+def on_plane(robot, quat_wxyz=(1, 0, 0, 0)) -> mujoco.MjModel:
+    """The robot on an infinite plane through (8, 4, 0), as MuJoCo has level ground."""
+    model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS)))
     ground = model.geom("ground").id
-    model.geom_type[ground], model.geom_dataid[ground], model.geom_rbound[ground] = mujoco.mjtGeom.mjGEOM_PLANE, -1, 0.0
-    model.geom_size[ground], model.geom_pos[ground] = (0.0, 0.0, 0.05), (8.0, 4.0, 0.0)
-    model.geom_quat[ground], model.geom_sameframe[ground] = quat_wxyz, 0  # else MuJoCo keeps the frame of its body
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the heightfield
+    model.geom_pos[ground], model.geom_quat[ground] = (8.0, 4.0, 0.0), quat_wxyz
+    model.geom_sameframe[ground] = 0  # else MuJoCo keeps the frame of its body
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the level ground
     return model
 
 

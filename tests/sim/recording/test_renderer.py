@@ -1,7 +1,5 @@
 """Pictures: the ground lies where it is, painted by its height, and the robot stands on it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -110,11 +108,3 @@ def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
         (stepping, [0, 1], [2]),
     ):
         assert pixels(picture, strong, weak) > pixels(alone, strong, weak) + 40
-
-
-def test_a_file_without_the_robots_joints_is_named(anymal, tmp_path):
-    file = tmp_path / "body.xml"
-    file.write_text("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
-    robot = dataclasses.replace(anymal, model_file=file, base_geoms=(), limb_geoms=(), foot_geoms=())
-    with pytest.raises(ValueError, match="LF_HAA"):
-        scene_model(robot, np.zeros((NUM_ROWS, NUM_COLS)), width=8, height=8)
