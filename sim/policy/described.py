@@ -2,7 +2,7 @@
 
 import math
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -117,11 +117,8 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
 
 def text_of(cfg: ControllerCfg) -> str:
     """The description as TOML, which :func:`read_controller` reads."""
-
-    def given(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-        return {name: value for name, value in values if value is not None}
-
-    return "".join(f"{name} = {to_toml(value)}\n" for name, value in asdict(cfg, dict_factory=given).items())
+    given = asdict(cfg, dict_factory=lambda items: {name: value for name, value in items if value is not None})
+    return "".join(f"{name} = {to_toml(value)}\n" for name, value in given.items())
 
 
 class _Memory(NamedTuple):

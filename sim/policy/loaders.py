@@ -235,7 +235,7 @@ def _actor_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
             f"policy '{path}' has more than a perceptron or a recurrent network: {', '.join(unknown)} are not "
             "understood; export it as TorchScript or ONNX"
         )
-    normaliser = {f"obs_normalizer.{key}": value for key, value in content.get("obs_norm_state_dict", {}).items()}
+    normaliser = {f"obs_normalizer.{key}": value for key, value in (content.get("obs_norm_state_dict") or {}).items()}
     return {names[key]: value for key, value in state.items()} | normaliser
 
 
