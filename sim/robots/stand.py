@@ -237,7 +237,7 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
         f"{standing.joint_error:.3f} rad off; its weight is on {carried}",
         f"Dropped on rough ground: at most {standing.contacts:.1f} contacts a robot on average (nconmax "
         f"{robot.nconmax}) and {standing.rows} constraint rows (njmax {robot.njmax})",
-        *mistakes,
-        "It stands." if standing.stands else falls,
+        *(mistakes or [falls] * (not standing.stands)),
+        *["It stands."] * standing.stands,
     ]
     return "\n".join(lines), not mistakes

@@ -40,7 +40,7 @@ def test_what_has_to_be_mended_is_named(tmp_path, device, change, parts):
     robot = dataclasses.replace(get_robot(str(write_dog(tmp_path, **KINDS["urdf"]))), **change)
     text, fine = describe_standing(robot, stand(robot, device=device, seconds=1.5, drops=2))
     mended = "\n".join(line for line in text.splitlines() if line.startswith("To mend"))
-    assert not fine and all(part in mended for part in parts)
+    assert not fine and all(part in mended for part in parts) and "biped" not in text
 
 
 def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
