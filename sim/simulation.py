@@ -16,7 +16,7 @@ from kernels.restart import clear_rows
 from sim.bank import TerrainBank
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.robots.compiled import robot_spec
-from sim.robots.model import builder_of, geom_names
+from sim.robots.model import builder_of
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.solver import dynamics_of, use_own_solver
@@ -170,7 +170,7 @@ class Simulation:
         if self.bank.ground is not None:
             self._build_ground(geom_of_shape[first_shape:].reshape(self.num_envs, -1))
         column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
-        for shape, name in enumerate(geom_names(builder)):
+        for shape, name in enumerate(builder.shape_label):
             if name in self.robot.geom_names:  # a mesh of several parts is several shapes of one name
                 column_of_geom[geom_of_shape[first_shape + shape]] = self.robot.geom_names.index(name)
         self.column_of_geom = wp.array(column_of_geom, dtype=int)

@@ -66,7 +66,8 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
     check_identity(content, robot, robot.scales_file, remedy)
     scales = content.get("scales")
     scales = scales if isinstance(scales, dict) else {}
-    missing = [name for name in robot.penalties if not _is_positive(scales.get(name))]
+    missing = [name for name in robot.penalties if type(scales.get(name)) not in (int, float)
+               or not 0.0 < scales[name] <= sys.float_info.max]  # fmt: skip
     if missing:
         raise ValueError(f"{robot.scales_file} holds no positive scale for {', '.join(missing)}: {remedy}")
     return tuple(float(scales[name]) for name in robot.penalties)
@@ -88,7 +89,3 @@ def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
     if measured.get("policy_sha256") in (None, controller_hash(policy)):
         return None
     return f"Penalties are scaled by those of {measured.get('policy')}, with which {robot.scales_file} was measured."
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, int | float) and value is not True and 0.0 < value <= sys.float_info.max

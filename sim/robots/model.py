@@ -21,11 +21,6 @@ _RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
 _vec2: Any = wp.vec2
 
 
-def geom_names(builder: newton.ModelBuilder) -> list[str]:
-    """Names of a robot's collision shapes."""
-    return list(builder.shape_label)
-
-
 def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
     """One robot as a Newton builder, ready to be replicated into worlds.
 

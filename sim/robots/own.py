@@ -147,8 +147,7 @@ def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[f
     data: Any = mujoco.MjData(model)  # type: ignore
     data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), pose
     mujoco.mj_kinematics(model, data)  # type: ignore
-    names = [model.geom(k).name for k in range(model.ngeom)]
-    numbers = [names.index(name) for name in feet if name in names]
+    numbers = [k for k in range(model.ngeom) if model.geom(k).name in feet]
     reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
     return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
 

@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from kernels.contact import Probes
 from sim.crossing import CrossingCfg
 from sim.device import host_device
-from sim.robots.model import geom_names
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
@@ -338,7 +337,7 @@ def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str
         body, shape, radius = (
             np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("body", "shape", "radius")
         )
-        points, names = probes.position.numpy(), np.array(geom_names(builder))[shape]
+        points, names = probes.position.numpy(), np.array(builder.shape_label)[shape]
         for pose in poses:
             state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
             newton.eval_fk(model, state.joint_q, state.joint_qd, state)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim.bank import TerrainBank, heights_of
 from sim.crossing import CAPACITY_OVERFLOWS
-from sim.robots.model import build_robot, geom_names
+from sim.robots.model import build_robot
 from sim.robots.probes import extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
@@ -158,7 +158,7 @@ def describe_model(robot: RobotCfg) -> str:
         joints.append((name, f"{angle:.3f}", span, f"{kp:g}", f"{kd:g}", most, *passive, *limits))
     geoms = [("geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]")]
     numbers_of = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
-    for k, name in enumerate(geom_names(builder)):
+    for k, name in enumerate(builder.shape_label):
         geom, kind = int(numbers_of[k]), newton.GeoType(builder.shape_type[k]).name.lower()
         role = next((role for role in ("base", "foot", "limb") if name in getattr(robot, f"{role}_geoms")), "-")
         size = " ".join(f"{length:.3g}" for length in model.geom_size[geom][: _SIZES_OF.get(kind, 3)])

@@ -17,7 +17,7 @@ from sim.mujoco_c.crossing import cross, draw_starts
 from sim.policy.adapters import read_row
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot, read_penalty_scales
-from sim.robots.model import build_robot, geom_names
+from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
@@ -249,7 +249,7 @@ def test_geoms_without_a_name_are_called_by_their_body_and_shown_so(tmp_path):
     file = write_dog(tmp_path, model=re.sub(r'name="\w+_thigh" (?=type)', "", mjcf()))
     replace_once(file, '("thigh", "shank")', '("thigh_geom_0", "shank")')
     dog = get_robot(str(file))
-    assert "HR_thigh_geom_0" in geom_names(build_robot(dog)) and Skeleton(dog).model.geom("HR_thigh_geom_0")
+    assert "HR_thigh_geom_0" in build_robot(dog).shape_label and Skeleton(dog).model.geom("HR_thigh_geom_0")
 
 
 def test_the_digest_tells_models_apart(tmp_path):
@@ -316,7 +316,7 @@ def test_a_robot_travels_with_its_files(tmp_path, anymal, kind):
     assert tmp_path / "there" in unpacked.model_file.parents
     builder = build_robot(unpacked)
     assert sum(builder.body_mass) == pytest.approx(MASS) and robot_digest(unpacked) == digest
-    trunk = geom_names(builder).index("trunk")
+    trunk = builder.shape_label.index("trunk")
     assert builder.shape_type[trunk] == newton.GeoType.MESH
     positions, radii = probes_of(builder, trunk)
     np.testing.assert_allclose((np.abs(positions) + radii[:, None]).max(axis=0), TRUNK, atol=0.01)
@@ -329,13 +329,13 @@ def test_a_urdf_is_the_same_robot_as_its_mjcf(tmp_path):
     assert other.body_count == 9  # a trunk and four legs of two parts: feet are of their shanks
     assert sum(other.body_mass) == pytest.approx(MASS)
     assert one.joint_label[1:] == other.joint_label[1:] == list(JOINTS)
-    assert {*geom_names(one)} == {*geom_names(other)}
+    assert {*one.shape_label} == {*other.shape_label}
     joints = ("target_ke", "target_kd", "armature", "limit_lower", "limit_upper")
     for name in ("body_mass", "body_com", "body_inertia", *(f"joint_{name}" for name in joints)):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
     for geom in ("trunk", "FL_thigh", "HR_foot"):  # a capsule tag of a URDF has its length without the caps
         for name in ("shape_type", "shape_body", "shape_scale", "shape_transform"):
-            of_one, of_other = (getattr(builder, name)[geom_names(builder).index(geom)] for builder in both)
+            of_one, of_other = (getattr(builder, name)[builder.shape_label.index(geom)] for builder in both)
             np.testing.assert_allclose(np.array(of_one), np.array(of_other), atol=1e-6, err_msg=f"{geom} {name}")
 
 
@@ -360,6 +360,6 @@ def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
     assert builder.body_mass[0] == pytest.approx(8.0)
     np.testing.assert_allclose(builder.body_com[0], [0, 0, 0.05], atol=1e-6)
     np.testing.assert_allclose(np.reshape(builder.body_inertia[0], (3, 3)).diagonal(), [0.2, 0.03, 0.2], rtol=1e-5)
-    pose = builder.shape_transform[geom_names(builder).index("trunk")]
+    pose = builder.shape_transform[builder.shape_label.index("trunk")]
     np.testing.assert_allclose(pose[:3], [0, 0, 0.05], atol=1e-6)
     np.testing.assert_allclose(oracle.rotation_matrix(np.array(pose[3:]))[:, 0], [0, 1, 0], atol=1e-6)

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from sim.robots.model import build_robot, geom_names
+from sim.robots.model import build_robot
 from sim.robots.probes import (
     MAX_MESH_PROBES,
     MAX_SAG,
@@ -124,7 +124,7 @@ def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     builder = build_robot(robot)
     probes = make_probes(builder)
     shapes, bodies, starts = (getattr(probes, f"strip_{name}").numpy() for name in ("shape", "body", "start"))
-    assert [geom_names(builder)[shape] for shape in shapes] == geom_names(builder)  # once: no cylinders, no boxes
+    assert [builder.shape_label[shape] for shape in shapes] == builder.shape_label  # once: no cylinders, no boxes
     np.testing.assert_array_equal(bodies, np.array(builder.shape_body)[shapes])
     if robot.name == "cassie":
         # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m.

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from sim.robots.find import get_robot
-from sim.robots.model import build_robot, geom_names
+from sim.robots.model import build_robot
 from sim.robots.skeleton import Skeleton
 from tests.kernels import oracle
 from tests.kernels.states import random_states
@@ -42,7 +42,7 @@ def test_shapes_stand_where_the_simulation_has_them(tmp_path, kind):
     robot = get_robot(str(with_mesh(tmp_path, kind)) if kind in KINDS else kind)
     skeleton, rows, builder = Skeleton(robot), np.float64(random_states(3, robot.num_joints)[0]), build_robot(robot)
     positions, quaternions = skeleton.body_poses(rows)
-    names = geom_names(builder)
+    names = builder.shape_label
     with wp.ScopedDevice("cpu"):
         model = builder.finalize()
         state = model.state()
