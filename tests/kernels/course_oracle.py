@@ -3,8 +3,6 @@
 import numpy as np
 
 NODES = 20  # a metre
-CUT = {"ramp": 16, "cross_slope": 30, "sill": 1, "rail": 0, "pallet": 16, "ditch": 2, "bridge": 16, "stones": 20,
-       "rubble": 16}  # fmt: skip
 RANGES = {
     "flat": [(0, 0), {"whole": (0, 60)}, (0, 0), (0, 0)],
     "ramp": [(1 / 12, 1 / 3), {"whole": (16, 48)}, (0, 0), (-1, 1)],
@@ -95,7 +93,7 @@ def patch_of(kind, size, length, detail, turn, room):
         return None
     faces = 2 if kind in ("sill", "rail", "pallet") else 0
     length = min(length, room - faces)
-    if length < CUT[kind]:
+    if length < RANGES[kind][1]["whole"][0]:
         return None
     patch = np.zeros((161, length + faces + 1))
     inside, y = patch[:, 1:-1], np.arange(161) / NODES - 4

@@ -96,7 +96,16 @@ def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, pat
             f"{' '.join(str(std).split())}: leave it out, or give another controller"
         )
     if critic is not None:
-        _check_critic(critic, (robot.observation_size, *hidden, 1), path)
+        expected = {}
+        for k, (width, out) in enumerate(pairwise((robot.observation_size, *hidden, 1))):
+            expected |= {f"mlp.{2 * k}.weight": (out, width), f"mlp.{2 * k}.bias": (out,)}
+        tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
+        shapes = {key: tuple(value.shape) for key, value in critic.items()} if tensors else {}
+        if shapes != expected or not all(bool(value.isfinite().all()) for value in critic.values()):
+            raise ValueError(
+                f"{path}: critic_state_dict must have finite weights and the actor's hidden layers {list(hidden)}, got "
+                "others: leave it out of the file, and a critic is trained"
+            )
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
 
 
@@ -144,16 +153,3 @@ def plain_layers(network: Any, place: str) -> MlpPolicy:
         f"finetune needs a network of plain layers with one kind of activation, got another in {place}: give an rsl_rl "
         "checkpoint or its TorchScript as the description's policy"
     )
-
-
-def _check_critic(critic: Any, sizes: tuple[int, ...], path: Path) -> None:
-    expected = {}
-    for k, (width, out) in enumerate(pairwise(sizes)):
-        expected |= {f"mlp.{2 * k}.weight": (out, width), f"mlp.{2 * k}.bias": (out,)}
-    tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
-    shapes = {key: tuple(value.shape) for key, value in critic.items()} if tensors else {}
-    if shapes != expected or not all(bool(value.isfinite().all()) for value in critic.values()):
-        raise ValueError(
-            f"{path}: critic_state_dict must have finite weights and the actor's hidden layers {list(sizes[1:-1])}, "
-            "got others: leave it out of the file, and a critic is trained"
-        )

@@ -114,7 +114,12 @@ class Progress:
         self._window = []
         if learner.ranks.is_first:
             self._print(row)
-            scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in _scalars_of(row).items()]
+            groups = {"train": {name: value for name, value in row.items() if not isinstance(value, dict)}}
+            groups |= {name: values for name, values in row.items() if isinstance(values, dict)}
+            scalars = [
+                Summary.Value(tag=f"{group}/{name}", simple_value=value)
+                for group, values in groups.items() for name, value in values.items() if value is not None
+            ]  # fmt: skip
             _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
 
     def _print(self, row: dict[str, Any]) -> None:
@@ -129,14 +134,6 @@ class Progress:
         )
         if row["ends"]["invalid"] or row["overflows"]:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
-
-
-def _scalars_of(row: dict[str, Any]) -> dict[str, float]:
-    scalars = {f"train/{name}": value for name, value in row.items() if not isinstance(value, dict)}
-    for group, values in row.items():
-        if isinstance(values, dict):
-            scalars |= {f"{group}/{name}": value for name, value in values.items()}
-    return {tag: value for tag, value in scalars.items() if value is not None}
 
 
 def _write_event(file: Path, event: Event) -> None:
