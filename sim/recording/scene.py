@@ -56,12 +56,7 @@ def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None
 
 
 def scene_model(
-    robot: RobotCfg,
-    heights: NDArray[np.floating],
-    *,
-    width: int,
-    height: int,
-    ground: GroundMaps | None = None,
+    robot: RobotCfg, heights: NDArray[np.floating], *, width: int, height: int, ground: GroundMaps | None = None
 ) -> Any:
     """The model of a scene: the robot's file and its height grid [m], shape (nrow, ncol), in world-local coordinates.
 

@@ -22,11 +22,7 @@ PHYSICS_DT = 0.005
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 GAINS = {
     "anymal": ([80] * 12, [2] * 12, [80] * 12),
-    "cassie": (
-        [100, 100, 200, 200, 200, 40] * 2,
-        [3, 3, 6, 6, 6, 1] * 2,
-        [112, 112, 195, 195, 195, 45] * 2,
-    ),
+    "cassie": ([100, 100, 200, 200, 200, 40] * 2, [3, 3, 6, 6, 6, 1] * 2, [112, 112, 195, 195, 195, 45] * 2),
 }
 """Stiffness [N m/rad] and damping [N m s/rad] (legged_gym's), and limit of effort [N m] (published), joint by joint."""
 ONLY_ANYMAL = pytest.mark.parametrize("robot", ["anymal"], indirect=True)

@@ -26,11 +26,6 @@ EPISODES = 3
 FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
 
-@pytest.fixture(scope="module")
-def heights():
-    return np.float32(0.3) * np.sin(np.arange(NUM_COLS) / 9.0, dtype=np.float32) * np.ones((NUM_ROWS, 1), np.float32)
-
-
 def test_starts_are_those_of_the_rollout(robot):
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
     rollout.put(SUPER_GAUSSIAN.hard_random(1, 5), np.array([77], np.uint32))
@@ -42,7 +37,8 @@ def test_starts_are_those_of_the_rollout(robot):
     np.testing.assert_array_equal(starts.qvel[:EPISODES], expected.qvel)
 
 
-def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(robot, heights):
+def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(robot):
+    heights = np.random.default_rng(6).uniform(-0.2, 0.2, FLAT.shape).astype(np.float32)
     model = crossing_model(robot, heights)
     ground = model.geom("ground").id
     assert model.geom_solmix[ground] == 0.0
@@ -52,10 +48,9 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     fine = crossing_model(robot, heights, time_constant_s=0.003)
     assert (fine.geom_solref == [0.003, 1.0]).all() and (model.geom_solref[:, 0] > 0.003).all()
     # The surface, between the nodes too, edge heights continued beyond it: what a ray from above meets.
-    heights = heights + np.random.default_rng(6).uniform(-0.1, 0.1, heights.shape).astype(np.float32)
     points = [(3.03, 2.2), (8.0, 4.0), (12.31, 7.9), (17.5, 9.5), (-1.5, -1.5), (5.025, 3.025), (6.01, 4.04)]
     far = [0, 0, 50, 1, *np.zeros(3 + robot.num_joints)]
-    met, geoms = rays_from_above(crossing_model(robot, heights), points, far)
+    met, geoms = rays_from_above(model, points, far)
     assert (geoms == ground).all()
     np.testing.assert_allclose(met, [oracle.surface_height(heights, SPACING, *point) for point in points], atol=1e-5)
 
@@ -67,9 +62,7 @@ def test_plain_mujoco_takes_any_robot_that_the_search_takes(tmp_path):
     assert model.geom("trunk").conaffinity[0] == 0 and model.geom("ground").conaffinity[0] == 1
     # A URDF says nothing of contact: friction 1, the time constant of the shipped robots.
     given = KINDS["urdf"] | {"more": f"{GAINS}\n    friction=0.6,\n    contact_time_constant_s=0.02,"}
-    for number, (kind, contact) in enumerate(
-        (({}, [0.8, 0.01]), (KINDS["urdf"], [1.0, 0.01]), (given, [0.6, 0.02])),
-    ):
+    for number, (kind, contact) in enumerate((({}, [0.8, 0.01]), (KINDS["urdf"], [1.0, 0.01]), (given, [0.6, 0.02]))):
         model = crossing_model(get_robot(str(write_dog(tmp_path / str(number), **kind))), FLAT)
         of_robot = model.geom_bodyid > 0
         assert model.nu == 8 and of_robot.sum() == 13

@@ -22,21 +22,7 @@ from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
-from tests.kernels import oracle
-from tests.sim.dogs import (
-    DRIVE,
-    GAINS,
-    JOINTS,
-    KINDS,
-    MASS,
-    TRUNK,
-    mjcf,
-    stl,
-    urdf,
-    with_mesh,
-    write_dog,
-    write_toml,
-)
+from tests.sim.dogs import DRIVE, JOINTS, KINDS, MASS, TRUNK, mjcf, stl, with_mesh, write_dog, write_toml
 from tests.sim.scenes import FLAT, crossing
 
 
@@ -345,21 +331,3 @@ def probes_of(builder, shape):
     counts = np.diff(probes.strip_start.numpy())
     on_shape = np.repeat(probes.strip_shape.numpy(), counts) == shape
     return probes.position.numpy()[on_shape], np.repeat(probes.strip_radius.numpy(), counts)[on_shape]
-
-
-def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
-    # As many URDFs have it: an empty root, here 5 cm under the trunk and turned by a quarter about the vertical.
-    mount = (
-        '<robot name="dog"><link name="base"/><joint name="mount" type="fixed"><parent link="base"/>'
-        '<child link="trunk"/><origin xyz="0 0 0.05" rpy="0 0 1.5707963"/></joint>'
-    )
-    file = write_dog(tmp_path, model=urdf().replace('<robot name="dog">', mount), suffix="urdf", more=GAINS)
-    replace_once(file, "0.29", "0.24")
-    builder = build_robot(get_robot(str(file)))
-    assert builder.body_count == 9 and builder.body_label[0].endswith("base")
-    assert builder.body_mass[0] == pytest.approx(8.0)
-    np.testing.assert_allclose(builder.body_com[0], [0, 0, 0.05], atol=1e-6)
-    np.testing.assert_allclose(np.reshape(builder.body_inertia[0], (3, 3)).diagonal(), [0.2, 0.03, 0.2], rtol=1e-5)
-    pose = builder.shape_transform[builder.shape_label.index("trunk")]
-    np.testing.assert_allclose(pose[:3], [0, 0, 0.05], atol=1e-6)
-    np.testing.assert_allclose(oracle.rotation_matrix(np.array(pose[3:]))[:, 0], [0, 1, 0], atol=1e-6)

@@ -9,13 +9,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from sim.robots.model import build_robot
-from sim.robots.probes import (
-    MAX_MESH_PROBES,
-    MAX_SAG,
-    hull_probes,
-    make_probes,
-    shape_strips,
-)
+from sim.robots.probes import MAX_MESH_PROBES, MAX_SAG, hull_probes, make_probes, shape_strips
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2.0
 

@@ -184,6 +184,11 @@ def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
     assert hip == pytest.approx(0.8, abs=0.1) and knee == pytest.approx(-2.0 * hip + 0.1, abs=0.03)
 
 
+def of_urdf(folder, text, more=GAINS):
+    """A URDF as simulations have it, compiled."""
+    return robot_spec(get_robot(str(write_dog(folder, model=text, suffix="urdf", more=more)))).compile()
+
+
 WORLD = '<link name="world"/><joint name="root" type="floating"><parent link="world"/><child link="trunk"/></joint>'
 URDFS = {
     "a turned inertia": ('<origin xyz="0 0 -0.07"/>', '<origin xyz="0 0 -0.07" rpy="0.4 0.3 0.2"/>'),
@@ -195,11 +200,26 @@ URDFS = {
 @pytest.mark.parametrize(("old", "new"), URDFS.values(), ids=URDFS)
 def test_a_link_of_a_urdf_turns_as_in_mujoco(tmp_path, old, new):
     text = re.sub("<visual>.*?</visual>", "", urdf()).replace(old, new, 1)
-    robot = get_robot(str(write_dog(tmp_path, **KINDS["urdf"] | {"model": text})))
-    bodies = [model.body("FL_thigh") for model in (robot_spec(robot).compile(), mujoco.MjModel.from_xml_string(text))]
+    bodies = [m.body("FL_thigh") for m in (of_urdf(tmp_path, text), mujoco.MjModel.from_xml_string(text))]
     axes = [rotation_matrix(body.iquat) for body in bodies]
     own, expected = (turn @ np.diag(body.inertia) @ turn.T for turn, body in zip(axes, bodies, strict=True))
     np.testing.assert_allclose(own, expected, atol=1e-9)
+
+
+def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
+    # As many URDFs have it: an empty root, here 5 cm under the trunk and turned by a quarter about the vertical.
+    mount = (
+        '<robot name="dog"><link name="base"/><joint name="mount" type="fixed"><parent link="base"/>'
+        '<child link="trunk"/><origin xyz="0 0 0.05" rpy="0 0 1.5707963"/></joint>'
+    )
+    model = of_urdf(tmp_path, urdf().replace('<robot name="dog">', mount))
+    base, trunk = model.body("base"), model.geom("trunk")
+    assert model.nbody == 1 + 9 and base.mass[0] == pytest.approx(8.0) and trunk.bodyid == base.id == 1
+    axes = rotation_matrix(base.iquat)
+    np.testing.assert_allclose(axes @ np.diag(base.inertia) @ axes.T, np.diag([0.2, 0.03, 0.2]), atol=1e-6)
+    for place in (base.ipos, trunk.pos):
+        np.testing.assert_allclose(place, [0, 0, 0.05], atol=1e-6)
+    np.testing.assert_allclose(rotation_matrix(trunk.quat)[:, 0], [0, 1, 0], atol=1e-6)
 
 
 def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
@@ -209,10 +229,7 @@ def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
         'ixz="0" iyz="0"/></inertial></link><joint name="mount" type="fixed"><parent link="trunk"/>'
         '<child link="camera"/><origin xyz="1 0 0"/></joint></robot>'
     )
-    without, with_camera = (
-        robot_spec(get_robot(str(write_dog(tmp_path / name, **KINDS["urdf"] | {"model": text})))).compile()
-        for name, text in (("plain", urdf()), ("camera", urdf().replace("</robot>", camera)))
-    )
+    without, with_camera = (of_urdf(tmp_path, text) for text in (urdf(), urdf().replace("</robot>", camera)))
     mass = without.body_mass[1]
     assert with_camera.nbody == without.nbody and with_camera.body_mass[1] == pytest.approx(mass + 0.5)
     assert with_camera.body_ipos[1, 0] == pytest.approx(0.5 / (mass + 0.5))
@@ -222,14 +239,12 @@ def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
 
 
 def test_a_motors_inertia_in_a_link_of_a_urdf_is_the_joints_armature(tmp_path):
-    text, plain = urdf(), robot_spec(get_robot(str(write_dog(tmp_path / "plain", **KINDS["urdf"])))).compile()
+    text, plain = urdf(), of_urdf(tmp_path, urdf())
     shank = re.search(r'<link name="FL_shank">.*?<inertia [^>]*/>', text, re.S)[0]
     own = re.search(r'iyy="([^"]*)"', shank)[1]
     more = text.replace(shank, shank.replace(f'iyy="{own}"', f'iyy="{float(own) + 0.02}"'))
-    kind = KINDS["urdf"] | {"model": more, "more": GAINS.replace("armature=(0.01,) * 8,", "")}
-    model = robot_spec(get_robot(str(write_dog(tmp_path / "more", **kind)))).compile()
-    dof = int(model.joint("FL_knee").dofadr[0])
-    body = int(model.jnt_bodyid[model.joint("FL_knee").id])
+    model = of_urdf(tmp_path, more, GAINS.replace("armature=(0.01,) * 8,", ""))
+    dof, body = int(model.joint("FL_knee").dofadr[0]), model.body("FL_shank").id
     turned = [m.body_inertia[body].sum() + m.dof_armature[dof] for m in (plain, model)]
     assert 0.019 < model.dof_armature[dof] < 0.02 + 1e-4
     assert turned[1] == pytest.approx(turned[0] - plain.dof_armature[dof] + 0.02, rel=1e-6)
