@@ -137,7 +137,8 @@ def _mjcf_files(model_file: Path) -> list[Path]:
         named = sorted(map(Path, mj.mju_getXMLDependencies(os.path.abspath(model_file))))
     except mj.FatalError as error:
         raise ValueError(f"{model_file} cannot be read by MuJoCo: {error}") from None
-    home, folders = os.path.abspath(model_file.parent), [file.parent for file in named if file.suffix == ".xml"]
+    home = os.path.abspath(model_file.parent)
+    folders = [file.parent for file in named if file.suffix in (".xml", ".mjcf")]
     files = [model_file]
     for file in named:
         places = [file, *(folder / os.path.relpath(file, home) for folder in folders)]
