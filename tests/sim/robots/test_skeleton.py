@@ -14,17 +14,13 @@ from tests.kernels.states import random_states
 from tests.sim.dogs import KINDS, with_mesh, write_dog
 
 
-@pytest.fixture(scope="module")
-def skeleton(robot):
-    return Skeleton(robot)
-
-
 def matrix_of(quaternion_wxyz):
     return oracle.rotation_matrix(np.roll(quaternion_wxyz, -1))
 
 
-def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot, skeleton):
+def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot):
     """No shape that collides is seen; each role shows its touch, feet by what is where they are."""
+    skeleton = Skeleton(robot)
     model, touches = skeleton.model, skeleton.touches
     assert {model.geom_bodyid[geom] - 1 for geom in touches} == set(range(skeleton.num_bodies))
     for column, name in enumerate(robot.geom_names):
