@@ -7,7 +7,6 @@ but what the network of Go1 sees, which its file does not say, is read from the 
 import argparse
 import json
 import shutil
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -88,21 +87,18 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         walked = walk(crossings, str(robot.policy_file), seed)
         agreed = agree(crossings, space, seed, 1 if small else 40)
     cfg = preset("small" if small else "wide", robot, None, space=space)
-    began = time.perf_counter()
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
-    wall_s = time.perf_counter() - began
     archive = judge(run, stages=("fresh",) if small else ("fresh", "resolved"), compute=compute, robot=robot.spec)
     if name == WITH_SPECIALIST and not small:
         train_specialist(robot, run, FinetuneCfg.specialist(robot), RunCfg(device=compute.device))
         archive = judge(run, stages=("others",), compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
-    counts = {count: summary.get(count) for count in COUNTS}
+    counts = {count: summary.get(count) for count in (*COUNTS, "wall_s")}
     return {
         "flat": walked,
         "agreement": agreed,
         "space": space,
         **counts,
-        "wall_s": wall_s,
         "causes": causes_of(archive),
     }
 
