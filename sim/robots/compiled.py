@@ -96,8 +96,8 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
 
 def _with_element(text: str, files: ModelFiles) -> str:
     """What MuJoCo says of a URDF with the element itself in place of its line, which is not that of the file."""
-    lines = ET.tostring(files.root, encoding="unicode").splitlines() if files.is_urdf else []
-    return re.sub(r"line (\d+)", lambda line: lines[int(line[1]) - 1].strip() if lines else line[0], text)
+    lines = dict(enumerate(ET.tostring(files.root, encoding="unicode").split("\n"), 1)) if files.is_urdf else {}
+    return re.sub(r"line (\d+)", lambda line: lines.get(int(line[1]), line[0]).strip(), text)
 
 
 def joint_names(model: Any) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
-from tests.sim.dogs import DRIVE, JOINTS, KINDS, MASS, TRUNK, mjcf, stl, with_mesh, write_dog, write_toml
+from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog, write_toml
 from tests.sim.scenes import FLAT, crossing
 
 
@@ -203,12 +203,8 @@ def test_a_mistake_in_settings_or_model_is_named(tmp_path, suffix, old, new, par
 
 def test_every_mistake_of_settings_and_model_is_named_at_once(tmp_path):
     file = write_dog(tmp_path)
-    for old, new in (
-        ("150.0", "-1"),
-        ("* 4", "* 3"),
-        ('"shank"', '"shin"'),
-        ('base_geoms=("trunk",)', "base_geoms=()"),
-    ):
+    wrong = {"150.0": "-1", "* 4": "* 3", '"shank"': '"shin"', 'base_geoms=("trunk",)': "base_geoms=()"}
+    for old, new in wrong.items():
         replace_once(file, old, new)
     replace_once(file.with_suffix(".xml"), HIP, f'{HIP} armature="-1"')
     with pytest.raises(ValueError, match=r"dog\.py") as raised:
@@ -217,20 +213,17 @@ def test_every_mistake_of_settings_and_model_is_named_at_once(tmp_path):
         assert part in str(raised.value)
 
 
-def test_effort_is_the_settings_or_the_urdfs(tmp_path):
-    file = write_dog(tmp_path, **KINDS["urdf"])
-    model = file.with_suffix(".urdf")
-    model.write_text(model.read_text().replace(' effort="30"', ""))
-    assert robot_spec(get_robot(str(file))).compile().actuator_forcerange[:, 1].tolist() == [30.0] * 8
-    replace_once(file, "effort_limit=(30.0,) * 8,", "")
-    with pytest.raises(ValueError, match="effort_limit"):
-        get_robot(str(file))
+NO_LIMIT = GAINS.replace("effort_limit=(30.0,) * 8,", "")
+LIMITLESS = {
+    "urdf": {"model": urdf().replace(' effort="30"', ""), "suffix": "urdf", "more": NO_LIMIT},
+    "motor": {"model": mjcf(drive=""), "more": f"{NO_LIMIT} saturation_effort=(9.0,) * 8, velocity_limit=(9.0,) * 8,"},
+}
 
 
-def test_a_dc_motor_needs_a_limit_of_effort(tmp_path):
-    more = "stiffness=(60.0,) * 8, damping=(2.0,) * 8, saturation_effort=(40.0,) * 8, velocity_limit=(20.0,) * 8,"
+@pytest.mark.parametrize("kind", LIMITLESS.values(), ids=LIMITLESS)
+def test_a_limit_of_effort_is_needed(tmp_path, kind):
     with pytest.raises(ValueError, match=r"no torque limit .* FL_hip"):
-        get_robot(str(write_dog(tmp_path, model=mjcf(drive=""), more=more)))
+        get_robot(str(write_dog(tmp_path, **kind)))
 
 
 def test_geoms_without_a_name_are_called_by_their_body_and_shown_so(tmp_path):
