@@ -13,6 +13,7 @@ from rich.text import Text
 
 from qd.run.settings import SearchCfg
 from qd.workers.invalid import WARNED_SHARE, reason_words
+from sim.policy.spec import SHIPPED
 
 _CELLS = 10  # of the bar
 _PLAIN_EVERY_S = 30.0
@@ -27,10 +28,10 @@ def clock(seconds: float) -> str:
 
 def describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
     """What a search is about to do after ``done`` iterations, by so many processes or GPUs."""
-    left = cfg.iterations - done
+    left, controller = cfg.iterations - done, "its own controller" if cfg.policy == SHIPPED else cfg.policy
     return (
         f"{path}: {left:,} of {cfg.iterations:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
-        f"{cfg.replicas} episodes of {cfg.robot} with the {cfg.policy} controller on {cfg.space}; in all "
+        f"{cfg.replicas} episodes of {cfg.robot} with {controller} on {cfg.space}; in all "
         f"{left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
         f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
     )

@@ -326,7 +326,7 @@ def _read_isaac_lab(source: Path, found: _Found) -> Path:
     lengths = [group.get("history_length") or term.get("history_length") or 1 for term in terms.values()]
     rows = [_isaac_term(name, term, env["scene"], order, found) for name, term in terms.items()]
     found.stack(rows, lengths)
-    found.put(observation=rows)
+    found.put(observation=rows, why="lin_vel is that of the base's centre of mass" * any("at" in row for row in rows))
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
     if agent.get("clip_actions") is not None:
         found.put(action_clip=agent["clip_actions"])
@@ -353,6 +353,7 @@ def _isaac_robot(env: dict[str, Any], found: _Found) -> None:
         known, drive = ("DelayedPDActuator", "PD gains with a limit") if name in ideal else ("DCMotor", "a DC motor")
         if kind not in ("", "ImplicitActuator", "IdealPDActuator", known):
             notes.append(f"{name} is a {kind}, simulated as {drive}")
+        notes += [f"the friction of {name} is left out: give their joints a frictionloss"] * bool(group.get("friction"))
         group |= _NO_MOTOR if name in ideal else {}
         moved = _chosen(group["joint_names_expr"], joints)
         for key, of_key in values.items():
@@ -360,11 +361,12 @@ def _isaac_robot(env: dict[str, Any], found: _Found) -> None:
             of_key |= zip(moved, per_joint(given, moved, f"{file}: {name}.{key}", partly=True), strict=True)
     for key, of_key in values.items():
         without = [joint for joint, value in of_key.items() if value is None]
-        asked = f"a gain of each joint: none is said of {', '.join(without)}"
+        said = ", ".join(f"{joint} {value}" for joint, value in of_key.items() if value is not None)
+        asked = f"a value of each joint{': ' * bool(said)}{said}; none is said of {', '.join(without)}"
         if not without:
             why = f"1e6 is that of an ideal drive, {', '.join(ideal)}" * bool(ideal and key in _NO_MOTOR)
             found.put(**{key: _one_of([*of_key.values()])}, why="; ".join(notes) if key == "stiffness" else why)
-        elif key in ("stiffness", "damping"):
+        elif said or key in ("stiffness", "damping"):
             found.put(**{key: None}, why="; ".join([asked, *notes]))
     delays = {name: (group.get("min_delay") or 0, group.get("max_delay") or 0) for name, group in groups.items()}
     if any(most for _, most in delays.values()):
@@ -425,7 +427,8 @@ def _isaac_term(
         what = f"{term['func']}{' with modifiers' if term.get('modifiers') else ''}"
         known = ", ".join(_ISAAC_TERMS)
         raise ValueError(f"{found.file} says what is not understood: observation {name}, {what}; only {known}")
-    row = _term(_ISAAC_TERMS[function], term.get("scale"), clip=term.get("clip"))
+    centre = found.model.body_ipos[1].round(5).tolist() if function == "base_lin_vel" else None
+    row = _term(_ISAAC_TERMS[function], term.get("scale"), clip=term.get("clip"), at=centre)
     if function in ("joint_pos_rel", "joint_vel_rel"):
         asset = params.get("asset_cfg") or {}
         joints = _chosen(asset.get("joint_names") or ".*", order, asset.get("preserve_order"))

@@ -142,7 +142,7 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
     """The controller in a file; with ``fits`` it must have the robot's sizes."""
     if path == robot.policy_file and not path.exists():
         raise ValueError(
-            f"robot '{robot.name}' has no shipped controller yet, expected at {path}: train one with "
+            f"robot '{robot.name}' has no controller of its own, expected at {path}: train one with "
             f"`{robot.train_command}`, or name another with --policy"
         )
     if path.suffix == ".toml" and path.is_file():

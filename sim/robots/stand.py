@@ -149,7 +149,7 @@ def describe_model(robot: RobotCfg) -> str:
         drive, (low, high), dof = drive_of.get(k), model.jnt_range[k], int(model.jnt_dofadr[k])
         kp, kd, effort = 0.0, 0.0, float(model.jnt_actfrcrange[k, 1])
         if drive is not None:
-            kp, kd = model.actuator_gainprm[drive, 0], -model.actuator_biasprm[drive, 2]
+            kp, kd = model.actuator_gainprm[drive, 0], 0.0 - model.actuator_biasprm[drive, 2]
             effort = min(effort, model.actuator_forcerange[drive, 1] if model.actuator_forcelimited[drive] else np.inf)
         most = "follows" if drive is None else f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
         span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[k] else "free"

@@ -67,7 +67,7 @@ def content_of(material: Material) -> dict[str, Any]:
     certifiers = () if archive.faults is None else archive.faults.certifiers
     return {
         "material": material,
-        "controller": "its shipped controller" if searched == SHIPPED else ControllerSpec.parse(searched).label,
+        "controller": "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label,
         "crosser": ControllerSpec.parse(material.policy).label,
         "place": without_machine(str(material.opened_run.path)),
         "summary": summary_of(ranking, archive),

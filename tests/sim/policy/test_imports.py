@@ -179,21 +179,24 @@ def test_a_run_of_isaac_lab_is_read(tmp_path):
 
 
 def test_motors_and_delays_of_isaac_lab_are_kept(tmp_path, capsys):
-    more = "saturation_effort: 25.0, min_delay: 1, max_delay: 6, damping: 0.5}\n      knees"
+    more = "saturation_effort: 25.0, min_delay: 1, max_delay: 6, armature: .01, friction: 1, damping: 0.5}\n      knees"
     robot, _ = imported(isaac_lab(tmp_path / "run", "damping: 0.5}\n      knees", more), tmp_path)
     # 1e6 N m at a speed limit of 1e6 rad/s are the knees' ideal drives.
     assert (robot.saturation_effort, robot.velocity_limit) == ((25.0, 1e6) * 4, (30.0, 1e6) * 4)
     assert robot.drive_delay_steps == 2  # (1 + 6 + 0 + 0) / 4 = 1.75
     lines = capsys.readouterr().out
     assert "a guess: the mean of the delays of hips (1 to 6)" in lines and "simulated as PD gains" not in lines
+    assert "# armature = ...  # fill in: a value of each joint: FL_hip 0.01" in lines  # of the knees nobody says it
+    assert "the friction of hips is left out" in lines
 
 
 def test_descriptors_say_the_order_of_joints(tmp_path):
-    run = isaac_lab(tmp_path / "run")
+    run = isaac_lab(tmp_path / "run", ":base_ang_vel", ":base_lin_vel")
     articulations = {"robot": {"joint_names": RIGHT_FIRST}}
     write_yaml(run / "exported" / "x_IO_descriptors.yaml", {"articulations": articulations})
     _, controller = imported(run, tmp_path)
     assert controller.joints == tuple(RIGHT_FIRST)
+    assert controller.observation[0].at == (0.0, 0.0, 0.0)  # the trunk's centre of mass
 
 
 def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
