@@ -51,12 +51,12 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
         walks = _walks(robot, walk(crossings, policy))
         if walks or anyway:
-            height = fitting_height(crossings, policy)
+            most, share = fitting_height(crossings, policy)
     if walks or anyway:
         doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
         dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=0)
-        stairs, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
-        print(f"Half get over a kerb {kerb}, stairs {stairs}; 80 % cross hard-random terrains at --height {height:g}.")
+        up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
+        print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
     return fine and walks
 
 

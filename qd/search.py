@@ -201,6 +201,9 @@ def say_what_stops_the_robot(
     say("Next: ", (view, "cyan"), ", ", (report, "cyan"), " or ", (replay, "cyan"))
     if archive.fresh is None:
         say((command_line("judge", **flags, policy=policy), "cyan"), " says which of them are faults.")
+    elif not (archive.faults and archive.faults.certifiers):
+        train = command_line("finetune", robot=robot, specialist=run, policy=policy, space=space)
+        say((train, "cyan"), " trains a controller to cross them: without another one no fault is known.")
 
 
 def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:

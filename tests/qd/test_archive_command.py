@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,9 +14,11 @@ from qd.archive import read_archive
 from qd.commands import Archive
 from qd.judge import judge
 from qd.run import settings
+from qd.search import say_what_stops_the_robot
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
+from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.searches import crossing_by
 
@@ -155,6 +158,8 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
         f"faultline replay {run} --elite {number} --policy {fine}"
     )
     assert judging.startswith(f"faultline judge {run} --policy {fine} ")
+    say_what_stops_the_robot(Path("a b"), replace(found, fresh=fresh_values(found)), policy=fine)
+    assert f"faultline finetune --specialist 'a b' --policy {fine} trains" in capsys.readouterr().out
 
 
 def test_code_runs_only_if_the_command_line_names_it(capsys):

@@ -72,10 +72,11 @@ def test_the_actor_begins_as_the_controller(robot, tmp_path):
     assert ends >= 3 and np.unique(torch.stack(done).numpy()).size > 100
 
 
-def test_it_learns_goes_on_and_crosses(robot, tmp_path):
+def test_it_learns_goes_on_and_crosses(robot, tmp_path, capsys):
     run, on_cpu = tmp_path / "run", RunCfg(device="cpu", export=tmp_path / "panel" / "mine.pt")
     for iterations in (2, 3):
         described = finetune(robot, cfg_of(robot, iterations=iterations), run, on_cpu)
+    assert f"written to {described} and" in capsys.readouterr().out
     assert described == run / "controller.toml" and read_checkpoint(run / "checkpoint.pt")["iter"] == 3
     assert read_controller(described) == replace(
         read_controller(robot.policy_file), policy="policy.pt", activation="swish"

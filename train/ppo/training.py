@@ -237,10 +237,11 @@ class Training:
         record = {**self.progress.record(), "averaged": learner.averaged, **self._facts}
         for path in (self._run_dir / POLICY, *([export] if export else [])):
             write_controller(path, learner, record)
+            written = path
             if learner.env.controller is not None:
-                description = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
-                write_atomically(description, text_of(replace(learner.env.controller, policy=path.name)).encode())
-            print(f"Controller and training record written to {path} and {path.with_suffix('.train.json').name}")
+                written = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
+                write_atomically(written, text_of(replace(learner.env.controller, policy=path.name)).encode())
+            print(f"Controller and training record written to {written} and {path.with_suffix('.train.json').name}")
 
 
 def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
