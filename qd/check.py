@@ -99,7 +99,7 @@ def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, 
     if file is None or file.suffix != ".toml":
         print(": write them into its settings.", flush=True)
         return wanted, standing
-    text = re.sub(r"^(njmax|nconmax)\s*=.*\n", "", file.read_text(), flags=re.MULTILINE)
+    text = re.sub(r"^(njmax|nconmax)\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
     write_atomically(file, f"njmax = {wanted.njmax}\nnconmax = {wanted.nconmax}\n{text}".encode())
     print(f", as {file} says now.", flush=True)
     return wanted, standing

@@ -39,7 +39,7 @@ class Archive(ControllerFlags, WorkerFlags):
 
     preset: str = "small"
     """Size of the search: wide (the default on a GPU), paper (the paper's), or small (the default on the CPU)."""
-    iterations: int = 20
+    iterations: PositiveInt = 20
     """Iterations to reach; with --resume, more than before extend a finished run."""
     seed: int = 0
     """Seed of everything drawn."""
@@ -53,7 +53,7 @@ class Archive(ControllerFlags, WorkerFlags):
     height: float | None = None
     """Lowers the terrains: the largest height of a bump [m], at most 0.25, and everything else alike. If left out, 0.25
     for shipped robots; for yours the height of the penalty scales: about 80 % of hard-random terrains are crossed."""
-    replicas: int = 4
+    replicas: PositiveInt = 4
     """Episodes a terrain."""
     method: str | None = None
     """Where terrains come from: surrogate (the default), cma_mae (the paper's), cma_me, map_elites, hard_random,
@@ -89,12 +89,15 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.search import say_what_stops_the_robot, search
         from qd.workers.evaluator import Compute
         from sim.robots.find import get_robot
-        from sim.spaces.registry import load_space, space_at
+        from sim.spaces.registry import at_height, load_space, space_at
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         if self.resume is None:
-            robot, policy = made_ready(get_robot(self.robot), self.policy, compute), None
-            space = space_at(load_space(self.space), self.height, robot)
+            robot, policy, space = get_robot(self.robot), None, load_space(self.space)
+            if self.height is not None:
+                space = at_height(space, self.height)
+            robot = made_ready(robot, self.policy, compute)
+            space = space_at(space, self.height, robot)
             cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
         elif self.run_dir:
             raise ValueError("--resume goes on with a run as it is, got --run-dir too: leave it out")

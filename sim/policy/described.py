@@ -151,6 +151,8 @@ class Described(torch.nn.Module):
             if isinstance(term.scale, tuple) and len(term.scale) != width:
                 self._refuse(f"observation[{k}].scale must be one number or {width}, got {len(term.scale)}")
             self._check_limits(f"observation[{k}].clip", term.clip)
+            for size in np.ravel(term.limit or 0.0):
+                self._check_limits(f"observation[{k}].limit", size)
         history = cfg.history
         self.lengths = [term.history or (history.length if history else 1) for term in cfg.observation]
         if max(self.lengths) > 1 and history is None:

@@ -16,7 +16,7 @@ from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.policy.loaders import activation_in, load_network, read_yaml
 from sim.robots.compiled import joint_names, read_robot_file
-from sim.robots.own import PER_JOINT, per_joint
+from sim.robots.own import NAME, PER_JOINT, per_joint
 from sim.robots.robot import RobotCfg
 
 _FILES = {
@@ -122,6 +122,8 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     """
     if taken := [str(out / name) for name in _FILES if (out / name).exists()]:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
+    if not re.fullmatch(NAME, out.resolve().name):
+        raise ValueError(f"--out must end in the robot's name, of letters, digits, . _ and -, got {out}")
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
     of_file = read_robot_file(model_file)
@@ -130,15 +132,22 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     kind, read = _reader_of(source)
     try:
         weights = read(source, found)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError, re.error) as error:
+        if isinstance(error, ValueError) and str(found.file) in str(error):
+            raise
         raise ValueError(f"{source} must be {kind}, but: {type(error).__name__}: {error}") from None
+    copy = out / weights.name
+    if copy.exists() and copy.read_bytes() != weights.read_bytes():
+        raise ValueError(
+            f"{copy} must be a copy of {weights}, or not be there, got other weights: move them away first"
+        )
     out.mkdir(parents=True, exist_ok=True)
     found.put(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights.name)
     print(f"{source} is read as {kind}; its weights are {weights}.")
     if found.unused:
         print(f"Not needed: {', '.join(found.unused)}.")
-    if not (out / weights.name).exists():
-        shutil.copyfile(weights, out / weights.name)
+    if not copy.exists():
+        shutil.copyfile(weights, copy)
     gaps = []
     for file, names in _FILES.items():
         given = [name for name in names if name in found.settings]
@@ -168,7 +177,7 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
         content = read_yaml(file)
         if "kps" in content:
             return "a deployment of unitree_rl_gym", _read_deployment
-        if len(content) == 1 and "observations" in (next(iter(content.values())) or ()):
+        if len(content) == 1 and isinstance(said := next(iter(content.values())), dict) and "observations" in said:
             return "a controller of rl_sar", _read_rl_sar
         raise ValueError(
             f"{file} must be of rl_sar (a name with observations, ...) or unitree_rl_gym (kps, kds, ...), or the run "
@@ -289,7 +298,10 @@ def _read_mjlab(source: Path, found: _Found) -> Path:
 
 def _read_weights(source: Path, found: _Found) -> Path:
     """Weights that say nothing but their widths."""
-    (width, count), place = _widths(source), found.imu()
+    network: Any = load_network(source, "cpu", None, of="it")
+    (width, count), place = _widths(network), found.imu()
+    if activation := getattr(getattr(network, "head", network), "activation", None):
+        found.put(activation=activation)
     asked = f"an angle of each joint [rad], its pose at action 0: {', '.join(found.joints)}"
     found.put(default_joint_pos=found.home, why="" if found.home else asked)
     if not found.model.nu or not found.model.actuator_biasprm[:, 1].any():
@@ -304,9 +316,8 @@ def _read_weights(source: Path, found: _Found) -> Path:
     return source
 
 
-def _widths(source: Path) -> tuple[int | None, int | None]:
+def _widths(network: Any) -> tuple[int | None, int | None]:
     """Columns and actions of a network, as far as it says them."""
-    network: Any = load_network(source, "cpu", None, of="it")
     if hasattr(network, "sizes"):
         return network.sizes
     for weight in network.parameters():
@@ -323,7 +334,8 @@ def _read_isaac_lab(source: Path, found: _Found) -> Path:
     order = _isaac_action(env["actions"], source, found)
     group = env["observations"]["policy"]
     terms = {name: term for name, term in group.items() if isinstance(term, dict)}
-    lengths = [group.get("history_length") or term.get("history_length") or 1 for term in terms.values()]
+    of_all = group.get("history_length")
+    lengths = [(term.get("history_length") if of_all is None else of_all) or 1 for term in terms.values()]
     rows = [_isaac_term(name, term, env["scene"], order, found) for name, term in terms.items()]
     found.stack(rows, lengths)
     found.put(observation=rows, why="lin_vel is that of the base's centre of mass" * any("at" in row for row in rows))

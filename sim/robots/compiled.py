@@ -88,10 +88,11 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
     problems = _structure_problems(model)
     if strange := strange + drives.problems:
         problems.append(f"{', '.join(strange)} cannot be simulated: take it out, or write it otherwise")
+    if len(home) not in (0, model.nq):
+        problems.append(f"qpos of the keyframe home must be {model.nq} numbers, got {len(home)}")
     if problems:
         raise ValueError("; ".join(f"{model_file}: {_with_element(problem, files)}" for problem in problems))
-    pose = home[7:] if len(home) == model.nq else None
-    return RobotFile(spec=spec, model=model, drives=drives, home=pose, is_urdf=files.is_urdf)
+    return RobotFile(spec=spec, model=model, drives=drives, home=home[7:] or None, is_urdf=files.is_urdf)
 
 
 def _with_element(text: str, files: ModelFiles) -> str:
@@ -214,6 +215,9 @@ def _keep_robot(spec: Any) -> list[str]:
         strange = [name for name, value in values.items() if np.any(value)]
         problems.extend(f"<{kind} {name}> of {part.name} ({part.info})" for name in strange)
 
+    from_geoms = spec.compiler.inertiafromgeom == _mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    lost = [body for body in spec.bodies if from_geoms and body.explicitinertial and not (body.joints or body.geoms)]
+    problems += [f'<inertial> of {body.name} ({body.info}) beside inertiafromgeom="true"' for body in lost]
     problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
     problems += [f"a flexible body ({flex.info})" for flex in spec.flexes]
     for body in spec.bodies:
@@ -221,6 +225,8 @@ def _keep_robot(spec: Any) -> list[str]:
         for number, geom in enumerate(touching_geoms(body)):
             geom.name = geom.name or f"{body.name}_geom_{number}"
             geom.contype, geom.conaffinity = 1, 0
+            if geom.type in (_mj.mjtGeom.mjGEOM_HFIELD, _mj.mjtGeom.mjGEOM_SDF):
+                problems.append(f"a height field or distance field as geom {geom.name} ({geom.info})")
             refuse("geom", geom, margin=geom.margin, gap=geom.gap, adhesion=geom.adhesion, surfacevel=geom.surfacevel)
         refuse("body", body, gravcomp=body.gravcomp, mocap=body.mocap)
         for joint in body.joints:

@@ -1,6 +1,7 @@
 """Robots of a user: load and check their settings file, pack them for another machine."""
 
 import itertools
+import math
 import os
 import re
 import tomllib
@@ -30,6 +31,8 @@ INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geom
 """Settings that a robot.toml may leave out though there is no default."""
 PER_JOINT = tuple(UNITS)
 """Settings that a robot.toml may give as one number, or as a table of joint names or regular expressions, too."""
+NAME = r"[A-Za-z0-9][\w.-]*"
+"""A robot's name, of which files and folders are made."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
 
 
@@ -67,7 +70,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file; an error names it."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from None
 
 
@@ -97,7 +100,10 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
         return value
     if not isinstance(value, dict):
         return [value] * len(joints)
-    matches = [[joint] if joint in value else [key for key in value if re.fullmatch(key, joint)] for joint in joints]
+    try:
+        matches = [[name] if name in value else [key for key in value if re.fullmatch(key, name)] for name in joints]
+    except re.error as error:
+        raise ValueError(f"{what} must have names or regular expressions, got {error.pattern!r}: {error}") from None
     idle = [key for key in value if not any(key in keys for keys in matches)]
     if idle and not partly:
         raise ValueError(f"{what}: {', '.join(idle)} matches no joint of {', '.join(joints)}")
@@ -123,7 +129,9 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     found: dict[str, Any] = {"name": file.parent.name, "joint_names": list(joint_names(model)), "collision_bit": False}
     found |= {"default_joint_pos": of_file.home or nearest} | given
     pose = found["default_joint_pos"]
-    if len(pose) != model.njnt - 1 or not all(isinstance(angle, int | float) for angle in pose):
+    if len(pose) != model.njnt - 1 or not all(
+        isinstance(angle, int | float) and math.isfinite(angle) for angle in pose
+    ):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
     with wp.ScopedDevice(host_device()):
         ((bottoms, _),) = extents(builder_of(model), [pose])
@@ -173,7 +181,7 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     """What is wrong with settings by themselves, one line each."""
     mistakes = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
-    if "name" not in wrong and not re.fullmatch(r"[A-Za-z0-9][\w.-]*", robot.name):
+    if "name" not in wrong and not re.fullmatch(NAME, robot.name):
         mistakes.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
     elif "name" not in wrong and robot.name in ROBOTS:
         mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")

@@ -232,6 +232,7 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
         ('{term = "gravity"}', "", r"87 observations.*\(gravity 3\) has 3 observations"),
         ('{term = "gravity", clip = [1, 0]}', "", r"observation\[0\]\.clip"),
         ('{term = "gravity"}', "action_clip = -1", "action_clip"),
+        ('{term = "command", limit = [1, -1, 1]}', "", r"observation\[0\]\.limit"),
         ("", "", "observation"),
         ("[" * 5000, "", "TOML"),
         ('{term = "gravity"', "", "TOML"),

@@ -199,6 +199,21 @@ def test_descriptors_say_the_order_of_joints(tmp_path):
     assert controller.observation[0].at == (0.0, 0.0, 0.0)  # the trunk's centre of mass
 
 
+def test_other_weights_are_never_taken_and_a_training_says_what_is_between_layers(tmp_path):
+    state = {"actor.0.weight": torch.zeros(8, 36), "actor.0.bias": torch.zeros(8)}
+    torch.save({"model_state_dict": state}, tmp_path / "model_9.pt")
+    (tmp_path / "agent.yaml").write_text("policy: {activation: tanh}")
+    folder = tmp_path / "mine" / "dog"
+    with pytest.raises(ValueError, match="no gains"):  # which are to be filled in
+        imported(tmp_path / "model_9.pt", tmp_path)
+    assert 'activation = "tanh"' in (folder / "controller.toml").read_text()
+    for name in ("robot", "controller"):
+        (folder / f"{name}.toml").unlink()
+    (folder / "model_9.pt").write_bytes(b"older")
+    with pytest.raises(ValueError, match=r"dog/model_9\.pt must be a copy"):
+        imported(tmp_path / "model_9.pt", tmp_path)
+
+
 def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
     torch.jit.script(torch.nn.Linear(36, 8)).save(str(tmp_path / "policy.pt"))
     with pytest.raises(ValueError, match=r"no gains for FL_hip"):
@@ -218,8 +233,10 @@ def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
         (rl_sar, {"observations_history": [0, 2]}, "observations_history"),
         (rl_sar, {"model_name": "other.pt"}, "other.pt"),
         (rl_sar, {"rl_kp": [1.0]}, "rl_kp"),
+        (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
         (deployment, {"num_obs": 40}, "num_obs"),
         (deployment, {"num_actions": 7}, "num_actions"),
+        (mjlab, {"joint_damping": "much"}, "run.onnx must be a controller of mjlab"),
         (deployment, {"leg_joint2motor_idx": []}, "leg_joint2motor_idx"),
         (mjlab, {"observation_names": "base_lin_vel,height_scan"}, "height_scan"),
         (mjlab, {"joint_names": MJLAB["joint_names"].replace("HR_knee", "tail")}, "tail"),

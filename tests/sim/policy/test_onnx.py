@@ -116,6 +116,15 @@ MODELS = {
         [port("obs", ["n", OBSERVATIONS]), port("h_in", [1, "n", 3])],
         [port("obs_x", ["n", OBSERVATIONS]), port("h_in_x", [1, "n", 3])],
     ),
+    "rows that are mixed": graph_model(
+        [
+            helper.make_node("Slice", ["obs", "first", "last", "columns"], ["some"]),
+            helper.make_node("Softmax", ["some"], ["a"], axis=0),
+        ],
+        [port("obs", ["n", OBSERVATIONS])],
+        [port("a", ["n", ACTIONS])],
+        [numpy_helper.from_array(np.array([k]), name) for name, k in (("first", 0), ("last", ACTIONS), ("columns", 1))],
+    ),
     "no graph": graph_model([], [], []),
     "half a file": linear().SerializeToString()[:-9],
 }

@@ -51,10 +51,13 @@ def test_a_checkpoint_of_any_rsl_rl_acts_as_its_training_says(tmp_path, anymal, 
         load_policy(path, anymal, "cpu")
 
 
-@pytest.mark.parametrize("key", ["student.0.weight", "estimator.0.bias", "actor.1.running_mean"])
+@pytest.mark.parametrize(
+    "key", ["student.0.weight", "estimator.0.bias", "actor.1.running_mean", "obs_normalizer.running_mean"]
+)
 def test_what_is_no_part_of_a_known_network_is_refused_by_name(tmp_path, anymal, key):
     content = old_checkpoints()["2"]
-    content["model_state_dict"][key] = torch.zeros(3)
+    part = "obs_norm_state_dict" if "normalizer" in key else "model_state_dict"
+    content[part][key.removeprefix("obs_normalizer.")] = torch.zeros(3)
     torch.save(content | {"activation": "elu"}, tmp_path / "model.pt")
     with pytest.raises(ValueError, match=rf"model\.pt.*{key}"):
         load_policy(tmp_path / "model.pt", anymal, "cpu")
@@ -117,6 +120,7 @@ class Exported(torch.nn.Module):
         super().__init__()
         self.kind, self.layer = kind, torch.nn.Linear(OBSERVATIONS, ACTIONS)
         self.last = torch.nn.Buffer(torch.zeros(1, OBSERVATIONS))
+        self.calls: int = 0
 
     @torch.jit.export
     def reset(self) -> None:
@@ -127,6 +131,9 @@ class Exported(torch.nn.Module):
         if self.kind == "averages":
             self.last[:] = 0.5 * self.last + 0.5 * x
             return self.layer(self.last)
+        if self.kind == "counts":
+            self.calls += 1
+            return self.layer(x) * float(max(self.calls, 9))
         if self.kind == "the first row's":
             self.last[:] = 0.5 * self.last + 0.5 * x[:1]
             return self.layer(x + self.last[:1])
@@ -136,11 +143,11 @@ class Exported(torch.nn.Module):
 @pytest.mark.filterwarnings("ignore:.torch.jit")
 def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
     policies = {}
-    for kind in ("plain", "averages", "the first row's"):
+    for kind in ("plain", "averages", "the first row's", "counts"):
         torch.manual_seed(0)
         torch.jit.script(Exported(kind)).save(str(tmp_path / f"{kind}.pt"))
-        if kind == "the first row's":
-            with pytest.raises(ValueError, match=r"row's\.pt.* last"):
+        if kind in ("the first row's", "counts"):
+            with pytest.raises(ValueError, match=r"row's\.pt.* last|counts\.pt.* other steps"):
                 load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
         else:
             policies[kind] = load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")

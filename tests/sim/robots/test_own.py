@@ -22,7 +22,21 @@ from sim.robots.model_files import read_model_files
 from sim.robots.own import PackedRobot, pack_robot
 from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
-from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, MASS, TRUNK, mjcf, stl, urdf, with_mesh, write_dog, write_toml
+from tests.sim.dogs import (
+    DRIVE,
+    GAINS,
+    JOINTS,
+    KINDS,
+    MASS,
+    STAND,
+    TRUNK,
+    mjcf,
+    stl,
+    urdf,
+    with_mesh,
+    write_dog,
+    write_toml,
+)
 from tests.sim.scenes import FLAT, crossing
 
 
@@ -84,6 +98,8 @@ def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path)
         ("stiffness = {'.*' = 50, '.*knee' = 40}\ndamping = 2", "FL_knee"),
         ("stiffness = {'.*' = 50, '.*ankle' = 40}\ndamping = 2", "ankle"),
         ("default_joint_pos = [0.1]", "default_joint_pos"),
+        ("default_joint_pos = nan", "must be 8 angles"),
+        ("armature = {'[' = 1}", "armature must have names or regular expressions"),
         ("speed = 'fast'", "speed"),
         ("base_geoms = ['tail']", "tail"),
         ("base_geoms = 3", "base_geoms"),
@@ -114,6 +130,9 @@ HIP = '<joint name="FL_hip"'
 BALL = 'type="sphere" size="0.025"'
 FIRST_DRIVE = DRIVE.format("FL_hip")
 MESH = "<asset></asset>"
+SHORT_HOME = '<keyframe><key name="home" qpos="0 0 1"/></keyframe>'
+START = f'{WORLD}\n    <body name="trunk" pos="0 0 {STAND}">'
+PAYLOAD = '<body name="imu"><inertial mass="2" pos="0 0 0" diaginertia="0.01 0.01 0.01"/></body>'
 MORE = "collision_bit=False,"
 LIMIT = '<limit lower="-1.5" upper="2.5" effort="30" velocity="30"/>'
 FIRST_MASS = '<mass value="0.8"/>'
@@ -179,6 +198,8 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", "</mujoco>", '<option actuatorgroupdisable="0"/></mujoco>', "disableactuator"),
     ("xml", "</mujoco>", '<option><flag override="enable"/></option></mujoco>', "<flag override"),
     ("xml", 'pos="0.2 0.12 0"', 'pos="0.2 nan 0"', "position"),
+    ("xml", "</mujoco>", f"{SHORT_HOME}</mujoco>", "home must be 15 numbers, got 3"),
+    ("xml", START, f'<compiler inertiafromgeom="true"/>{START}{PAYLOAD}', "<inertial> of imu (line"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="package://other/trunk.stl"/>', "package other"),
     ("urdf", '<box size="0.5 0.16 0.1"/>', '<mesh filename="https://example.org/trunk.stl"/>', "https"),
     ("urdf", LIMIT, "", "FL_hip has no <limit>"),
