@@ -163,6 +163,8 @@ def _letter(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> N
 
     def write(place: tuple[float, float], text: str, size: float, color: Any, anchor: str = "ls") -> None:
         font, edge = ImageFont.load_default(size * unit), max(1, round(2 * unit))
+        if (beyond := font.getlength(text) / (0.78 * picture.width)) > 1.0:  # the map stands in the corner
+            font = ImageFont.load_default(size * unit / beyond)
         draw.text((place[0] * unit, place[1] * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
 
     write((10, 32), shot.title, 28, "black")

@@ -40,7 +40,8 @@ for robot in "${robots[@]}"; do
   make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
-  "$python" -m results.make.public "$PUBLIC"                            # 20 min
+  "$python" -m results.make.public "$PUBLIC"                            # 40 min
+  "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min
 "$python" -m results.make.pictures                                    # some minutes, a browser
