@@ -321,7 +321,7 @@ def _widths(network: Any) -> tuple[int | None, int | None]:
     if hasattr(network, "sizes"):
         return network.sizes
     for weight in network.parameters():
-        with suppress(RuntimeError, AttributeError, IndexError):  # of an inner layer
+        with suppress(RuntimeError, torch.jit.Error, AttributeError, IndexError):  # of an inner layer
             return weight.shape[1], network(torch.zeros(1, weight.shape[1])).shape[1]
     return None, None
 

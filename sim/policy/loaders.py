@@ -367,7 +367,7 @@ def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> P
             free = _RecurrentScript(probe, initial, axis)
             try:
                 together = torch.stack([free(step) for step in rows], dim=1)
-            except RuntimeError:
+            except (RuntimeError, torch.jit.Error):
                 continue
             if torch.allclose(together, torch.stack(apart), rtol=1e-4, atol=1e-4):
                 return _RecurrentScript(module, initial, axis).to(device)

@@ -94,7 +94,7 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
     """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
 
     A name counts before an expression; every joint must be matched once, and every entry must match. ``partly``: joints
-    without a match have None, entries may be of joints that are not there.
+    without a match have None, entries may be of joints that are not there, but not all.
     """
     if isinstance(value, list):
         return value
@@ -105,7 +105,7 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
     except re.error as error:
         raise ValueError(f"{what} must have names or regular expressions, got {error.pattern!r}: {error}") from None
     idle = [key for key in value if not any(key in keys for keys in matches)]
-    if idle and not partly:
+    if idle and (len(idle) == len(value) if partly and joints else not partly):
         raise ValueError(f"{what}: {', '.join(idle)} matches no joint of {', '.join(joints)}")
     wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in zip(joints, matches, strict=True)
              if len(keys) > 1 or not (keys or partly)]  # fmt: skip

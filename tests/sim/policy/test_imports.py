@@ -242,6 +242,7 @@ def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
         (mjlab, {"joint_names": MJLAB["joint_names"].replace("HR_knee", "tail")}, "tail"),
         (isaac_lab, {"old": "joint_pos_rel", "new": "joint_pos"}, "joint_pos,"),
         (isaac_lab, {"old": "JointPositionAction", "new": "JointVelocityAction"}, "JointVelocityAction"),
+        (isaac_lab, {"old": "{.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}", "new": "{.*_toe: 1}"}, ".*_toe matches"),
         (isaac_lab, {"old": "decimation: 4", "new": ""}, "decimation"),
         (isaac_lab, {"old": "clip: null}", "new": "clip: [-1, 1]}"}, "clip"),
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),

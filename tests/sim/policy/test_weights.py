@@ -135,6 +135,7 @@ class Exported(torch.nn.Module):
             self.calls += 1
             return self.layer(x) * float(max(self.calls, 9))
         if self.kind == "the first row's":
+            assert len(self.last) == 1  # whose error is of a kind of its own
             self.last[:] = 0.5 * self.last + 0.5 * x[:1]
             return self.layer(x + self.last[:1])
         return self.layer(x)
