@@ -18,6 +18,7 @@ from sim.policy.loaders import activation_in, load_network, read_yaml
 from sim.robots.compiled import joint_names, read_robot_file
 from sim.robots.own import NAME, PER_JOINT, per_joint
 from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
 
 _FILES = {
     "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
@@ -122,8 +123,11 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     """
     if taken := [str(out / name) for name in _FILES if (out / name).exists()]:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
-    if not re.fullmatch(NAME, out.resolve().name):
-        raise ValueError(f"--out must end in the robot's name, of letters, digits, . _ and -, got {out}")
+    if not re.fullmatch(NAME, out.resolve().name) or out.resolve().name in ROBOTS:
+        shipped = ", ".join(ROBOTS)
+        raise ValueError(
+            f"--out must end in a name of its own, of letters, digits, . _ and -, not {shipped}, got {out}"
+        )
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
     of_file = read_robot_file(model_file)

@@ -190,6 +190,8 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     for one, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
         if (getattr(robot, one) is None) != (getattr(robot, other) is None):
             mistakes.append(f"{one} and {other} must be given together")
+    if wrong.isdisjoint(("max_duration_s", "physics_dt", "decimation")) and robot.max_duration_s < robot.control_dt:
+        mistakes.append(f"max_duration_s must be a control step or more, {robot.control_dt:g} s")
     fine = wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
     given, step = robot.contact_time_constant_s if fine else None, robot.physics_dt
     if given is not None and given < 2.0 * step * (1.0 - 1e-9):

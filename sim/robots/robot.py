@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from sim.files.command import command_line
-from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
 from sim.robots.training import LearningCfg, TrainingCfg, TuningCfg
 
 ROBOTS_DIR = Path(__file__).parent
@@ -55,7 +55,7 @@ class RobotCfg:
     action_scale: PositiveFloat = 0.5
     """Radians per unit of action."""
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
-    decimation: PositiveInt = 4
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4
     """Physics steps per control step."""
     speed: PositiveFloat = 0.75
     """Commanded speed of a crossing, toward the goal [m/s]."""
@@ -84,7 +84,7 @@ class RobotCfg:
     """
     velocity_limit: tuple[PositiveFloat, ...] | None = None
     """Speed of each joint at which its motor has no torque left [rad/s]."""
-    drive_delay_steps: NonNegativeInt = 0
+    drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Physics steps after which a joint target counts. Until the first one does, the default pose is held."""
     friction: PositiveFloat | None = None
     """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
