@@ -193,11 +193,11 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
 
 
 def _onnx_metadata(file: Path) -> Mapping[str, str]:
-    import onnxruntime  # takes long to load
+    import onnx  # takes long to load
 
     try:
-        return onnxruntime.InferenceSession(file.read_bytes()).get_modelmeta().custom_metadata_map
-    except Exception as error:  # its errors have no base
+        return {item.key: item.value for item in onnx.ModelProto.FromString(file.read_bytes()).metadata_props}
+    except Exception as error:  # protobuf's errors have no base
         raise ValueError(f"{file} is no ONNX file: {error}") from None
 
 
@@ -279,6 +279,7 @@ def _read_deployment(source: Path, found: _Found) -> Path:
 
 def _read_mjlab(source: Path, found: _Found) -> Path:
     """An ONNX file with the metadata of mjlab's exporter, rounded to three decimals."""
+    load_network(source, "cpu", None, of="it")  # what is wrong with it is said before it is written
     said: dict[str, Any] = {key: text.split(",") for key, text in _onnx_metadata(source).items() if text}
     names, joints = said.pop("observation_names"), said.pop("joint_names")
     found.check_known(names, _TERMS)
