@@ -16,6 +16,7 @@ from qd.workers.evaluator import Compute, check_policy
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.mujoco_c.crossing import cross_terrains
+from sim.policy.spec import crosser_name
 from sim.robots.find import read_penalty_scales
 from sim.robots.own import describe_inferred
 from sim.robots.robot import RobotCfg
@@ -54,7 +55,9 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
             most, share = fitting_height(crossings, policy)
     if walks or anyway:
         doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
-        dose = measure_dose(robot, {"it": policy}, doses, compute=compute, terrains=4, episodes=2, seed=0)
+        crosser = crosser_name(robot, policy)
+        out = RUNS / f"{crosser}-dose" / "dose.json"
+        dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
         up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
         print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
     return fine and walks

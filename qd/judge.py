@@ -271,7 +271,10 @@ def judge(
             failing = np.flatnonzero(archive.failing)
             if stage == "fresh":
                 cfg, kinds = search.cfg, {"num_replicas": FRESH_EPISODES, "seed": search.cfg.seed}
+                found = archive
                 archive = archive.corrected_by(fresh_values(archive, cross_fresh, cfg.fitness, **kinds))
+                if len(found) and not np.array_equal(found.cell, archive.cell):
+                    print(f"Elites of {run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)
             elif stage == "others":
                 archive = certify(archive, failing, certifiers, search, crossings)
             else:

@@ -32,8 +32,7 @@ from sim.policy.spec import about_controllers, crosser_name, spec_of
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.registry import load_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.spaces.registry import load_space, space_at
 
 EPISODES = 20
 """Episodes a terrain on a GPU."""
@@ -148,7 +147,7 @@ def evaluate_tables(
         independent = read_independent(cfg.independent, cfg.archive, robot, cfg.space)
         search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
         about["independent"] = _about(cfg.independent, independent) | search
-    space = load_space(cfg.space or SUPER_GAUSSIAN.name)
+    space = space_at(load_space(cfg.space), None, robot)
     check_seeds(controllers)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
@@ -212,7 +211,7 @@ def evaluate_rates(
     """
     count, episodes = sizes_for(compute, terrains, episodes, full=(300, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)
-    drawn_in = load_space(space or SUPER_GAUSSIAN.name)
+    drawn_in = space_at(load_space(space), None, robot)
     sets = {name: plain_set(name, count, seed, drawn_in) for name in ("hand_crafted", "hard_random", "flat")}
     controller = crosser_name(robot, policy)
 

@@ -207,6 +207,8 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "pol
 
 def label_suffix(policy: str) -> str:
     """The ending of the names of files about a controller that is not the usual one, for example ``-C-G``."""
+    if Path(policy).name == "controller.toml":  # as all descriptions are called
+        policy = Path(policy).resolve().parent.name
     label = re.sub(r"\.(pt|onnx|toml)$", "", ControllerSpec.parse(policy).label)
     return "-" + re.sub(r"[^A-Za-z0-9_.-]+", "-", label)
 

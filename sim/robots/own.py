@@ -70,6 +70,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file; an error names it."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from None
 

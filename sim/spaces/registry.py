@@ -68,7 +68,10 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
     fits = MOST_HEIGHT * share_of_height(get_space(fitting_space(robot) or SUPER_GAUSSIAN.name))
     if fits == MOST_HEIGHT or "@" in space.name or is_own(space.name):
         return space
-    print(f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} (--height says otherwise).")
+    print(
+        f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} (--height, or --space "
+        f"{SUPER_GAUSSIAN.name}@{MOST_HEIGHT:g}, says otherwise)."
+    )
     return at_height(space, fits)
 
 

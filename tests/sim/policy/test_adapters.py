@@ -132,3 +132,4 @@ def test_controllers_have_names(anymal, tmp_path):
     assert [about[name]["policy"] for name in about] == ["shipped", "a.pt"]
     assert (spec_of("shipped", anymal), spec_of("a.pt", anymal)) == (shipped, "a.pt")
     assert label_suffix(str(copy)) == "-C-G-1"
+    assert label_suffix(str(tmp_path / "go2" / "controller.toml")) == "-go2"
