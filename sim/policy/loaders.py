@@ -165,6 +165,8 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
         raise ValueError(f"{path}: policy must be the name of a file, got {cfg.policy!r}")
     of = f"{path} ({policy.columns})"
     network = load_network(weights, device, sizes, of=of, activation=cfg.activation)
+    if cfg.activation is not None and not isinstance(network, MlpPolicy | RnnPolicy):
+        raise ValueError(f"{path}: activation is of an rsl_rl checkpoint; {weights.name} says its own: leave it out")
     _try_rows(network, sizes, device, str(weights), of)
     policy.use(network, torch.device(device))
     return policy
@@ -235,7 +237,12 @@ def _actor_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
             f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', or "
             f"'model_state_dict' with 'actor.0.weight', got {got}"
         )
-    normaliser = {f"obs_normalizer.{key}": value for key, value in (content.get("obs_norm_state_dict") or {}).items()}
+    beside = content.get("obs_norm_state_dict") or {}
+    if not isinstance(beside, dict):
+        raise ValueError(
+            f"policy '{path}': obs_norm_state_dict must be a table of tensors, got {type(beside).__name__}"
+        )
+    normaliser = {f"obs_normalizer.{key}": value for key, value in beside.items()}
     names |= {key: key for key in normaliser}
     if unknown := [key for key, name in names.items() if not re.fullmatch(_KNOWN, name)]:
         raise ValueError(

@@ -195,6 +195,12 @@ def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
                 np.testing.assert_allclose(together[k][robot], own, rtol=2e-3, atol=5e-3)  # TF32
 
 
+def test_an_activation_is_of_a_checkpoint(tmp_path, anymal, describe):
+    torch.jit.script(torch.nn.Linear(3, ACTIONS)).save(str(tmp_path / "weights.pt"))
+    with pytest.raises(ValueError, match=r"controller\.toml: activation .*weights\.pt says its own"):
+        load_policy(describe('{term = "gravity"}', 'activation = "elu"'), anymal, "cpu")
+
+
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
     weights = tmp_path / "weights.pt"
     assert ControllerSpec.parse(remembering).files == (remembering, weights)

@@ -63,6 +63,12 @@ def test_what_is_no_part_of_a_known_network_is_refused_by_name(tmp_path, anymal,
         load_policy(tmp_path / "model.pt", anymal, "cpu")
 
 
+def test_a_normaliser_beside_it_is_a_table(tmp_path, anymal):
+    torch.save(old_checkpoints()["2"] | {"obs_norm_state_dict": [1.0], "activation": "elu"}, tmp_path / "model.pt")
+    with pytest.raises(ValueError, match=r"model\.pt.*obs_norm_state_dict .*table.*list"):
+        load_policy(tmp_path / "model.pt", anymal, "cpu")
+
+
 @pytest.fixture(scope="module", params=["lstm", "gru"])
 def recurrent(request):
     """rsl_rl's own recurrent actor of two layers, with a normaliser; and what it does with 12 steps of 5 robots."""
