@@ -92,6 +92,7 @@ class Archive(ControllerFlags, WorkerFlags):
         from sim.spaces.registry import at_height, load_space, space_at
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:
             robot, policy, space = get_robot(self.robot), None, load_space(self.space)
             if self.height is not None:
@@ -116,7 +117,7 @@ class Archive(ControllerFlags, WorkerFlags):
             replicas=self.replicas,
             intervals=self.fitness.intervals,
             fitness=replace(fitness, alpha=self.fitness.alpha, lam=self.fitness.lam),
-            scheduler=replace(self.scheduler, method=self.method or self.scheduler.method),
+            scheduler=scheduler,
         )
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy)
