@@ -247,9 +247,11 @@ def _read_rl_sar(source: Path, found: _Found) -> Path:
         history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
         found.put(history=history, why="steps before the start are zeros, as in rl_sar's own loop")
     terms = said.pop("observations")
-    found.check_known(terms, _TERMS)
+    known = _TERMS | {"g1_phase": "clock"}
+    found.check_known(terms, known)
     scales = {name: said.pop(key) for key, name in _SCALES.items() if key in said}
-    found.put(observation=[_term(_TERMS[name], scales.get(_TERMS[name])) for name in terms])
+    periods = {"g1_phase": 0.8}  # of its code [s]
+    found.put(observation=[_term(known[name], scales.get(known[name]), period_s=periods.get(name)) for name in terms])
     weights = _weights_of(file.parent, said.pop("model_name"))
     found.leave(said, "fixed_kp fixed_kd num_of_dofs num_observations joint_controller_names framework")
     return weights

@@ -136,14 +136,16 @@ def tags(controller):
 
 
 def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):
-    robot, controller = imported(rl_sar(tmp_path / "policy"), tmp_path)
+    source = rl_sar(tmp_path / "policy", 2 * 35, observations=[*RL_SAR["observations"], "g1_phase"])
+    robot, controller = imported(source, tmp_path)
     assert (robot.name, robot.default_joint_pos, robot.stiffness) == ("dog", IN_FILE, (20, 30) * 4)
     assert (robot.damping, robot.effort_limit, robot.control_dt) == ((0.5,) * 8, (23.5,) * 8, 0.02)
     assert (controller.joints, controller.action_scale) == (tuple(RIGHT_FIRST), (0.125, 0.25) * 4)
     assert (controller.action_clip, controller.observation_clip) == (9.0, 100.0)
     assert vars(controller.history) == {"length": 2, "newest": "first", "by": "row", "fill": "zeros"}
-    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action"]
-    assert [term.scale for term in controller.observation] == [0.25, 1.0, (2.0, 2.0, 0.25), 1.0, 1.0, 1.0]
+    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
+    assert [term.scale for term in controller.observation] == [0.25, 1.0, (2.0, 2.0, 0.25), 1.0, 1.0, 1.0, 1.0]
+    assert controller.observation[-1].period_s == 0.8
 
 
 def test_a_deployment_of_unitree_has_its_scripts_observation(tmp_path):
