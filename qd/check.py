@@ -51,15 +51,15 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
     check_policy(policy, robot, compute.device)
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
         walks = _walks(robot, walk(crossings, policy))
-        if walks or anyway:
-            most, share = fitting_height(crossings, policy)
-    if walks or anyway:
-        doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
-        crosser = crosser_name(robot, policy)
-        out = RUNS / f"{crosser}-dose" / "dose.json"
-        dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
-        up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
-        print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
+        if not (walks or anyway):
+            return False
+        most, share = fitting_height(crossings, policy)
+    doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
+    crosser = crosser_name(robot, policy)
+    out = RUNS / f"{crosser}-dose" / "dose.json"
+    dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
+    up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
+    print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
     return fine and walks
 
 

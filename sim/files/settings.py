@@ -6,9 +6,10 @@ A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Fl
 import json
 import math
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
@@ -116,6 +117,16 @@ def _choices(annotation: Any) -> tuple[Any, ...]:
 def _brief(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def read_toml(path: Path, text: str | None = None) -> dict[str, Any]:
+    """Content of a TOML file, or of its text; an error names the file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8") if text is None else text)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no TOML: {error}") from None
 
 
 def to_toml(value: Any) -> str:

@@ -93,7 +93,7 @@ class Episodes:
     """States of the episodes of one terrain, stepped one by one."""
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
-        self._model, self._robot = copy(model), robot  # whose torque limits change with the speed
+        self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
         self.data = [_mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel

@@ -1,7 +1,6 @@
 """A controller as data: a TOML file says what a network sees, and what its actions mean (docs/controllers.md)."""
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, to_toml
+from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
 from sim.policy.adapters import Sensed, read_row
 from sim.policy.mlp import ACTIVATIONS
 from sim.policy.runner import is_graph_safe
@@ -94,10 +93,7 @@ class ControllerCfg:
 
 def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
     """Reads a description, or its text, which is called ``path`` in errors; an error names the field too."""
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8") if text is None else text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} cannot be read as TOML: {error}") from None
+    content = read_toml(path, text)
     items = content.pop("observation", None)
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
         raise ValueError(f'{path}: observation must be a list of terms, for example [{{term = "gravity"}}]')

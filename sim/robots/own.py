@@ -4,7 +4,6 @@ import itertools
 import math
 import os
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import warp as wp
 
 from kernels.penalties import PENALTIES
 from sim.device import host_device
-from sim.files.settings import from_builtins, problems, to_toml
+from sim.files.settings import from_builtins, problems, read_toml, to_toml
 from sim.policy.spec import run_file
 from sim.robots.compiled import UNITS, RobotFile, file_problems, joint_names, read_robot_file
 from sim.robots.model import builder_of
@@ -64,16 +63,6 @@ def load_robot(path: Path) -> RobotCfg:
     if mistakes:
         raise ValueError(f"{path}: {'; '.join(mistakes)}")
     return robot
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file; an error names it."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from None
 
 
 def _read_toml(path: Path, file: Path) -> tuple[RobotCfg, RobotFile]:
