@@ -21,13 +21,13 @@ HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it
 
 
 def cross_in_all_ways(
-    script: Script, crossings: Crossings, name: str, genes: NDArray[np.float32], space: str
+    script: Script, crossings: Crossings, name: str, genes: NDArray[np.float32], space: str, *, episodes: int = 40
 ) -> dict[str, NDArray[np.uint8]]:
     """Outcomes of a set's episodes by how they were crossed, (num_terrains, num_episodes); fewer terrains in MuJoCo C.
 
     ``search`` has the first starts; ``again`` (the same settings), ``resolved`` and ``mujoco_c`` have the second.
     """
-    episodes, in_mujoco_c = (1, 1) if script.small else (40, 40)
+    episodes, in_mujoco_c = (1, 1) if script.small else (episodes, 40)
     sequences = [np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)) for stream in (FIRST, SECOND)]
     first, second = (sequence.generate_state(len(genes), np.uint32).astype(np.uint32) for sequence in sequences)
 

@@ -31,12 +31,13 @@ for robot in "${robots[@]}"; do
   make_file "$folder/dose.json" dose "$robot"                         # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
   make_file "sim/robots/$robot/pack/pack.json" pack "$robot"          # 2 min
-  make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min
+  make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min; with MJLAB results.make.peer too, 3 min
   if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
     .venv/bin/torchrun --nproc-per-node 2 -m results.make.train_speed --robot "$robot" # 1 min on two GPUs
     make_file "$folder/scale.json" scale "$robot"                     # 4 min on all GPUs
   fi
-  make_file "$folder/speed.json" speed "$robot"                       # 12 min, 4 of them on the CPU
+  "$python" -m results.make.speed --robot "$robot"                    # 7 min; what is done is not done again
+  "$python" -m results.make.speed --robot "$robot" --device cpu       # 4 min, and to be quoted where two cores are free
   make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
@@ -44,5 +45,6 @@ if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, a
   "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min
+FAULTLINE_DEVICE=cuda:0 "$python" -m pytest -q -m gpu --record results/bench/gpu-tests.json # 4 min
 "$python" -m results.make.pictures                                    # some minutes, a browser
 "$python" -m results.make.docs

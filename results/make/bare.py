@@ -4,21 +4,28 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import mujoco
+import mujoco_warp
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
 from sim.bank import TerrainBank
+from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
+from sim.terrain import NUM_COLS, NUM_ROWS
 
 SEGMENT_STEPS = 10  # control steps: over 0.2 s a replayed robot still moves as the recorded one did
 SEGMENT_EVERY = 20
 PROFILED_STEPS = 50
 NAMED_KERNELS = 40
+SETTLE, STANDING = 100, 250  # control steps
+MUJOCO: Any = mujoco  # its types are not written down
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,15 +122,58 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
     walking, ground = replay_rates([motion, with_maps], rounds)
+    return {"walking": walking, "standing": standing_rate(rollout, motion, terrains, seeds), "ground": ground}
+
+
+def standing_rate(rollout: Rollout, motion: Motion, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> float:
+    """Physics steps a second over all robots that hold the default pose where crossings start."""
+    sim, robot = rollout.sim, rollout.robot
     rollout.clear()
     rollout.put(terrains, seeds)
     sim.joint_qd.zero_()
     targets = np.zeros(sim.targets.shape, dtype=np.float32)
     targets[:, 7:] = robot.default_joint_pos
     sim.targets.assign(targets)
-    motion.stand(100)  # 2 s, in which they settle
-    standing = 250 * robot.decimation * sim.num_envs / motion.stand(250)
-    return {"walking": walking, "standing": standing, "ground": ground}
+    motion.stand(SETTLE)  # 2 s, in which they come to rest
+    return STANDING * robot.decimation * sim.num_envs / motion.stand(STANDING)
+
+
+def standing_rates(rollout: Rollout) -> dict[str, float] | None:
+    """Physics steps a second over all robots that stand on level ground, ours and mujoco_warp's by itself.
+
+    Both step the same model with the same caps of iterations; mujoco_warp finds its contacts with a plane. None if the
+    robots do not end at the same height: a biped falls.
+    """
+    sim, robot, device = rollout.sim, rollout.robot, rollout.sim.device
+    level, seeds = np.zeros((rollout.num_terrains, NUM_ROWS, NUM_COLS)), np.zeros(rollout.num_terrains, np.uint32)
+    ours = standing_rate(rollout, Motion(sim, []), level, seeds)
+    height = sim.joint_q.numpy()[:, 2].mean()
+    rollout.clear()
+    rollout.put(level, seeds)
+    model = crossing_model(robot, level[0])
+    model.opt.disableflags = MUJOCO.mjtDisableBit.mjDSBL_SENSOR  # which only MuJoCo C is asked for
+    for cap in ("iterations", "ls_iterations"):
+        setattr(model.opt, cap, getattr(sim.solver.mj_model.opt, cap))
+    start = MUJOCO.MjData(model)
+    start.ctrl[:] = np.array(robot.default_joint_pos)[model.actuator_trnid[:, 0] - 1]
+    with wp.ScopedDevice(device):
+        on_device = mujoco_warp.put_model(model)
+        data = mujoco_warp.put_data(model, start, nworld=sim.num_envs, njmax=robot.njmax, nconmax=robot.nconmax)
+        data.qpos.assign(sim.joint_q.numpy()[:, [0, 1, 2, 6, 3, 4, 5, *range(7, 7 + robot.num_joints)]])
+
+        def control_step() -> None:
+            for _ in range(robot.decimation):
+                mujoco_warp.step(on_device, data)
+
+        graph = sim.capture(control_step)
+        launch = partial(wp.capture_launch, graph)
+        seconds_of(lambda: [launch() for _ in range(SETTLE)], device)
+        seconds = seconds_of(lambda: [launch() for _ in range(STANDING)], device)
+        theirs = data.qpos.numpy()[:, 2].mean()
+    if not abs(theirs - height) < 0.002:
+        return None
+    alone = STANDING * robot.decimation * sim.num_envs / seconds
+    return {"num_envs": sim.num_envs, "world_steps_per_s": ours, "world_steps_per_s_mujoco_warp": alone}
 
 
 def kernel_shares(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[dict[str, Any]]:

@@ -39,6 +39,8 @@ class Script:
     small: bool
     """Whether this is a trial on a CPU, of a minute or so, whose numbers mean nothing."""
     out: Path
+    parts: tuple[str, ...] = ()
+    """Those asked for, of a script that has parts; none is all."""
 
     @property
     def policy(self) -> str:
@@ -106,7 +108,9 @@ class Script:
         return content
 
 
-def parse(doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results") -> Script:
+def parse(
+    doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results", parts: Sequence[str] = ()
+) -> Script:
     """Reads the flags that every script has.
 
     Args:
@@ -114,6 +118,7 @@ def parse(doc: str | None, argv: Sequence[str] | None, file: str, *, published: 
         argv: Words of the command line; those of the process if None.
         file: Name of the file written, in ``<published>/<robot>``.
         published: Folder of what is published.
+        parts: Words that may be named, of a script that can be asked for a part of its work.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robot", default="anymal")
@@ -121,6 +126,8 @@ def parse(doc: str | None, argv: Sequence[str] | None, file: str, *, published: 
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--small", action="store_true", help="a trial of a minute or so; it publishes nothing")
     parser.add_argument("--out", type=Path, help=f"file to write; {published}/<robot>/{file} if left out")
+    if parts:
+        parser.add_argument("--parts", nargs="+", choices=parts, help="all that this device can measure if left out")
     args = parser.parse_args(argv)
     robot = get_robot(args.robot)
     folder = Path("runs/make/small" if args.small else published) / robot.name
@@ -130,6 +137,7 @@ def parse(doc: str | None, argv: Sequence[str] | None, file: str, *, published: 
         seed=args.seed,
         small=args.small,
         out=args.out or folder / file,
+        parts=tuple(getattr(args, "parts", None) or ()),
     )
 
 

@@ -251,6 +251,7 @@ def public_controllers() -> str:
         "heights up to [m]": lambda one: one["space"].partition("@")[2] or "0.25",
         "hard-random: reach the goal, here / finer / MuJoCo C, finer":
             beside("agreement", ("searched", "resolved", "mujoco_c"), None, ".2f"),
+        "episodes/s of 32,768 robots": "episodes_per_s_32768",
         **{name.replace("_", " "): name for name in ("episodes", "elites", "corrected_elites", "failing", "confirmed",
                                                      "faults")},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
@@ -258,9 +259,81 @@ def public_controllers() -> str:
     return table({words: numbers[name] for name, words in named.items() if name in numbers}, columns, upright=True)
 
 
+def inside(*path: str | int, form: str = ",.0f", factor: float = 1.0) -> Callable[[Any], str]:
+    """A cell: a number in objects within a row's, by keys; one that is a number picks the object of so many robots."""
+
+    def cell(row: Any) -> str:
+        for key in path[:-1]:
+            picked = (one for one in row if one["num_envs"] == key) if isinstance(key, int) else iter([row.get(key)])
+            row = next(picked, None) or {}
+        return shown(str(path[-1]), form, factor)(row)
+
+    return cell
+
+
+def speed() -> str:
+    """What is quoted of speed, by robot, and the devices and commits that the numbers are of."""
+    rows = {}
+    for robot, words in ROBOTS.items():
+        numbers, scale = (read(f"results/{robot}/{name}.json") for name in ("speed", "scale"))
+        origins = [one for one in (*(numbers.get("measured") or {"": numbers}).values(), scale) if one.get("device")]
+        named = {
+            key: ", ".join(dict.fromkeys(str(one[key])[: 28 if key == "device" else 12] for one in origins))
+            for key in ("device", "commit")
+        }
+        by_ray = "; ".join(f"{one['workers']}: {one['episodes_per_s']:,.0f}" for one in scale.get("rows", ()))
+        largest = [one for one in numbers.get("kernels") or () if one.get("share", 0.0) >= 0.04]
+        shares = ", ".join(f"{kernel_words(one['name'])} {one['share']:.0%}" for one in largest)
+        rows[words] = {**numbers, "named": {**named, "ray": by_ray or NONE, "kernels": shares or NONE}}
+    mixed, million, minutes = "cma_mae+map_elites", {"form": ".1f", "factor": 1e-6}, {"form": ".1f", "factor": 1 / 60}
+    columns: dict[str, Column] = {
+        **{f"episodes/s of {count:,} robots": inside("envs_curve", count, "episodes_per_s")
+           for count in (1024, 4096, 32768)},
+        "episodes/s by Ray, by number of GPUs": lambda row: row["named"]["ray"],
+        "an iteration of preset paper [s]": shown("iteration_s_median", ".2f"),
+        "its physics steps/s [million]": shown("world_steps_per_s", **million),
+        "... in those of contacts and solver alone": shown("bare_physics_ratio", ".2f"),
+        "an iteration of preset wide [s]": inside("wide", "surrogate", "iteration_s_median", form=".1f"),
+        "... minutes for the paper's episodes": inside("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
+        f"... by `{mixed}` [s]": inside("wide", mixed, "iteration_s_median", form=".1f"),
+        f"... minutes by `{mixed}`": inside("wide", mixed, "minutes_per_4m_episodes", form=".1f"),
+        "preset small on two CPU cores [minutes]": inside("cpu", "archive_wall_s", **minutes),
+        **{f"{count:,} robots standing: physics steps/s [million]{alone}":
+           inside("flat", count, f"world_steps_per_s{key}", **million)
+           for count in (4096, 32768) for alone, key in (("", ""), (", mujoco_warp alone", "_mujoco_warp"))},
+        "training: environment steps/s of 4,096 robots": "train_env_steps_per_s",
+        "... of 8,192 robots": "train_env_steps_per_s_8192",
+        "... of 8,192 on each of two GPUs": "train_env_steps_per_s_2gpu",
+        "... of mjlab's 4,096 Unitree Go1 in the same run": "train_env_steps_per_s_mjlab",
+        "goal rate above that of finer physics": inside("agreement", "resolved", "goal_bias", form="+.3f"),
+        "goal rate above that of MuJoCo C": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),
+        "largest kernels of a control step": lambda row: row["named"]["kernels"],
+        "device": lambda row: row["named"]["device"],
+        "commit": lambda row: row["named"]["commit"],
+    }  # fmt: skip
+    return table(rows, columns, upright=True)
+
+
+def kernel_words(name: str) -> str:
+    """A kernel's name without what compilers add."""
+    return "matrix products" if "gemm" in name else name.rpartition("__")[2].removesuffix("_kernel").strip("_")
+
+
+def kernels() -> str:
+    """Kernels against torch, by the newest file of a GPU."""
+    numbers = max(map(read, sorted(str(file.relative_to(ROOT)) for file in ROOT.glob("results/bench/nvidia-*.json"))),
+                  key=lambda one: one["date"])  # fmt: skip
+    rows = {one["kernel"].replace("_", " "): one for one in numbers["rows"] if one["torch_ms"]}
+    columns: dict[str, Column] = {f"{words} [ms]": shown(key, ".4f") for words, key in (
+        ("here", "ours_ms"), ("torch", "torch_ms"), ("`torch.compile`", "torch_compile_ms"))}  # fmt: skip
+    columns |= {"of the ceiling": shown("ceiling_share", ".1%"), "bound by": lambda one: one["bound_by"]}
+    words = f"{numbers['num_envs']:,} robots, {numbers['device']}, commit {numbers['commit'][:12]}"
+    return table(rows, columns).replace("|  |", f"| {words} |", 1)
+
+
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
     archives, archive_details, training, goals, collisions, beside_paper, methods, hardening, spaces, sizes, agreement,
-    minimal, packs, public_controllers)}  # fmt: skip
+    minimal, packs, public_controllers, speed, kernels)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:

@@ -29,11 +29,13 @@ from qd.workers.evaluator import Compute
 from results.make.common import agreement, crossing_rates
 from results.make.pictures import FOLDER
 from results.make.spaces import COUNTS, causes_of
+from results.make.speed import time_crossings
 from sim.device import resolve_device
 from sim.files.atomic import write_atomically
 from sim.files.records import provenance, sources_sha256
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
+from sim.robots.robot import RobotCfg
 from sim.spaces.registry import SUPER_GAUSSIAN, load_space
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
@@ -73,16 +75,29 @@ def fill_in(file: Path, text: str) -> None:
     file.write_text("".join(kept) + text)
 
 
-def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
-    """Imports a controller, lets it walk in both simulators, and searches what breaks it."""
+def ready(name: str, folder: Path, runs: Path, compute: Compute) -> tuple[RobotCfg, str]:
+    """The robot of a controller, imported with it, and the terrain space that fits it."""
     source, model, of_controller, of_robot = CONTROLLERS[name]
-    home, run = runs / name, runs / f"{name}-archive"
+    home = runs / name
     if not (home / "robot.toml").exists():
         import_controller(folder / source, folder / model, home)
         fill_in(home / "controller.toml", of_controller)
         fill_in(home / "robot.toml", of_robot)
     robot = made_ready(get_robot(str(home / "robot.toml")), None, compute)
-    space = fitting_space(robot) or SUPER_GAUSSIAN.name
+    return robot, fitting_space(robot) or SUPER_GAUSSIAN.name
+
+
+def time_alone(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
+    """Episodes a second of many robots, by 4 episodes a robot, and where and when that was measured."""
+    robot, space = ready(name, folder, runs, compute)
+    row = time_crossings(robot, 4 if small else 32768, compute.device, seed, space=space, each=4)
+    return {"episodes_per_s_32768": row["episodes_per_s"], "timed": provenance(compute.device, seed)}
+
+
+def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
+    """Imports a controller, lets it walk in both simulators, and searches what breaks it."""
+    run = runs / f"{name}-archive"
+    robot, space = ready(name, folder, runs, compute)
     with Crossings(robot, compute, cache=runs / "crossings") as crossings:
         walked = walk(crossings, str(robot.policy_file), seed)
         agreed = agree(crossings, space, seed, 1 if small else 40)
@@ -136,6 +151,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", action="store_true", help="stills of searches that are there, and nothing else")
+    parser.add_argument("--speed", action="store_true", help="episodes a second alone, into the file that is there")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
@@ -149,8 +165,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             take_picture(name, runs)
         return {}
     content = provenance(compute.device, args.seed) | {"controllers": {}}
+    if args.speed and out.exists():
+        content = json.loads(out.read_text())
     for name in args.only:
-        numbers = measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+        numbers = content["controllers"].get(name, {})
+        if not args.speed:
+            numbers |= measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+        numbers |= time_alone(name, args.folder, runs, compute, seed=args.seed, small=args.small)
         content["controllers"][name] = numbers
         print(json.dumps({name: numbers}, indent=1), flush=True)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,8 @@
 """How fast the search runs beside the bare physics it is made of, and what else is quoted of speed: speed.json.
 
 The iterations timed are those of a real search, ask to saved checkpoint. Bare rates are measured right after, on the
-terrains that it asks for next, with as many robots and the same solver.
+terrains that it asks for next, with as many robots and the same solver. The file is written after each part. A part
+that today's sources have on this device is not measured again; on the CPU there is one, which joins those of a GPU.
 """
 
 import json
@@ -11,7 +12,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,17 +24,25 @@ from numpy.typing import NDArray
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import SearchCfg, preset
 from qd.search import search
+from qd.workers.cross import Crossings
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, open_evaluator
-from results.make.bare import bare_rates, kernel_shares
-from results.make.common import Script, parse
+from results.make.agreement import compare, cross_in_all_ways
+from results.make.bare import bare_rates, kernel_shares, standing_rates
+from results.make.common import Script, is_current, parse
+from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
-from sim.spaces.registry import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN, load_space
 
 WARM_UP = 2
-WIDE = ("cma_mae", "cma_mae+map_elites", "surrogate")
+WIDE = ("surrogate", "cma_mae+map_elites")
 CURVE = (1024, 4096, 32768)
-EPISODES_A_ROBOT = REPLICAS = 20
+REPLICAS = 20
+PROFILED = 32_000
+"""Robots whose kernels are timed: as many as preset wide has."""
 PAPER_EPISODES = 4_000_000
+KEYS = ("iteration_s_median", "bare_physics_ratio", "world_steps_per_s", "ground_step_ratio", "conditions_step_ratio",
+        "envs_curve", "wide", "flat", "kernels", "agreement", "cpu")  # fmt: skip
+"""What others read: null until it is measured."""
 
 
 def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> tuple[Metrics, NDArray[np.float32]]:
@@ -86,7 +95,7 @@ def time_wide(script: Script) -> dict[str, Any]:
     numbers = {}
     for method in WIDE:
         cfg = script.search_cfg(method=method)
-        metrics, _ = time_search(script, f"wide-{method}", cfg, 6)
+        metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
         seconds = float(np.median([row["wall_s"] for row in metrics]))
         numbers[method] = {
             "iteration_s_median": seconds,
@@ -94,32 +103,54 @@ def time_wide(script: Script) -> dict[str, Any]:
             "idle_share": float(np.median([row["idle_share"] for row in metrics])),
             "search_share": float(np.median([row["search_s"] / row["wall_s"] for row in metrics])),
         }
-    return numbers
+    return {"wide": numbers}
 
 
-def time_curve(script: Script) -> list[dict[str, float]]:
+def time_curve(script: Script) -> dict[str, Any]:
     """Episodes a second on hard-random terrains over numbers of robots, each of which runs 20 episodes."""
-    rows = []
-    for count in (4,) if script.small else CURVE:
-        num_terrains = max(1, count * EPISODES_A_ROBOT // REPLICAS)
-        genes = SUPER_GAUSSIAN.hard_random(num_terrains, script.seed)
-        cfg = EvaluatorCfg(
-            robot=script.robot, policy=script.policy, num_terrains=max(1, num_terrains // 5), num_replicas=REPLICAS,
-            num_envs=count, device=script.device, workers="1",
-        )  # fmt: skip
-        with open_evaluator(cfg) as evaluate:
-            result = evaluate(genes, np.arange(num_terrains, dtype=np.uint32))
-        rate = result.outcome.size / result.wall_s
-        rows.append({"num_envs": count, "episodes_per_s": rate, "idle_share": result.idle_share})
-    return rows
+    counts = (4,) if script.small else CURVE
+    return {"envs_curve": [time_crossings(script.robot, count, script.device, script.seed) for count in counts]}
 
 
-def time_kernels(script: Script, num_envs: int) -> list[dict[str, Any]]:
+def time_crossings(
+    robot: RobotCfg, num_envs: int, device: str, seed: int, *, space: str = SUPER_GAUSSIAN.name, each: int = 20
+) -> dict[str, float]:
+    """Episodes a second of robots that cross hard-random terrains of a space, by ``each`` episodes a robot."""
+    num_terrains = max(1, num_envs * each // REPLICAS)
+    genes = load_space(space).hard_random(num_terrains, seed)
+    cfg = EvaluatorCfg(
+        robot=robot, policy=str(robot.policy_file), num_terrains=max(1, num_terrains * 4 // each), space=space,
+        num_replicas=REPLICAS, num_envs=num_envs, device=device, workers="1",
+    )  # fmt: skip
+    with open_evaluator(cfg) as evaluate:
+        result = evaluate(genes, np.arange(num_terrains, dtype=np.uint32))
+    rate = result.outcome.size / result.wall_s
+    return {"num_envs": num_envs, "episodes_per_s": rate, "idle_share": result.idle_share}
+
+
+def time_standing(script: Script) -> dict[str, Any]:
+    """Bare physics of robots that stand on level ground beside mujoco_warp's own, over numbers of robots."""
+    counts = (4,) if script.small else CURVE[1:]
+    rows = [standing_rates(rollout_of(script, 1, count, count)) for count in counts]
+    return {"flat": [row for row in rows if row is not None]}
+
+
+def time_kernels(script: Script) -> dict[str, Any]:
     """Shares of a control step's kernels in hard-random crossings; on a GPU alone."""
-    num_terrains = num_envs // REPLICAS
-    rollout = rollout_of(script, num_terrains, num_envs, REPLICAS)
+    num_terrains = PROFILED // REPLICAS
+    rollout = rollout_of(script, num_terrains, PROFILED, REPLICAS)
     genes = SUPER_GAUSSIAN.hard_random(num_terrains, script.seed)
-    return kernel_shares(rollout, genes, np.arange(num_terrains, dtype=np.uint32))
+    shares = kernel_shares(rollout, genes, np.arange(num_terrains, dtype=np.uint32))
+    return {"kernels_num_envs": PROFILED, "kernels": shares}
+
+
+def measure_agreement(script: Script) -> dict[str, Any]:
+    """Agreement with finer physics and MuJoCo C on a few hard-random terrains, so that no rate stands without it."""
+    terrains = 1 if script.small else 40
+    genes = SUPER_GAUSSIAN.hard_random(terrains, script.seed)
+    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
+        outcome = cross_in_all_ways(script, crossings, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=10)
+    return {"agreement": compare(outcome, script.seed)}
 
 
 def time_cpu(script: Script) -> dict[str, Any]:
@@ -128,7 +159,8 @@ def time_cpu(script: Script) -> dict[str, Any]:
     shutil.rmtree(run, ignore_errors=True)
     words = ("archive", "--robot", script.robot.name, "--preset", "small", "--device", "cpu", "--run-dir", str(run))
     subprocess.run([sys.executable, "-m", "faultline", *words], check=True)
-    return {"archive_wall_s": time.perf_counter() - began, **time_view(script.robot.name, script.runs / "speed")}
+    wall_s = time.perf_counter() - began
+    return {"cpu": {**script.origin(), "archive_wall_s": wall_s, **time_view(script.robot.name, script.runs / "speed")}}
 
 
 def time_view(robot: str, folder: Path) -> dict[str, float | None]:
@@ -163,32 +195,39 @@ def time_view(robot: str, folder: Path) -> dict[str, float | None]:
     return {"view_to_page_s": served_s, "view_to_failure_s": plays_s}
 
 
-def training_rates(file: Path) -> dict[str, float | None]:
-    """PPO's environment steps a second with learning, as train_speed.py wrote them."""
-    rows = json.loads(file.read_text())["rows"] if file.exists() else []
-    rates = {(row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in rows}
-    return {
-        "train_env_steps_per_s": rates.get((1, 4096)),
-        "train_env_steps_per_s_8192": rates.get((1, 8192)),
-        "train_env_steps_per_s_2gpu": rates.get((2, 8192)),
-        "train_env_steps_per_s_mjlab": None,
-    }
+def training_rates(file: Path) -> dict[str, Any]:
+    """PPO's environment steps a second with learning, as train_speed.py wrote them with today's sources."""
+    rows = json.loads(file.read_text())["rows"] if is_current(file) else []
+    rates = {(row.get("peer", "")[:5], row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in rows}
+    keys = {("", 1, 4096): "", ("", 1, 8192): "_8192", ("", 2, 8192): "_2gpu", ("mjlab", 1, 4096): "_mjlab"}
+    return {f"train_env_steps_per_s{key}": rates.get(row) for row, key in keys.items()} | {"training": rows}
+
+
+PARTS: dict[str, Callable[[Script], dict[str, Any]]] = {
+    "curve": time_curve, "iteration": time_iteration, "wide": time_wide, "flat": time_standing,
+    "kernels": time_kernels, "agreement": measure_agreement, "cpu": time_cpu,
+}  # fmt: skip
+ON_GPU = ("wide", "kernels")
+"""Parts that take a GPU, in a trial too."""
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Times everything."""
-    script = parse(__doc__, argv, "speed.json")
-    on_gpu = script.device.startswith("cuda")
-    return script.write(
-        {
-            **time_iteration(script),
-            **training_rates(script.out.with_name("train_speed.json")),
-            "envs_curve": time_curve(script),
-            "wide": time_wide(script) if on_gpu else None,
-            "kernels": time_kernels(script, 4000) if on_gpu else None,
-            "cpu": None if script.small else time_cpu(script),
-        }
-    )
+    """Measures the parts that are missing."""
+    script = parse(__doc__, argv, "speed.json", parts=tuple(PARTS))
+    on_gpu, origin = script.device.startswith("cuda"), script.origin()
+    here = [part for part in PARTS if part not in (("cpu",) if on_gpu else (*ON_GPU, "cpu"))]
+    report: dict[str, Any] = {}
+    for part in script.parts or (here if on_gpu or script.small else ("cpu",)):
+        report = json.loads(script.out.read_text()) if is_current(script.out) else {}
+        measured = report.get("measured", {})
+        if measured.get(part, {}).get("device") != origin["device"]:
+            if part != "cpu" or not report:
+                report |= origin
+            report |= PARTS[part](script)
+            measured[part] = {name: origin[name] for name in ("commit", "device", "date")}
+        rates = training_rates(script.out.with_name("train_speed.json"))
+        report = script.add(dict.fromkeys(KEYS) | report, {**rates, "measured": measured})
+    return report
 
 
 if __name__ == "__main__":

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kernels.episode import Outcome
 from qd.workers.evaluator import Compute
 from results.make import common, docs, speed, tables
 from sim.files.records import sources_sha256
+from sim.rates import counted_episodes
 from tests.qd.searches import without_figures
 from tests.qd.stand_in import Stub, make_result
 
@@ -20,6 +22,11 @@ MAKE = Path(common.__file__).parent
 SCRIPTS = ("base", "dose", "minimal", "pack", "penalty_ratios", "search", "spaces", "speed", "tables")
 """Those that call all that the others call."""
 FILES = {name: f"{name}.json" for name in SCRIPTS} | {"minimal": "archive/minimal.json", "pack": "pack/pack.json"}
+
+GOAL, HIT, LATE, INVALID = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID
+
+OURS = np.uint8([[GOAL, GOAL, HIT, LATE], [HIT, HIT, HIT, INVALID], [INVALID] * 4, [GOAL] * 4])
+THEIRS = np.uint8([[GOAL, LATE, LATE, LATE], [GOAL, HIT, HIT, HIT], [GOAL] * 4, [Outcome.RUNNING] * 4])
 
 
 @contextmanager
@@ -65,6 +72,16 @@ def test_a_file_of_other_sources_is_not_current(tmp_path):
         assert common.is_current(file) == (digest != "0" * 64)
 
 
+def test_a_part_of_speed_is_measured_once_by_sources(tmp_path, monkeypatch):
+    calls, out = [], tmp_path / "speed.json"
+    for part in speed.PARTS:
+        monkeypatch.setitem(speed.PARTS, part, lambda script, part=part: calls.append(part) or {part: len(calls)})
+    for parts in (["curve"], ["flat", "curve"], ["cpu"]):
+        report = speed.main(["--device", "cpu", "--out", str(out), "--parts", *parts])
+    assert calls == ["curve", "flat", "cpu"] and report == json.loads(out.read_text())
+    assert report | {"curve": 1, "flat": 2, "cpu": 3, "wide": None} == report and list(report["measured"]) == calls
+
+
 def test_means_over_seeds():
     # Of 1, 2 and 6 the mean is 3 and the standard deviation sqrt(7); t at 97.5 % and 2 degrees of freedom is 4.303.
     half = 4.303 * np.sqrt(7) / np.sqrt(3)
@@ -72,6 +89,31 @@ def test_means_over_seeds():
     assert numbers["elites"] == 3
     assert numbers["elites_interval"] == pytest.approx([3 - half, 3 + half], rel=1e-3)
     assert common.mean_over_seeds("faults", [1, None]) == {"faults": None, "faults_interval": None}
+
+
+def test_rates_are_of_valid_episodes():
+    np.testing.assert_array_equal(common.crossing_rates(OURS, "success"), [0.75, 0.0, np.nan, 1.0])
+    np.testing.assert_array_equal(common.crossing_rates(OURS, "goal"), [0.5, 0.0, np.nan, 1.0])
+    assert np.isnan(common.crossing_rates(THEIRS[3:], "goal"))  # they still run
+
+
+def test_no_episode_counts_where_more_than_a_quarter_are_invalid():
+    invalid = np.array([[True, False, False, False], [True, True, False, False]])
+    assert counted_episodes(invalid).tolist() == [[False, True, True, True], [False] * 4]
+    rates = common.crossing_rates(np.uint8([[INVALID, GOAL, GOAL, HIT], [INVALID, INVALID, GOAL, GOAL]]), "goal")
+    np.testing.assert_array_equal(rates, [2 / 3, np.nan])
+
+
+def test_bias_and_distance_are_of_terrains_that_both_have():
+    # Success .75 and 0 against 1 and .25: both .25 lower. Goal .5 and 0 against .25 and .25: once more, once less.
+    numbers = common.agreement(OURS, THEIRS, seed=0)
+    assert numbers["terrains"] == 2
+    assert numbers["success_bias"] == -0.25 and numbers["success_difference"] == 0.25
+    assert numbers["success_bias_interval"] == pytest.approx([-0.25, -0.25])
+    assert numbers["goal_bias"] == 0.0 and numbers["goal_difference"] == 0.25
+    assert numbers["goal_bias_interval"] == pytest.approx([-0.25, 0.25])
+    numbers = common.agreement(OURS[2:], THEIRS[2:], seed=0)
+    assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}
 
 
 def test_difference_of_two_kinds_of_controllers():
