@@ -169,6 +169,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         content = json.loads(out.read_text())
     for name in args.only:
         numbers = content["controllers"].get(name, {})
+        if args.speed and numbers.get("timed", {}).get("sources_sha256") == sources_sha256():
+            continue
         if not args.speed:
             numbers |= measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
         numbers |= time_alone(name, args.folder, runs, compute, seed=args.seed, small=args.small)
