@@ -292,7 +292,7 @@ def speed() -> str:
         "episodes/s by Ray, by number of GPUs": lambda row: row["named"]["ray"],
         "an iteration of preset paper [s]": shown("iteration_s_median", ".2f"),
         "its physics steps/s [million]": shown("world_steps_per_s", **million),
-        "... in those of contacts and solver alone": shown("bare_physics_ratio", ".2f"),
+        "... as a share of contacts and solver alone": shown("bare_physics_ratio", ".2f"),
         "an iteration of preset wide [s]": inside("wide", "surrogate", "iteration_s_median", form=".1f"),
         "... minutes for the paper's episodes": inside("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
         f"... by `{mixed}` [s]": inside("wide", mixed, "iteration_s_median", form=".1f"),
