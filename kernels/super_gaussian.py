@@ -82,7 +82,7 @@ def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, factor: flo
     heights_out[t, row, col] = factor * height
 
 
-def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0) -> None:
+def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0, *origin: float) -> None:
     """Rasterise one Super-Gaussian mixture a terrain (equation 1; genes clipped to [-1, 1], rescaled by Table I).
 
     Args:
@@ -90,6 +90,7 @@ def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0)
         spacing: Distance of neighbouring grid nodes [m].
         heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
         factor: Of all heights.
+        origin: x and y of the first node [m]; 0 if left out.
     """
     if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
         raise ValueError(
@@ -102,7 +103,8 @@ def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0)
         )
     num_bumps = genes.shape[1] // GENES_PER_BUMP
     bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
-    inputs = [genes, _genes(*LOWER), _genes(*UPPER)]
+    shift = np.pad(origin, (0, GENES_PER_BUMP - len(origin)))
+    inputs = [genes, _genes(*(LOWER - shift)), _genes(*(UPPER - shift))]
     wp.launch(_decode_genes_kernel, bumps.shape, inputs, outputs=[bumps], device=genes.device)
     inputs = [bumps, spacing, factor]
     wp.launch(_rasterise_bumps_kernel, heights_out.shape, inputs, outputs=[heights_out], device=genes.device)

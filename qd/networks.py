@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,110 +19,115 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
 
 Moments = list[dict[str, Tensor]]
 """What Adam remembers of each tensor of weights: `step`, `exp_avg` and `exp_avg_sq`; nothing before its first step."""
+_Layers = tuple[tuple[Tensor, Tensor], ...]
 
 
-class Networks(nn.ModuleList):
+class Networks(nn.Module):
     """Small convolutional networks side by side, as groups of channels.
 
     They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
     depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
     place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does. Of
     ``num_maps`` maps of a terrain each network says ``num_out`` numbers.
+
+    Parameters are weights and biases of each layer in turn, all zero, of shapes (MEMBERS * out, in, *size) and
+    (MEMBERS * out,). Weights lie in memory as convolutions are fastest, on the CPU and on CUDA.
     """
 
     def __init__(self, num_maps: int, num_out: int) -> None:
         super().__init__()
-        self._num_maps = num_maps
         (rows, cols), channels = SHAPE, num_maps
+        layers, self._weights = [], nn.ParameterList()
         for size, strides, channels_out in _CONVOLUTIONS:
-            self.append(_beside(channels, channels_out, size, stride=strides, padding=size // 2))
+            layers.append((channels_out, channels, size, size))
             rows, cols, channels = -(-rows // strides[0]), -(-cols // strides[1]), channels_out
-        self.append(_beside(channels + _WAVES, _FEATURES, (rows, 3), padding=(0, 1)))
-        self.append(_beside(2 * _FEATURES, num_out, 1))
+        for out, *shape in (*layers, (_FEATURES, channels + _WAVES, rows, 3), (num_out, 2 * _FEATURES, 1, 1)):
+            weights = torch.zeros(MEMBERS * out, *shape).contiguous(memory_format=torch.channels_last)
+            self._weights.extend([weights, torch.zeros(MEMBERS * out)])
         waves = math.pi * torch.arange(1, _WAVES + 1)[:, None] * torch.linspace(0.0, 1.0, cols)  # from start to goal
-        self.register_buffer("_where", waves.cos()[:, None].repeat(1, rows, 1), persistent=False)
+        places = nn.functional.unfold(waves.cos()[None, :, None].repeat(1, 1, rows, 1), (rows, 3), padding=(0, 1))
+        self.register_buffer("_places", places[0], persistent=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """What each network says of the maps that it sees, (batch, MEMBERS, num_maps, *SHAPE).
+        """What each network says of the maps that it sees, (MEMBERS, batch, *SHAPE, num_maps).
 
         Shape (batch, MEMBERS, num_out).
         """
         if maps.is_cuda:
-            return self._through(maps.flatten(1, 2), slice(None))
-        # One by one, since groups are slow on the CPU.
-        members = (slice(member, member + 1) for member in range(MEMBERS))
-        return torch.cat([self._through(maps[:, member].flatten(1, 2), member) for member in members], dim=1)
+            return self._through(maps.movedim(0, 3).flatten(3), *self._layers(MEMBERS))
+        # One by one, since channels that no weight joins cost time on the CPU.
+        return torch.cat([*map(self._through, maps, self._layers(1))], dim=1)
 
     def judge(self, maps: Tensor) -> Tensor:
-        """What each network says of the same maps, (batch, num_maps, *SHAPE); on CUDA half precision is enough.
+        """What each network says of the same maps, (batch, *SHAPE, num_maps); on CUDA half precision is enough.
 
         Float32, shape (batch, MEMBERS, num_out).
         """
         if not maps.is_cuda:
-            return self(maps[:, None].expand(-1, MEMBERS, -1, -1, -1))
+            return self(maps.expand(MEMBERS, -1, -1, -1, -1))
         with torch.autocast("cuda", torch.float16):
-            return self._through(maps, slice(None)).float()
+            return self._through(maps, *self._layers(MEMBERS)).float()
 
-    def _through(self, rows: Tensor, members: slice) -> Tensor:
-        """What some of the networks say of maps for each of them or for all, shape (batch, networks, num_out)."""
-        count = len(range(MEMBERS)[members])
-        alike = rows.shape[1] < count * self._num_maps
-        for index, layer in enumerate(self):
-            assert isinstance(layer, nn.Conv2d) and layer.bias is not None
-            weight, bias = (
-                part.unflatten(0, (MEMBERS, -1))[members].flatten(0, 1) for part in (layer.weight, layer.bias)
-            )
-            rows = nn.functional.relu(rows) if index else rows
-            if index == len(_CONVOLUTIONS):
-                rows = self._placed(rows, count)
-            elif index > len(_CONVOLUTIONS):
-                rows = _pooled(rows, count)
-            groups = count if index or not alike else 1
-            rows = nn.functional.conv2d(rows, weight, bias, layer.stride, layer.padding, groups=groups)
-        return rows.reshape(len(rows), count, -1)
+    def _layers(self, count: int) -> list[_Layers]:
+        """Weights and biases of each layer, of ``count`` networks after the other."""
+        parts = [part.unflatten(0, (MEMBERS, -1)).split(count) for part in self._weights]
+        return [tuple(zip(tensors[::2], tensors[1::2], strict=True)) for tensors in zip(*parts, strict=True)]
 
-    def _placed(self, rows: Tensor, networks: int) -> Tensor:
-        """Each network's channels, and beside them where they lie."""
-        apart = rows.unflatten(1, (networks, -1))
-        where = self.get_buffer("_where").expand(len(rows), networks, -1, -1, -1)
-        return torch.cat([apart, where], dim=2).flatten(1, 2)
+    def _through(self, maps: Tensor, layers: _Layers) -> Tensor:
+        """What networks of some layers say of maps for each of them or for all, shape (batch, networks, num_out)."""
+        rows = maps.movedim(-1, 1)
+        for (size, strides, _), (weight, bias) in zip(_CONVOLUTIONS, layers, strict=False):
+            alike = rows.shape[1] == weight.shape[2]  # all networks see the same
+            weight = weight.flatten(0, 1) if alike else _block_diagonal(weight)
+            rows = nn.functional.conv2d(rows, weight, bias.flatten(), strides, size // 2).relu()
+        (weight, bias), (last_weight, last_bias) = layers[-2:]
+        weight, of_places = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
+        places = of_places.flatten(2) @ self.get_buffer("_places") + bias[..., None]  # the same in every row
+        rows = nn.functional.conv2d(rows, _block_diagonal(weight), padding=(0, 1))
+        rows = (rows.reshape(len(rows), *places.shape) + places).relu()
+        pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2)
+        return torch.einsum("bni,noi->bno", pooled, last_weight.flatten(2)) + last_bias
 
 
-def _beside(channels_in: int, channels_out: int, size: Any, stride: Any = 1, padding: Any = 0) -> nn.Conv2d:
-    channels = MEMBERS * channels_in, MEMBERS * channels_out
-    return nn.Conv2d(*channels, size, groups=MEMBERS, stride=stride, padding=padding)
+def _block_diagonal(weight: Tensor) -> Tensor:
+    """Weights of networks, (networks, out, in, *size), as those of one convolution, whose groups would be slower.
 
-
-def _pooled(rows: Tensor, networks: int) -> Tensor:
-    """Mean and maximum along the way, each network's side by side, shape (batch, networks * 2 * channels, 1, 1)."""
-    apart = rows.unflatten(1, (networks, -1))
-    return torch.cat([apart.mean(-1, keepdim=True), apart.amax(-1, keepdim=True)], dim=2).flatten(1, 2)
+    Shape (networks * out, networks * in, *size).
+    """
+    count = len(weight)
+    if count == 1:
+        return weight[0]
+    apart = torch.eye(count, device=weight.device)[:, None, :, None, None, None] * weight[:, :, None]
+    return apart.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
 
 
 class Training:
     """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
 
     The graph holds the memory of weights and moments. So networks that are moved need a new training, which captures
-    anew. ``loss`` is of what the networks say and what they should, both of shape (batch, MEMBERS, num_out).
-    ``moments`` are what Adam remembers from before, of each tensor of weights.
+    anew. On CUDA all steps must be taken on one stream, other than the default one. ``loss`` is of what the networks
+    say and what they should, both of shape (batch, MEMBERS, num_out). ``moments`` are what Adam remembers from before,
+    of each tensor of weights.
     """
 
     def __init__(
         self, networks: Networks, loss: Callable[[Tensor, Tensor], Tensor], device: str, moments: Moments | None = None
     ) -> None:
-        on_cuda = device.startswith("cuda")
-        self._networks, self._loss, self._device = networks, loss, device
+        self._networks, self._loss, self._on_cuda = networks, loss, device.startswith("cuda")
         weights = list(networks.parameters())
         for tensor in weights:
             tensor.grad = None
         self._optimiser = torch.optim.AdamW(
-            weights, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, capturable=on_cuda, fused=on_cuda or None
+            weights, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, capturable=self._on_cuda, fused=True
         )
         for tensor, remembered in zip(weights, moments or [{} for _ in weights], strict=True):
             if remembered:  # Adam begins anew where there is nothing
-                self._optimiser.state[tensor] = {name: remembered[name].to(device) for name in _MOMENTS}
-        self._batch: tuple[Tensor, Tensor, Tensor] | None = None  # maps, targets, which maps are mirrored
-        self._stream = torch.cuda.Stream(device) if on_cuda else None
+                likes = tensor.new_zeros(()), tensor, tensor  # a moment's memory is laid out as that of its weights
+                self._optimiser.state[tensor] = {
+                    name: torch.empty_like(like).copy_(remembered[name])
+                    for name, like in zip(_MOMENTS, likes, strict=True)
+                }
+        self._batch: tuple[Tensor, Tensor] | None = None  # maps and targets
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_steps = 0
 
@@ -139,36 +143,26 @@ class Training:
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
         """Takes a step for each batch that was drawn. All tensors are on the device.
 
-        Maps of all terrains are of half precision, shape (N, num_maps, *SHAPE); targets are what the networks should
+        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets are what the networks should
         say of them, (N, num_out). ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it
         sees them mirrored, both (steps, batch, MEMBERS).
         """
-        if self._stream is None:
-            self._take_steps(maps, targets, drawn, turned)
-            return
-        # One stream of our own for every backward pass: autograd remembers the stream of a tensor's first use, and a
-        # capture must not meet another one.
-        current = torch.cuda.current_stream(self._device)
-        self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream):
-            self._take_steps(maps, targets, drawn, turned)
-        current.wait_stream(self._stream)
-
-    def _take_steps(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
+        terrains, turned = drawn.transpose(1, 2), turned.transpose(1, 2)
         if self._batch is None:  # memory of a batch, the same in every step
-            count = turned[0].numel()
-            batch = maps.new_empty(count, *maps.shape[1:]), targets.new_empty(count, *targets.shape[1:])
-            self._batch = *batch, torch.empty_like(turned[0])
-        batch_maps, batch_targets, batch_turned = self._batch
-        for rows, mirrored in zip(drawn.flatten(1), turned, strict=True):
-            # Outside of the graph, since the tensors of all terrains grow and move.
-            torch.index_select(maps, 0, rows, out=batch_maps)
-            torch.index_select(targets, 0, rows, out=batch_targets)
-            batch_turned.copy_(mirrored)
+            shape = terrains.shape[1:]
+            self._batch = maps.new_empty(*shape, *maps.shape[1:]), targets.new_empty(*shape, targets.shape[1])
+        batch_maps, batch_targets = self._batch
+        # A mirrored terrain has the lines along the way in the opposite order.
+        lines = torch.arange(SHAPE[0], device=maps.device)
+        rows = torch.where(turned[..., None], lines.flip(0), lines) + len(lines) * terrains[..., None]
+        for step_rows, step_terrains in zip(rows.int().flatten(1), terrains.flatten(1), strict=True):
+            # Outside of the graph, since they are drawn from ever more terrains.
+            torch.index_select(maps.flatten(0, 1), 0, step_rows, out=batch_maps.flatten(0, 2))
+            torch.index_select(targets, 0, step_terrains, out=batch_targets.flatten(0, 1))
             self._take_step()
 
     def _take_step(self) -> None:
-        if self._stream is None or self._eager_steps < _EAGER_STEPS:
+        if not self._on_cuda or self._eager_steps < _EAGER_STEPS:
             self._learn_batch()
             self._eager_steps += 1
             return
@@ -176,7 +170,7 @@ class Training:
             self._optimiser.zero_grad(set_to_none=True)  # so that the graph has gradients of its own
             graph = torch.cuda.CUDAGraph()
             # Other threads may use the device meanwhile.
-            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
+            with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
                 self._learn_batch()  # is recorded, not done
             self._graph = graph
         self._graph.replay()
@@ -184,9 +178,7 @@ class Training:
     def _learn_batch(self) -> None:
         """A step on the batch that lies in fixed memory."""
         assert self._batch is not None
-        maps, targets, turned = self._batch
-        maps = maps.float().unflatten(0, turned.shape)
-        maps = torch.where(turned[..., None, None, None], maps.flip(-2), maps)
+        maps, targets = self._batch
         self._optimiser.zero_grad(set_to_none=True)
-        self._loss(self._networks(maps), targets.unflatten(0, turned.shape)).backward()
+        self._loss(self._networks(maps.float()), targets.transpose(0, 1)).backward()
         self._optimiser.step()

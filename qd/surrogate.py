@@ -15,15 +15,15 @@ from torch import Tensor, nn
 
 from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
-from qd.networks import MEMBERS, Networks, Training
+from qd.networks import MEMBERS, Moments, Networks, Training
 from qd.run.presets import SchedulerCfg
-from sim.corridor import corridor_ground, corridor_heights
-from sim.policy.loaders import prepare_torch
+from sim.corridor import SHAPE, corridor_ground, corridor_heights
+from sim.policy.loaders import on_stream, prepare_torch
 from sim.spaces.base import TerrainSpace, clipped
 from sim.spaces.registry import get_space
 
 BATCH = 64
-"""Terrains of a step of training, for each network."""
+"""Terrains of a step of training, for each network, or as many as an iteration has if those are fewer."""
 FEWEST = 64
 """Valid terrains that must be known before the networks are asked."""
 MOST = 50_000
@@ -62,29 +62,23 @@ class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals."""
 
     def __init__(self, cfg: SchedulerCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
-        self.cfg, self.cells, self.device = cfg, cells, "cpu"
+        self.cfg, self.cells = cfg, cells
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
         self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
         self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
-        self._make_networks()
+        self._networks = Networks(1 + len(space.ground), self._targets.shape[1])
         for weights in self._networks.parameters():
             drawn = self._rng.normal(size=weights.shape) * np.sqrt(2.0 / max(1, weights[0].numel()))
             values = drawn if weights.ndim > 1 else np.zeros(weights.shape)
             weights.data.copy_(torch.from_numpy(values))
+        self._work_on("cpu")
 
     @property
     def _regressed(self) -> int:
         """Numbers that are regressed: logarithms of the penalties' means and stds, and the fitness."""
         return 2 * self.cells.num_ratios + 1
-
-    def _make_networks(self) -> None:
-        with torch.random.fork_rng(devices=[]):  # torch draws weights first, which are replaced
-            self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
-        self._training = Training(self._networks, self._loss, self.device)
-        self._maps: Tensor | None = None  # of the genes
-        self._codes: Tensor | None = None  # of the cells
 
     @property
     def space(self) -> TerrainSpace:
@@ -97,11 +91,20 @@ class Surrogate:
 
     def compute_on(self, device: str) -> None:
         """Moves the work to a Warp device; to the CPU where torch does not see such a device."""
-        self.device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
-        prepare_torch(self.device)
-        self._maps, self._codes = None, None
-        moments = self._training.moments
-        self._training = Training(self._networks.to(self.device), self._loss, self.device, moments)
+        device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
+        prepare_torch(device)
+        self._work_on(device, self._training.moments)
+
+    def _work_on(self, device: str, moments: Moments | None = None) -> None:
+        self.device = device
+        # Its many small kernels go before the large ones that let robots walk, which fill what is left of the device;
+        # the other way round each small one would wait for a large one to end.
+        self._stream = torch.cuda.Stream(device, priority=-1) if device.startswith("cuda") else None
+        self._maps: Tensor | None = None  # a ring of the newest terrains' maps, in half precision since there are many
+        self._num_mapped, self._num_unmapped = 0, len(self)  # terrains that the ring has taken, and has still to take
+        self._codes: Tensor | None = None  # of the cells
+        with on_stream(self._stream):
+            self._training = Training(self._networks.to(device), self._loss, device, moments)
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         """Remembers terrains, of genes (N, num_genes), and trains for their share of an iteration's steps.
@@ -112,37 +115,47 @@ class Surrogate:
         if valid.any():
             self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
         if len(self) >= FEWEST:
-            self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
+            with on_stream(self._stream):
+                self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         units = np.rint(genes * _GENE_UNITS).astype(np.int16)
-        if self._maps is not None:
-            self._maps = torch.cat([self._maps, self._map_units(units)])[-MOST:]
         self._genes = np.concatenate([self._genes, units])[-MOST:]
         self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-MOST:]
+        self._num_unmapped = min(self._num_unmapped + len(units), len(self))
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
-    def _map_units(self, units: NDArray[np.int16]) -> Tensor:
-        """Maps of genes as they are remembered, in half precision since there are many, shape (N, num_maps, *SHAPE)."""
-        parts = torch.from_numpy(units).to(self.device).split(_AT_ONCE["cpu"])
-        return torch.cat([self._map_genes(part / _GENE_UNITS).half() for part in parts])
-
     def _map_genes(self, genes: Tensor) -> Tensor:
-        """Heights over their scale, and ground."""
+        """Heights over their scale, and ground, shape (N, *SHAPE, num_maps)."""
         heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
-        return torch.cat([heights[:, None], corridor_ground(genes, self.space)], dim=1)
+        return torch.cat([heights[..., None], corridor_ground(genes, self.space).movedim(1, -1)], dim=-1)
+
+    def _map_new(self) -> tuple[Tensor, Tensor]:
+        """The ring of maps, once it has those of all terrains, and the place of each terrain in it."""
+        if self._maps is None:
+            shape = MOST, *SHAPE, 1 + len(self.space.ground)
+            self._maps = torch.empty(shape, dtype=torch.half, device=self.device)
+        self._num_mapped += self._num_unmapped
+        places = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
+        new = slice(len(self) - self._num_unmapped, None)
+        units = torch.from_numpy(self._genes[new]).to(self.device)
+        for part, rows in zip(units.split(_AT_ONCE["cpu"]), places[new].split(_AT_ONCE["cpu"]), strict=True):
+            self._maps[rows] = self._map_genes(part / _GENE_UNITS).half()
+        self._num_unmapped = 0
+        return self._maps, places
 
     def _train(self, steps: int) -> None:
-        if self._maps is None:
-            self._maps = self._map_units(self._genes)
+        maps, places = self._map_new()
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         ratios, numbers, rates = self._split(torch.from_numpy(self._targets).to(self.device).float())
         targets = torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
-        shape = steps, BATCH, MEMBERS
+        shape = steps, min(BATCH, self.cfg.num_terrains), MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
-        self._training.run(self._maps, targets, drawn, turned)
+        ordered = targets.new_empty(len(maps), targets.shape[1])
+        ordered[places] = targets
+        self._training.run(maps, ordered, places[drawn], turned)
 
     def _split(self, columns: Any) -> tuple[Any, Any, Any]:
         """Columns of ratios, numbers and rates."""
@@ -186,17 +199,18 @@ class Surrogate:
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
-        draw = torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
-        parents = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
-        if len(self) < FEWEST:
-            return self._vary(parents, count, draw).cpu().numpy()
-        explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
-        best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
-        np.maximum.at(best, cell, fitness.astype(np.float32))
-        expected = torch.cat([torch.from_numpy(under_way).to(self.device), explored])
-        best_expected = self._add_expected(torch.from_numpy(best).to(self.device), expected)
-        searched = self._search(count - len(explored), parents, best_expected, count, draw)
-        return torch.cat([explored, searched]).cpu().numpy()
+        with on_stream(self._stream):
+            draw = torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
+            parents = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
+            if len(self) < FEWEST:
+                return self._vary(parents, count, draw).cpu().numpy()
+            explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
+            best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
+            np.maximum.at(best, cell, fitness.astype(np.float32))
+            expected = torch.cat([torch.from_numpy(under_way).to(self.device), explored])
+            best_expected = self._add_expected(torch.from_numpy(best).to(self.device), expected)
+            searched = self._search(count - len(explored), parents, best_expected, count, draw)
+            return torch.cat([explored, searched]).cpu().numpy()
 
     def _add_expected(self, best: Tensor, expected: Tensor) -> Tensor:
         """Fitness in each cell once robots have crossed what they are to cross already, shape (num_cells,)."""
@@ -253,7 +267,11 @@ class Surrogate:
     def __getstate__(self) -> dict[str, Any]:
         """Plain values and arrays; maps are made again."""
         parts = zip(self._networks.parameters(), self._training.moments, strict=True)
-        learned = [{"weights": weights.detach(), **moments} for weights, moments in parts]
+        with on_stream(self._stream):  # another one would wait for crossings
+            learned = [
+                {name: value.detach().cpu().numpy() for name, value in {"weights": weights, **moments}.items()}
+                for weights, moments in parts
+            ]
         return {
             "cfg": asdict(self.cfg),
             "cells": (self.cells.num_ratios, self.cells.intervals, self.cells.collision_bit),
@@ -262,23 +280,21 @@ class Surrogate:
             "genes": self._genes,
             "targets": self._targets,
             "scale": self._scale,
-            "learned": [{name: value.cpu().numpy() for name, value in tensors.items()} for tensors in learned],
+            "learned": learned,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """On the CPU, until :meth:`compute_on` moves it."""
         num_ratios, intervals, collision_bit = state["cells"]
-        self.cfg, self.device = SchedulerCfg(**state["cfg"]), "cpu"
+        self.cfg = SchedulerCfg(**state["cfg"])
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
-        self._make_networks()
-        moments = [
-            {name: torch.from_numpy(array).clone() for name, array in arrays.items()} for arrays in state["learned"]
-        ]
+        self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
+        moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state["learned"]]
         for weights, tensors in zip(self._networks.parameters(), moments, strict=True):
             weights.data.copy_(tensors.pop("weights"))
-        self._training = Training(self._networks, self._loss, self.device, moments)
+        self._work_on("cpu", moments)
 
 
 def vary_elites(

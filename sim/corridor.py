@@ -64,10 +64,9 @@ def _nodes(span: tuple[float, float]) -> np.ndarray:
 
 
 def _sampled(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    row, col = round(Y[0] / NODE_SPACING), round(X[0] / NODE_SPACING)
-    heights = genes.new_empty(len(genes), row + SHAPE[0], col + SHAPE[1])
-    space.rasterise(wp.from_torch(genes.contiguous()), NODE_SPACING, wp.from_torch(heights))
-    return heights[:, row:, col:]
+    heights = genes.new_empty(len(genes), *SHAPE)
+    space.rasterise(wp.from_torch(genes.contiguous()), NODE_SPACING, wp.from_torch(heights), X[0], Y[0])
+    return heights
 
 
 def _averaged(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:

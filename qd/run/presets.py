@@ -53,7 +53,7 @@ class SchedulerCfg:
     disagree_share: Share = 0.1
     """Surrogate: share of its terrains that the networks disagree most about."""
     training_steps: Annotated[int, Meta(ge=1, le=100_000)] = 100
-    """Surrogate: steps of training an iteration, each on 64 terrains a network."""
+    """Surrogate: steps of training an iteration, each on 64 terrains a network, or as many as an iteration has."""
 
     def __post_init__(self) -> None:
         check(self)

@@ -7,7 +7,8 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,32 @@ def prepare_torch(device: str) -> None:
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
     else:
         torch.set_num_threads(1)
+
+
+class _TorchMemory:
+    """Memory of torch for Warp's arrays: it is given back in the order of its stream, and no other stream waits."""
+
+    def allocate(self, size_in_bytes: int) -> int:
+        return torch.cuda.caching_allocator_alloc(size_in_bytes)
+
+    def deallocate(self, ptr: int, size_in_bytes: int) -> None:
+        torch.cuda.caching_allocator_delete(ptr)
+
+
+@contextmanager
+def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
+    """Let torch and Warp work on ``stream``, which waits for nothing; later work of the present one waits for it.
+
+    Warp's arrays that are made meanwhile must not be used afterwards. None changes nothing.
+    """
+    if stream is None:
+        yield
+        return
+    before, on_warp = torch.cuda.current_stream(stream.device), wp.stream_from_torch(stream)
+    memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
+    with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
+        yield
+    before.wait_stream(stream)
 
 
 def read_weights(path: Path) -> Any:

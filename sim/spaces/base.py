@@ -60,10 +60,11 @@ class TerrainSpace(Protocol):
         """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
         return ()
 
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
 
         Heights [m] have shape (num_terrains, nrow, ncol), row along y, column along x, at nodes ``spacing`` [m] apart.
+        ``origin`` is x and y of the first node [m] where they are not 0, in spaces of any spacing alone.
         """
         ...
 

@@ -61,9 +61,9 @@ class OnGround(TerrainSpace):
         per_part = self.inner.genes_per_part
         return per_part if per_part and NUM_PATCHES % per_part == 0 else None
 
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes into heights on the device, by the space."""
-        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out)
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device (:mod:`kernels.ground`)."""

@@ -38,9 +38,9 @@ class SuperGaussian(TerrainSpace):
         """Eight genes a bump, in the order of :data:`kernels.super_gaussian.PARAMETERS`, bump after bump."""
         return self.num_bumps * GENES_PER_BUMP
 
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
-        super_gaussian.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT)
+        super_gaussian.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT, *origin)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Uniform genes, but every bump at its lowest or highest height: the paper's hard-random terrains."""
