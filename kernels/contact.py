@@ -1,4 +1,4 @@
-"""Terrain contact: strips of sphere probes against height grids, written as contact records for the physics solver.
+"""Terrain contact: strips of sphere probes against height grids.
 
 A strip is a row of equal spheres on one collision shape, straight but for meshes (:mod:`sim.robots.probes` makes them).
 Of the probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its
@@ -9,7 +9,11 @@ from typing import Any
 
 import warp as wp
 
+from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
+from kernels.state import make_zeros
+
+_vec5 = wp.types.vector(5, float)
 
 
 @wp.struct
@@ -31,51 +35,63 @@ class Probes:
 
 
 @wp.struct
-class Layout:
-    """Where the robots of the environments stand in the flat model arrays."""
+class Contacts:
+    """Terrain contacts of every robot, shape (num_envs, capacity) each."""
 
-    bodies_per_env: int
-    shapes_per_env: int
-    first_shape: int
-    """Index of environment 0's first collision shape."""
-    ground_shape: int
-    """The static shape that carries the ground's material."""
+    count: wp.array[int]
+    """Of each robot, shape (num_envs,): it runs on past the capacity, the rest does not."""
+    shape: wp.array2d[int]
+    """Collision shape, counted within one robot."""
+    point: wp.array2d[wp.vec3]
+    """Middle between the surfaces that overlap, world-local [m]."""
+    normal: wp.array2d[wp.vec3]
+    """From the ground to the robot."""
+    distance: wp.array2d[float]
+    """Of the surfaces [m], below 0."""
+    friction: wp.array2d[float]
+    """Factor of the friction, by the patch of ground."""
+    time_constant: wp.array2d[float]
+    """Contact time constant of soft ground [s], ``FIRM`` for the robot's own."""
+    force: wp.array2d[wp.vec3]
+    """On the robot, world frame [N]; from the solver."""
 
 
 @wp.struct
-class ContactBuffer:
-    """Contact records as Newton's solver reads them (``newton.Contacts``), shape (capacity,) each."""
+class Surfaces:
+    """What contacts of each collision shape of a robot with the ground are like, by MuJoCo's names; (num_shapes,) each.
 
-    count: wp.array[int]
-    shape0: wp.array[int]
-    shape1: wp.array[int]
-    point0: wp.array[wp.vec3]
-    point1: wp.array[wp.vec3]
-    normal: wp.array[wp.vec3]
-    offset0: wp.array[wp.vec3]
-    offset1: wp.array[wp.vec3]
-    margin0: wp.array[float]
-    margin1: wp.array[float]
+    Those of two dimensions have a row for each robot, or one for all.
+    """
+
+    geom: wp.array[int]
+    """The solver's number."""
+    body: wp.array[int]
+    condim: wp.array[int]
+    friction: wp.array2d[_vec5]
+    solref: wp.array2d[wp.vec2]
+    solimp: wp.array2d[_vec5]
 
 
 @wp.func
-def _emit_contact(
-    contacts: ContactBuffer, slot: int, ground_shape: int, shape: int, terrain: Terrain, t: int, pose: wp.transform,
-    centre: wp.vec3, radius: float,
+def _write_contact(
+    contacts: Contacts, slot: int, shape: int, terrain: Terrain, ground: Ground, t: int, env: int, centre: wp.vec3,
+    radius: float,
 ):  # fmt: skip
-    # The capacity is checked by whoever reads the count: it runs on past it, the records do not.
-    if slot < contacts.shape0.shape[0]:
-        centre_w = wp.transform_point(pose, centre)
-        point = nearest_surface_point(terrain, t, centre_w, radius)
-        contacts.shape0[slot] = ground_shape
-        contacts.shape1[slot] = shape
-        contacts.point0[slot] = centre_w - point.normal * point.distance
-        contacts.point1[slot] = centre
-        contacts.normal[slot] = point.normal
-        contacts.offset0[slot] = wp.vec3(0.0)
-        contacts.offset1[slot] = wp.transform_vector(wp.transform_inverse(pose), -point.normal * radius)
-        contacts.margin0[slot] = 0.0
-        contacts.margin1[slot] = radius
+    if slot < contacts.shape.shape[1]:
+        point = nearest_surface_point(terrain, t, centre, radius)
+        touched = centre - point.normal * point.distance
+        contacts.shape[env, slot] = shape
+        contacts.point[env, slot] = 0.5 * (touched + centre - point.normal * radius)
+        contacts.normal[env, slot] = point.normal
+        contacts.distance[env, slot] = point.distance - radius
+        factor = float(1.0)
+        time_constant = FIRM
+        if ground.friction.shape[0] > 0:
+            patch = patch_at(touched[0], touched[1])
+            factor = ground.friction[t, patch[0], patch[1]]
+            time_constant = ground.time_constant[t, patch[0], patch[1]]
+        contacts.friction[env, slot] = factor
+        contacts.time_constant[env, slot] = time_constant
 
 
 @wp.kernel
@@ -84,14 +100,15 @@ def _collide_strips_kernel(
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     probes: Probes,
-    layout: Layout,
-    contacts_out: ContactBuffer,
+    ground: Ground,
+    bodies_per_env: int,
+    contacts_out: Contacts,
 ):
     """Grid (num_strips, num_envs): the threads of a warp look at the same part of different robots."""
     strip, env = wp.tid()
     t = terrain_of_env[env]
     radius = probes.strip_radius[strip]
-    pose = body_q[env * layout.bodies_per_env + probes.strip_body[strip]]
+    pose = body_q[env * bodies_per_env + probes.strip_body[strip]]
     begin = probes.strip_start[strip]
     end = probes.strip_start[strip + 1]
     a = wp.transform_point(pose, probes.position[begin])
@@ -123,31 +140,56 @@ def _collide_strips_kernel(
                 deepest = k
     if first < 0:
         return
-    shape = layout.first_shape + env * layout.shapes_per_env + probes.strip_shape[strip]
-    slot = wp.atomic_add(contacts_out.count, 0, 1 + int(first != deepest) + int(last != deepest))
-    ground = layout.ground_shape
-    _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[deepest], radius)
+    slot = wp.atomic_add(contacts_out.count, env, 1 + int(first != deepest) + int(last != deepest))
+    shape = probes.strip_shape[strip]
+    centre = wp.transform_point(pose, probes.position[deepest])
+    _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
     if first != deepest:
         slot += 1
-        _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[first], radius)
+        centre = wp.transform_point(pose, probes.position[first])
+        _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
     if last != deepest:
         slot += 1
-        _emit_contact(contacts_out, slot, ground, shape, terrain, t, pose, probes.position[last], radius)
+        centre = wp.transform_point(pose, probes.position[last])
+        _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
 
 
 def collide_strips(
-    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, layout: Layout, contacts_out: ContactBuffer
+    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, contacts_out: Contacts
 ) -> None:
-    """Append every environment's terrain contacts to ``contacts_out`` (whose count the caller has cleared).
+    """Find every robot's terrain contacts, all of ``contacts_out`` but the forces.
 
-    ``body_q`` are the poses in the world-local frame, shape (num_envs * bodies_per_env,). Contacts past the capacity
-    are counted but not written.
+    ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
+    the same everywhere.
     """
-    num_envs = terrain_of_env.shape[0]
-    if body_q.shape[0] != num_envs * layout.bodies_per_env:
-        raise ValueError(
-            f"body_q must hold {num_envs} x {layout.bodies_per_env} poses, got {body_q.shape[0]}: "
-            "one robot per entry of terrain_of_env"
-        )
-    inputs, size = [body_q, terrain_of_env, terrain, probes, layout], (probes.strip_radius.shape[0], num_envs)
-    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=body_q.device)
+    num_envs, bodies_per_env = body_q.shape
+    if terrain_of_env.shape[0] != num_envs:
+        raise ValueError(f"body_q must hold {terrain_of_env.shape[0]} robots, one a terrain_of_env, got {num_envs}")
+    contacts_out.count.zero_()
+    inputs = [body_q.flatten(), terrain_of_env, terrain, probes, ground, bodies_per_env]
+    size, device = (probes.strip_radius.shape[0], num_envs), body_q.device
+    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=device)
+
+
+def make_contacts(num_envs: int, capacity: int, device: str | None = None) -> Contacts:
+    """Room for so many contacts of each robot."""
+    fields = dict.fromkeys(Contacts.vars, (num_envs, capacity)) | {"count": (num_envs,)}
+    return make_zeros(Contacts, device, **fields)
+
+
+@wp.kernel
+def _sum_forces_kernel(contacts: Contacts, column_of_shape: wp.array[int], geom_force_out: wp.array2d[wp.vec3]):
+    """Grid (num_envs,)."""
+    env = wp.tid()
+    for column in range(geom_force_out.shape[1]):
+        geom_force_out[env, column] = wp.vec3(0.0)
+    for c in range(wp.min(contacts.count[env], contacts.shape.shape[1])):
+        column = column_of_shape[contacts.shape[env, c]]
+        if column >= 0:
+            geom_force_out[env, column] += contacts.force[env, c]
+
+
+def sum_forces(contacts: Contacts, column_of_shape: Any, geom_force_out: Any) -> None:
+    """Sum the contact forces on each robot geom; ``column_of_shape`` is that of each collision shape, -1 for others."""
+    inputs, device = [contacts, column_of_shape], geom_force_out.device
+    wp.launch(_sum_forces_kernel, geom_force_out.shape[0], inputs, outputs=[geom_force_out], device=device)

@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from kernels.contact import Contacts, Surfaces
 from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 
@@ -168,3 +169,102 @@ def _ask_poses_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform])
 def ask_poses(solver: SolverState, body_q_out: Any) -> None:
     """Read the poses of bodies, world-local frame, shape (num_envs, bodies_per_env), from mujoco_warp's data."""
     wp.launch(_ask_poses_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
+
+
+_vec5 = wp.types.vector(5, float)
+
+
+@wp.struct
+class SolverContacts:
+    """mujoco_warp's contacts, and the forces on its rows of constraints."""
+
+    count: wp.array[int]
+    worldid: wp.array[int]
+    geom: wp.array[wp.vec2i]
+    dist: wp.array[float]
+    pos: wp.array[wp.vec3]
+    frame: wp.array[wp.mat33]
+    """Rows: normal (toward the second geom) and two tangents, world frame."""
+    dim: wp.array[int]
+    friction: wp.array[_vec5]
+    solref: wp.array[wp.vec2]
+    solimp: wp.array[_vec5]
+    efc_address: wp.array2d[int]
+    """Rows of each contact; negative where the contact is inactive."""
+    efc_force: wp.array2d[float]
+    overflow: wp.array[int]
+    too_many: int
+    """Its bit for more contacts than there is room for."""
+    ground: int
+    """Its number of the ground's geom."""
+    slot: wp.array2d[int]
+    """Where each contact of a robot lies in the others, shape (num_envs, capacity)."""
+
+
+@wp.kernel
+def _tell_contacts_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts):
+    """Grid (num_envs, capacity)."""
+    env, c = wp.tid()
+    if c == 0:
+        solver_out.overflow[env] = 0
+        if contacts.count[env] > contacts.shape.shape[1]:
+            solver_out.overflow[env] = solver_out.too_many
+    if c >= contacts.count[env]:
+        return
+    slot = wp.atomic_add(solver_out.count, 0, 1)
+    shape = contacts.shape[env, c]
+    friction = surfaces.friction[env % surfaces.friction.shape[0], shape]
+    solref = surfaces.solref[env % surfaces.solref.shape[0], shape]
+    solimp = surfaces.solimp[env % surfaces.solimp.shape[0], shape]
+    factor = contacts.friction[env, c]
+    friction[0] *= factor
+    friction[1] *= factor
+    if contacts.time_constant[env, c] > solref[0] and solref[0] > 0.0:
+        solref = wp.vec2(contacts.time_constant[env, c], 1.0)
+        solimp[0] = solimp[1]
+    solver_out.slot[env, c] = slot
+    solver_out.worldid[slot] = env
+    solver_out.geom[slot] = wp.vec2i(solver_out.ground, surfaces.geom[shape])
+    solver_out.dist[slot] = contacts.distance[env, c]
+    solver_out.pos[slot] = contacts.point[env, c]
+    normal = contacts.normal[env, c]
+    axis = wp.vec3(0.0, 1.0, 0.0)
+    if wp.abs(normal[1]) >= 0.5:
+        axis = wp.vec3(0.0, 0.0, 1.0)
+    tangent = wp.normalize(axis - normal * wp.dot(normal, axis))
+    solver_out.frame[slot] = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
+    solver_out.dim[slot] = surfaces.condim[shape]
+    solver_out.friction[slot] = friction
+    solver_out.solref[slot] = solref
+    solver_out.solimp[slot] = solimp
+    for row in range(solver_out.efc_address.shape[1]):
+        solver_out.efc_address[slot, row] = -1
+
+
+def tell_contacts(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts) -> None:
+    """Write terrain contacts into mujoco_warp's data."""
+    solver_out.count.zero_()
+    size, device = contacts.shape.shape, contacts.count.device
+    wp.launch(_tell_contacts_kernel, size, [contacts, surfaces], outputs=[solver_out], device=device)
+
+
+@wp.kernel
+def _ask_forces_kernel(solver: SolverContacts, contacts_out: Contacts):
+    """Grid (num_envs, capacity)."""
+    env, c = wp.tid()
+    if c >= contacts_out.count[env]:
+        return
+    slot = solver.slot[env, c]
+    force = wp.vec3(0.0)
+    # An elliptic cone has a row for the normal and one for each tangent (MuJoCo, Computation, "Friction cones").
+    for k in range(wp.min(3, solver.dim[slot])):
+        row = solver.efc_address[slot, k]
+        if row >= 0:
+            force += solver.efc_force[env, row] * solver.frame[slot][k]
+    contacts_out.force[env, c] = force
+
+
+def ask_forces(solver: SolverContacts, contacts_out: Contacts) -> None:
+    """Read the forces of terrain contacts from mujoco_warp's data."""
+    size, device = contacts_out.shape.shape, contacts_out.count.device
+    wp.launch(_ask_forces_kernel, size, [solver], outputs=[contacts_out], device=device)

@@ -16,7 +16,6 @@ float* motion = com + NB * 3;       // NV x 6: of each dof; before, at its first
 const float* qpos = &wp::index(robots.qpos, world, 0);
 const float* qvel = &wp::index(robots.qvel, world, 0);
 
-auto of_model = [&](const auto& array, int k) { return wp::index(array, world % array.shape[0], k); };
 auto get = [](const float* at, int k) { return Vec(at[3 * k], at[3 * k + 1], at[3 * k + 2]); };
 auto put = [](float* at, int k, const Vec& v) { at[3 * k] = v[0]; at[3 * k + 1] = v[1]; at[3 * k + 2] = v[2]; };
 auto get_six = [](const float* at, int k) {

@@ -217,8 +217,6 @@ def _latch_outcomes_kernel(
     geom_force: wp.array2d[wp.vec3],
     geom_role: wp.array[int],
     overflow: wp.array[int],
-    contact_count: wp.array[int],
-    contact_capacity: int,
     task: Task,
     episodes_out: Episodes,
 ):
@@ -228,11 +226,8 @@ def _latch_outcomes_kernel(
     if episodes_out.outcome[env] != Outcome.RUNNING:
         return
     steps = episodes_out.steps[env] + 1
-    bits = overflow[env]
-    if contact_count[0] > contact_capacity:
-        bits = task.overflow_mask  # whose contacts were dropped is not known, so no episode is trusted
     force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
-    invalidity = find_invalidity(joint_q, joint_qd, action, bits, task, env)
+    invalidity = find_invalidity(joint_q, joint_qd, action, overflow[env], task, env)
     outcome = judge_state(joint_q, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
@@ -245,15 +240,15 @@ def _latch_outcomes_kernel(
 
 
 def latch_outcomes(
-    joint_q: Any, joint_qd: Any, action: Any, geom_force: Any, geom_role: Any, overflow: Any, contact_count: Any,
-    contact_capacity: int, task: Task, episodes_out: Episodes,
+    joint_q: Any, joint_qd: Any, action: Any, geom_force: Any, geom_role: Any, overflow: Any, task: Task,
+    episodes_out: Episodes,
 ) -> None:  # fmt: skip
     """Judge every running episode after a step and latch its end; forget what forces were noted.
 
     Coordinates and forces are those after the step, the action as :func:`kernels.observation.apply_action` left it.
-    ``overflow`` (num_envs,) are the solver's bits of the step; ``contact_count`` (1,) terrain contacts were found.
+    ``overflow`` (num_envs,) are the solver's bits of the step.
     """
-    inputs = [joint_q, joint_qd, action, geom_force, geom_role, overflow, contact_count, contact_capacity, task]
+    inputs = [joint_q, joint_qd, action, geom_force, geom_role, overflow, task]
     wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
 
 

@@ -8,10 +8,7 @@ grows with the time constant's square.
 
 from typing import Any
 
-import numpy as np
 import warp as wp
-
-from kernels.contact import ContactBuffer, Layout
 
 ROWS, COLS = 4, 8
 """Patches along y and along x."""
@@ -39,75 +36,12 @@ class Ground:
     """Contact time constant [s], ``FIRM`` for the robot's own; shape (num_terrains, 4, 8)."""
 
 
-@wp.struct
-class Bodies:
-    """What the solver makes of the stiffness and damping of a contact, by collision shape of the robots."""
-
-    inverse_gain: wp.array[float]
-    """What stiffness [N/m] and damping [N s/m] of unit acceleration are divided by [1/kg], shape (num_shapes,)."""
-    time_constant: wp.array[float]
-    """Contact time constant on firm ground [s], shape (num_shapes,)."""
-
-
-@wp.struct
-class GroundRecords:
-    """Columns of ``newton.Contacts`` that differ from contact to contact, shape (capacity,) each; 0 changes nothing."""
-
-    friction: wp.array[float]
-    """Factor of the friction."""
-    stiffness: wp.array[float]
-    """[N/m]."""
-    damping: wp.array[float]
-    """[N s/m]."""
-
-
 @wp.func
 def patch_at(x: float, y: float) -> wp.vec2i:
     """Row and column of the patch under world-local (x, y) [m]."""
     row = wp.clamp(int(wp.floor(y / PATCH)), 0, ROWS - 1)
     col = wp.clamp(int(wp.floor(x / PATCH)), 0, COLS - 1)
     return wp.vec2i(row, col)
-
-
-@wp.kernel
-def _tell_contacts_kernel(
-    terrain_of_env: wp.array[int],
-    ground: Ground,
-    bodies: Bodies,
-    layout: Layout,
-    contacts: ContactBuffer,
-    records_out: GroundRecords,
-):
-    """Grid (capacity)."""
-    slot = wp.tid()
-    if slot >= contacts.count[0]:
-        return
-    own = contacts.shape1[slot] - layout.first_shape
-    t = terrain_of_env[own // layout.shapes_per_env]
-    point = contacts.point0[slot]
-    patch = patch_at(point[0], point[1])
-    records_out.friction[slot] = ground.friction[t, patch[0], patch[1]]
-    tau = ground.time_constant[t, patch[0], patch[1]]
-    stiffness = float(0.0)
-    damping = float(0.0)
-    if tau > bodies.time_constant[own]:
-        stiffness = 1.0 / (tau * tau * bodies.inverse_gain[own])
-        damping = 2.0 / (tau * bodies.inverse_gain[own])
-    records_out.stiffness[slot] = stiffness
-    records_out.damping[slot] = damping
-
-
-def tell_contacts(
-    terrain_of_env: Any, ground: Ground, bodies: Bodies, layout: Layout, contacts: ContactBuffer,
-    records_out: GroundRecords,
-) -> None:  # fmt: skip
-    """Give each terrain contact the friction and softness of the patch that its point on the ground lies in.
-
-    Contacts are those that :func:`kernels.contact.collide_strips` found.
-    """
-    inputs = [terrain_of_env, ground, bodies, layout, contacts]
-    capacity, device = contacts.shape0.shape[0], terrain_of_env.device
-    wp.launch(_tell_contacts_kernel, capacity, inputs, outputs=[records_out], device=device)
 
 
 @wp.func
@@ -161,14 +95,3 @@ def make_ground(num_terrains: int, device: str) -> Ground:
     ground.time_constant = wp.zeros((num_terrains, ROWS, COLS), dtype=float, device=device)
     return ground
 
-
-def make_bodies(inverse_weight: np.ndarray, impedance: np.ndarray, time_constant: np.ndarray, device: str) -> Bodies:
-    """What a solver makes of stiffness and damping, from arrays of shape (num_shapes,).
-
-    They are MuJoCo's translational ``invweight0`` of each shape's body [1/kg], the upper impedance of its contacts,
-    below 1, and their time constant on firm ground [s].
-    """
-    bodies = Bodies()
-    bodies.inverse_gain = wp.array(inverse_weight * (1.0 - impedance), dtype=float, device=device)
-    bodies.time_constant = wp.array(time_constant, dtype=float, device=device)
-    return bodies

@@ -2,9 +2,10 @@
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = $warp;
 const int lane = threadIdx.x % LANES;
-__shared__ float pool[$worlds * $words];
+__shared__ alignas(16) float pool[$worlds * $words];
 float* memory = pool + threadIdx.x / LANES * $words;
 auto sync = [] { __syncwarp(); };
+auto from = [](float x, int k) { return __shfl_sync(0xffffffffu, x, k); };  // that of lane k
 auto total = [](float x) {
     for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(0xffffffffu, x, k);
     return x;
@@ -12,8 +13,11 @@ auto total = [](float x) {
 #else
 constexpr int LANES = 1;
 const int lane = 0;
-float memory[$words];
+alignas(16) float memory[$words];
 auto sync = [] {};
+auto from = [](float x, int) { return x; };
 auto total = [](float x) { return x; };
 #endif
 const int world = thread / LANES;
+constexpr int ALL = LANES == 1 ? 1 : 64;  // loops over registers are unrolled, those of a CPU over memory are not
+auto of_model = [&](const auto& array, int k) -> const auto& { return wp::index(array, world % array.shape[0], k); };

@@ -1,4 +1,4 @@
-"""Contact force of every geom, and the raw penalties of one physics step (the paper's section III-B), on the device.
+"""The raw penalties of one physics step (the paper's section III-B), on the device.
 
 A penalty is one ``@_penalty`` function here, under whose name robots choose it. Its NumPy counterpart, by which MuJoCo
 C is compared, stands in :func:`sim.mujoco_c.model.step_penalties`; its label and colour in :mod:`qd.show.figures`.
@@ -18,60 +18,6 @@ LIMB = 4
 
 STUMBLE_RATIO = wp.constant(5.0)
 COLLISION_FORCE = wp.constant(0.1)
-
-
-@wp.struct
-class SolverContacts:
-    """Contacts and constraint forces of the last solver step, as mujoco_warp keeps them for elliptic cones."""
-
-    count: wp.array[int]
-    capacity: int
-    world: wp.array[int]
-    geom: wp.array[wp.vec2i]
-    frame: wp.array[wp.mat33]
-    """Rows: normal (toward the second geom) and two tangents, world frame."""
-    efc_address: wp.array2d[int]
-    """Constraint rows of each contact; negative where the contact is inactive."""
-    efc_force: wp.array2d[float]
-
-
-@wp.func
-def force_of_contact(contacts: SolverContacts, c: int) -> wp.vec3:
-    """Force of a contact on its second geom, world frame [N].
-
-    An elliptic cone has a constraint row for the normal and one for each tangent (MuJoCo, Computation, "Friction
-    cones").
-    """
-    row = contacts.efc_address[c, 0]
-    if row < 0:
-        return wp.vec3(0.0)
-    world = contacts.world[c]
-    local = wp.vec3(
-        contacts.efc_force[world, row], contacts.efc_force[world, row + 1], contacts.efc_force[world, row + 2]
-    )
-    return wp.transpose(contacts.frame[c]) * local
-
-
-@wp.kernel
-def _sum_geom_forces_kernel(
-    contacts: SolverContacts, column_of_geom: wp.array[int], geom_force_out: wp.array2d[wp.vec3]
-):
-    """Grid (contact capacity,)."""
-    c = wp.tid()
-    if c >= wp.min(contacts.count[0], contacts.capacity):
-        return
-    # The robot's geom is second in every contact that kernels.contact writes.
-    column = column_of_geom[contacts.geom[c][1]]
-    if column >= 0:
-        wp.atomic_add(geom_force_out, contacts.world[c], column, force_of_contact(contacts, c))
-
-
-def sum_geom_forces(contacts: SolverContacts, column_of_geom: Any, geom_force_out: Any) -> None:
-    """Sum the contact forces on each robot geom; ``column_of_geom`` is that of each solver geom, -1 for others."""
-    geom_force_out.zero_()
-    inputs = [contacts, column_of_geom]
-    device = geom_force_out.device
-    wp.launch(_sum_geom_forces_kernel, contacts.capacity, inputs, outputs=[geom_force_out], device=device)
 
 
 @wp.func

@@ -1,286 +1,317 @@
 struct Point { float cost, slope, curve; };
-struct Row {  // what a line search needs of a row, or of a contact at its first row
-    int kind, state0;
-    float jaref, jv, d, cost0, loss, range, q0, q1, q2, mu, u0, v0, uu, uv, vv, dm, t0, r0;
-};
-constexpr int NV = $dofs, ROWS = $rows, DIM = $dimensions, LD = NV | 1, CHUNK = $chunk, ENTRIES = NV * (NV + 1) / 2;
+struct Spring { float stiffness, damping, impedance; };
+constexpr int NV = $dofs, DIM = $dimensions, MOST = $contacts, KEPT = $kept, LD = $stride, CHUNK = $chunk;
+constexpr int MINE = (NV + LANES - 1) / LANES;  // dofs of a lane: its own number, and every LANES further
+constexpr bool HAS_LOSSES = $losses;
 constexpr float MINVAL = ${minval}f, EPS = 8.0f * 1.1920929e-07f;
-enum { NOTHING, PLAIN, LOSS, CONTACT };
-enum { SATISFIED = $satisfied, QUADRATIC = $quadratic, LINEARNEG = $linearneg, LINEARPOS = $linearpos, CONE = $cone };
-float* inertia = memory;  // NV x NV, rows LD apart, and so the Hessian and its factor
-float* hessian = inertia + NV * LD;
-float* part = hessian + NV * LD;  // CHUNK x NV
-float* coefficient = part + CHUNK * LD;  // CHUNK x DIM
-float* jaref = coefficient + CHUNK * DIM;
-float* jv = jaref + ROWS;
-float* force = jv + ROWS;
-int* state = (int*)(force + ROWS);
-int* contact_of = state + ROWS;  // or one of the next line
-enum { NO_CONTACT = -1, NO_ROOM = -2 };
-float* qacc = (float*)(contact_of + ROWS);
-float* momentum = qacc + NV;
-float* gradient = momentum + NV;
-float* search = gradient + NV;
-float* mv = search + NV;
-const int num_rows = wp::min(ROWS, problem.num_rows.data[world]), num_equal = problem.num_equalities.data[world];
-const int num_fixed = num_equal + problem.num_losses.data[world], num_contacts = problem.num_contacts.data[0];
-const float* jacobian = &wp::index(problem.jacobian, world, 0, 0);
-const int stride = problem.jacobian.strides[1] / sizeof(float);
-const float* d_of = &wp::index(problem.stiffness, world, 0);
-const float* smooth = &wp::index(problem.qfrc_smooth, world, 0);
-float* constraint = &wp::index(problem.qfrc_constraint, world, 0);
+enum { SATISFIED, QUADRATIC, CONE };
+struct alignas(16) Four { float of[4]; };
+struct alignas(16) Contact {
+    float jacobian[DIM][LD], jaref[DIM], jv[DIM], force[DIM], d[DIM], friction[DIM];  // friction 0: of the cone
+    int state;
+};
+using Mine = float[MINE];
+using Rows = float[MINE][NV];  // of a matrix
+using Vec = wp::vec_t<3, float>;
+using Vec2 = wp::vec_t<2, float>;
+using Vec5 = wp::vec_t<5, float>;
+float* inertia = memory;  // NV x NV, rows LD apart as all are
+float* vector = inertia + NV * LD;  // over dofs, for whoever multiplies it
+float* part = vector + LD;  // CHUNK x DIM x NV
+float* coefficient = part + CHUNK * DIM * LD;  // CHUNK x DIM x DIM
+Contact* kept = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 * 4);
+Contact* others = MOST > KEPT ? (Contact*)&wp::index(problem.others, world, 0) : kept;
+auto contact = [&](int c) -> Contact& { return c < KEPT ? kept[c] : others[c - KEPT]; };
+const int found = problem.contacts.count.data[world], num_contacts = wp::min(found, MOST);
+const float dt = wp::index(problem.timestep, world % problem.timestep.shape[0]);
 const float root_impratio = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
 const float least = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
 const float ls_least = wp::index(problem.ls_tolerance, world % problem.ls_tolerance.shape[0]);
+float* qvel = &wp::index(problem.qvel, world, 0);
+float* qpos = &wp::index(problem.qpos, world, 0);
 auto safe = [](float x, float y) { return x / (y != 0.0f ? y : MINVAL); };
-auto first_row = [&](int c) { return wp::index(problem.address, c, 0); };
-auto friction_of = [&](int c, int k) { return wp::index(problem.friction, c)[k]; };
+auto product = [](const float* x, const float* y) {
+    float sum = 0.0f;
+    #pragma unroll
+    for (int k = 0; k < LD; k += 4) {
+        const Four a = *(const Four*)(x + k), b = *(const Four*)(y + k);
+        for (int j = 0; j < 4; ++j) sum += a.of[j] * b.of[j];
+    }
+    return sum;
+};
+auto write_vector = [&](const Mine& values) {
+    sync();
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        const int i = lane + m * LANES;
+        if (i < NV) vector[i] = values[m];
+    }
+    sync();
+};
+auto times_inertia = [&](Mine& out) {  // of the vector
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        const int i = lane + m * LANES;
+        out[m] = i < NV ? product(inertia + i * LD, vector) : 0.0f;
+    }
+};
+// MuJoCo's "solver parameters": what solref and solimp make of a distance.
+auto spring_at = [&](const Vec2& solref, const Vec5& solimp, float x) {
+    const float time = wp::max(solref[0], 2.0f * dt), low = wp::clamp(solimp[0], ${least_imp}f, ${most_imp}f);
+    const float high = wp::clamp(solimp[1], ${least_imp}f, ${most_imp}f), share = wp::abs(x) / wp::max(solimp[2], MINVAL);
+    Spring s;
+    s.stiffness = solref[0] <= 0.0f ? -solref[0] / (high * high)
+                                    : 1.0f / wp::max(MINVAL, high * high * time * time * solref[1] * solref[1]);
+    s.damping = solref[1] <= 0.0f ? -solref[1] / high : 2.0f / wp::max(MINVAL, high * time);
+    if (low == high || solimp[2] <= MINVAL) {
+        s.impedance = 0.5f * (low + high);
+    } else if (share >= 1.0f) {
+        s.impedance = high;
+    } else {
+        const float middle = wp::clamp(solimp[3], ${least_imp}f, ${most_imp}f), power = wp::max(1.0f, solimp[4]);
+        const bool below = share <= middle;
+        const float whole = below ? middle : 1.0f - middle, rest = below ? share : 1.0f - share;
+        float y = rest;
+        if (power == 2.0f) y = rest * rest / whole;
+        else if (power != 1.0f) y = rest <= 0.0f ? 0.0f : wp::pow(rest, power) / wp::pow(whole, power - 1.0f);
+        s.impedance = wp::clamp(low + (below ? y : 1.0f - y) * (high - low), low, high);
+    }
+    return s;
+};
+auto stiffness_of = [](float weight, float impedance) {  // D
+    return 1.0f / wp::max(weight * (1.0f - impedance) / impedance, MINVAL);
+};
+auto frame_of = [](const Vec& normal, Vec (&frame)[3]) {  // normal and two tangents
+    const Vec axis = wp::abs(normal[1]) < 0.5f ? Vec(0.0f, 1.0f, 0.0f) : Vec(0.0f, 0.0f, 1.0f);
+    frame[0] = wp::normalize(normal);
+    frame[1] = wp::normalize(axis - frame[0] * wp::dot(frame[0], axis));
+    frame[2] = wp::cross(frame[0], frame[1]);
+};
 
-// Force and state of every row at the present residuals, and what the forces do to the joints.
+// Force and state of each contact at the present residuals, and what all constraints do to the joints.
+float qacc[MINE], constraint[MINE], smooth[MINE];
+float limit_d[MINE], limit_aref[MINE], side[MINE];  // of a joint beyond its limit: the way back; else d is 0
+float loss[MINE], loss_d[MINE], loss_aref[MINE];    // of a joint with friction
 auto update_forces = [&]() {
     #pragma unroll 1
-    for (int r = lane; r < num_rows; r += LANES) {
-        const int c = contact_of[r];
-        const float x = jaref[r], d = d_of[r];
-        if (c == NO_CONTACT) {
-            float f = -d * x;
-            int s = QUADRATIC;
-            if (r >= num_fixed) {
-                if (x >= 0.0f) { f = 0.0f; s = SATISFIED; }
-            } else if (r >= num_equal) {
-                const float loss = wp::index(problem.frictionloss, world, r), range = safe(loss, d);
-                if (x <= -range) { f = loss; s = LINEARNEG; }
-                else if (x >= range) { f = -loss; s = LINEARPOS; }
-            }
-            force[r] = f;
-            state[r] = s;
-        } else if (c == NO_ROOM) {
-            force[r] = 0.0f;
-            state[r] = SATISFIED;
-        } else if (r == first_row(c)) {
-            const int dim = problem.condim.data[c];
-            const float mu = friction_of(c, 0) * root_impratio, n = x * mu;
-            float tt = 0.0f;
-            #pragma unroll 1
-            for (int k = 1; k < dim; ++k) {
-                const float u = jaref[r + k] * friction_of(c, k - 1);
-                tt += u * u;
-            }
-            const float t = tt <= 0.0f ? 0.0f : wp::sqrt(tt);
-            if (n >= mu * t || (t <= 0.0f && n >= 0.0f)) {
-                #pragma unroll 1
-                for (int k = 0; k < dim; ++k) { force[r + k] = 0.0f; state[r + k] = SATISFIED; }
-            } else if (mu * n + t <= 0.0f || (t <= 0.0f && n < 0.0f)) {
-                #pragma unroll 1
-                for (int k = 0; k < dim; ++k) { force[r + k] = -d_of[r + k] * jaref[r + k]; state[r + k] = QUADRATIC; }
-            } else {
-                const float normal = -safe(d, mu * mu * (1.0f + mu * mu)) * (n - mu * t) * mu;
-                force[r] = normal;
-                state[r] = CONE;
-                #pragma unroll 1
-                for (int k = 1; k < dim; ++k) {
-                    const float scale = friction_of(c, k - 1);
-                    force[r + k] = -safe(normal, t) * (jaref[r + k] * scale * scale);
-                    state[r + k] = CONE;
-                }
-            }
+    for (int c = lane; c < num_contacts; c += LANES) {
+        Contact& at = contact(c);
+        const float mu = at.friction[0], n = at.jaref[0] * mu;
+        float u[DIM], tt = 0.0f;
+        #pragma unroll
+        for (int k = 1; k < DIM; ++k) {
+            u[k] = at.jaref[k] * at.friction[k];
+            tt += u[k] * u[k];
+        }
+        const float t = tt <= 0.0f ? 0.0f : wp::sqrt(tt);
+        if (n >= mu * t || (t <= 0.0f && n >= 0.0f)) {
+            for (int k = 0; k < DIM; ++k) at.force[k] = 0.0f;
+            at.state = SATISFIED;
+        } else if (mu * n + t <= 0.0f || (t <= 0.0f && n < 0.0f)) {
+            for (int k = 0; k < DIM; ++k) at.force[k] = -at.d[k] * at.jaref[k];
+            at.state = QUADRATIC;
+        } else {
+            const float normal = -safe(at.d[0], mu * mu * (1.0f + mu * mu)) * (n - mu * t) * mu;
+            at.force[0] = normal;
+            #pragma unroll
+            for (int k = 1; k < DIM; ++k) at.force[k] = -safe(normal, t) * (u[k] * at.friction[k]);
+            at.state = CONE;
         }
     }
     sync();
-    for (int i = lane; i < NV; i += LANES) {
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        const int i = lane + m * LANES;
         float sum = 0.0f;
-        #pragma unroll 4
-        for (int r = 0; r < num_rows; ++r) sum += jacobian[r * stride + i] * force[r];
-        constraint[i] = sum;
+        #pragma unroll 1
+        for (int c = 0; c < num_contacts; ++c) {
+            const Contact& at = contact(c);
+            if (i >= NV || at.state == SATISFIED) continue;
+            #pragma unroll
+            for (int k = 0; k < DIM; ++k) sum += at.jacobian[k][i] * at.force[k];
+        }
+        const float x = side[m] * qacc[m] - limit_aref[m];
+        if (x < 0.0f) sum -= side[m] * limit_d[m] * x;
+        if (HAS_LOSSES) sum -= wp::clamp(loss_d[m] * (qacc[m] - loss_aref[m]), -loss[m], loss[m]);
+        constraint[m] = sum;
     }
 };
 
-// `search` times the inverse of `hessian`, whose lower triangle becomes its Cholesky factor.
-auto solve_hessian = [&]() {
-    #pragma unroll 1
-    for (int k = 0; k < NV; ++k) {  // with the forward substitution as it goes
-        const float root = wp::sqrt(hessian[k * LD + k]), inverse = 1.0f / root, y = search[k] * inverse;
-        sync();
-        for (int i = k + lane; i < NV; i += LANES) {
-            const float below = i == k ? root : hessian[i * LD + k] * inverse;
-            hessian[i * LD + k] = below;
-            search[i] = i == k ? y : search[i] - below * y;
+// Makes y the solution x of h x = y; of h each lane has its rows, which are spent: L D L^T, a column of all rows at a time.
+auto solve = [&](Rows& h, Mine& y) {
+    float inverse[MINE];
+    #pragma unroll ALL
+    for (int k = 0; k < NV; ++k) {
+        const float pivot = 1.0f / from(h[k / LANES][k], k % LANES), y_k = from(y[k / LANES], k % LANES);
+        #pragma unroll ALL
+        for (int m = LANES == 1 ? k : 0; m < MINE; ++m) {
+            const int i = lane + m * LANES;
+            if (i == k) inverse[m] = pivot;
+            const float below = i > k ? h[m][k] * pivot : 0.0f;
+            y[m] -= below * y_k;
+            #pragma unroll ALL
+            for (int j = k + 1; j < NV; ++j) h[m][j] -= below * from(h[k / LANES][j], k % LANES);
         }
-        sync();
-        for (int i = k + 1 + lane; i < NV; i += LANES) {
-            const float below = hessian[i * LD + k];
-            #pragma unroll 4
-            for (int j = k + 1; j <= i; ++j) hessian[i * LD + j] -= below * hessian[j * LD + k];
-        }
-        sync();
     }
-    #pragma unroll 1
+    #pragma unroll ALL
     for (int k = NV - 1; k >= 0; --k) {
-        const float x = search[k] / hessian[k * LD + k];
-        sync();
-        for (int i = lane; i <= k; i += LANES) search[i] = i == k ? x : search[i] - hessian[k * LD + i] * x;
-        sync();
+        const float x = from(y[k / LANES] * inverse[k / LANES], k % LANES);
+        #pragma unroll ALL
+        for (int m = 0; m < (LANES == 1 ? k + 1 : MINE); ++m) {
+            const int i = lane + m * LANES;
+            y[m] = i == k ? x : i < k ? y[m] - h[m][k] * x : y[m];
+        }
     }
 };
 
 // Newton's direction at the present gradient. Returns |direction|^2 and the decrement.
 //
-// The Hessian is M plus a sum of squares of rows g. An active plain row gives sqrt(D) J. A contact on the side of its cone,
-// of normal row a = mu J_0, tangent rows z_k = friction_k J_k and unit tangent residual e, gives
+// The Hessian is M, what joints at their limits and with friction add to its diagonal, and a sum of squares of rows g. A contact
+// that sticks gives sqrt(D) J of each of its rows. One on the side of its cone, of normal row a = mu J_0, tangent rows
+// z_k = friction_k J_k and unit tangent residual e, gives
 //     sqrt(dm) (a - mu sum_k e_k z_k)      and      sqrt(dm (mu^2 - mu n / t)) (what of z is at right angles to e),
 // the latter as rows of the reflection that turns e into an axis.
+float momentum[MINE], gradient[MINE], search[MINE];
 auto find_direction = [&](float& search_dot, float& decrement) {
-    constexpr int MINE = (ENTRIES + LANES - 1) / LANES;
-    float sums[MINE];
-    for (int m = 0; m < MINE; ++m) sums[m] = 0.0f;
+    float h[MINE][NV];
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        const int i = lane + m * LANES;
+        float more = side[m] * qacc[m] < limit_aref[m] ? limit_d[m] : 0.0f;
+        if (HAS_LOSSES && wp::abs(loss_d[m] * (qacc[m] - loss_aref[m])) < loss[m]) more += loss_d[m];
+        #pragma unroll ALL
+        for (int j = 0; j < NV; ++j) h[m][j] = (i < NV ? inertia[i * LD + j] : 0.0f) + (i == j ? more : 0.0f);
+    }
     #pragma unroll 1
-    for (int begin = 0; begin < num_rows; begin += CHUNK) {
-        const int count = wp::min(CHUNK, num_rows - begin);
+    for (int begin = 0; begin < num_contacts; begin += CHUNK) {
+        const int count = wp::min(CHUNK, num_contacts - begin);
         #pragma unroll 1
         for (int s = lane; s < count; s += LANES) {
-            const int r = begin + s, c = contact_of[r];
-            float* of = coefficient + s * DIM;
-            #pragma unroll 1
-            for (int k = 0; k < DIM; ++k) of[k] = 0.0f;
-            if (state[r] == QUADRATIC) of[0] = wp::sqrt(d_of[r]);
-            if (state[r] != CONE) continue;
-            const int first = first_row(c), dim = problem.condim.data[c], row = r - first;
-            const float mu = friction_of(c, 0) * root_impratio, dm = safe(d_of[first], mu * mu * (1.0f + mu * mu));
+            const Contact& at = contact(begin + s);
+            float* to = coefficient + s * DIM * DIM;
+            if (at.state != CONE) {
+                #pragma unroll
+                for (int k = 0; k < DIM * DIM; ++k) to[k] = k % (DIM + 1) == 0 ? wp::sqrt(at.d[k / DIM]) : 0.0f;
+                continue;
+            }
+            const float mu = at.friction[0], dm = safe(at.d[0], mu * mu * (1.0f + mu * mu));
             float e[DIM], tt = 0.0f;
-            #pragma unroll 1
-            for (int k = 1; k < dim; ++k) {
-                e[k] = jaref[first + k] * friction_of(c, k - 1);
+            #pragma unroll
+            for (int k = 1; k < DIM; ++k) {
+                e[k] = at.jaref[k] * at.friction[k];
                 tt += e[k] * e[k];
             }
-            const float t = wp::max(wp::sqrt(tt), MINVAL);
-            #pragma unroll 1
-            for (int k = 1; k < dim; ++k) e[k] /= t;
-            if (row == 0) {
-                of[0] = wp::sqrt(dm) * mu;
-                #pragma unroll 1
-                for (int k = 1; k < dim; ++k) of[k] = -of[0] * e[k] * friction_of(c, k - 1);
-            } else if (row < dim - 1) {
-                const float weight = wp::sqrt(dm * wp::max(0.0f, mu * mu - mu * (jaref[first] * mu) / t));
-                const float sign = e[1] < 0.0f ? -1.0f : 1.0f;
-                #pragma unroll 1
-                for (int k = 1; k < dim; ++k) {
-                    const float v = k == 1 ? e[1] + sign : e[k];
-                    const float entry = (k == row + 1 ? 1.0f : 0.0f) - e[row + 1] * v / (1.0f + wp::abs(e[1]));
-                    of[k] = weight * entry * friction_of(c, k - 1);
+            const float t = wp::max(wp::sqrt(tt), MINVAL), root = wp::sqrt(dm);
+            const float weight = wp::sqrt(dm * wp::max(0.0f, mu * mu - mu * (at.jaref[0] * mu) / t));
+            #pragma unroll
+            for (int k = 1; k < DIM; ++k) e[k] /= t;
+            const float sign = e[1] < 0.0f ? -1.0f : 1.0f;
+            #pragma unroll
+            for (int row = 0; row < DIM; ++row) {
+                to[row * DIM] = row == 0 ? root * mu : 0.0f;
+                #pragma unroll
+                for (int k = 1; k < DIM; ++k) {
+                    float entry = -root * mu * e[k];
+                    if (row > 0 && row < DIM - 1) {
+                        const float v = k == 1 ? e[1] + sign : e[k];
+                        entry = weight * ((k == row + 1 ? 1.0f : 0.0f) - e[row + 1] * v / (1.0f + wp::abs(e[1])));
+                    } else if (row > 0) {
+                        entry = 0.0f;
+                    }
+                    to[row * DIM + k] = entry * at.friction[k];
                 }
             }
         }
         sync();
         #pragma unroll 1
-        for (int m = lane; m < count * NV; m += LANES) {
-            const int s = m / NV, i = m % NV, r = begin + s;
-            const float* of = coefficient + s * DIM;
-            float sum = 0.0f;
-            if (state[r] == CONE) {
-                const int first = first_row(contact_of[r]), dim = problem.condim.data[contact_of[r]];
-                #pragma unroll 1
-                for (int k = 0; k < dim; ++k) sum += of[k] * jacobian[(first + k) * stride + i];
-            } else if (state[r] == QUADRATIC) {
-                sum = of[0] * jacobian[r * stride + i];
+        for (int s = 0; s < count; ++s) {
+            const Contact& at = contact(begin + s);
+            if (at.state == SATISFIED) continue;
+            #pragma unroll 1
+            for (int i = lane; i < LD; i += LANES) {
+                #pragma unroll
+                for (int row = 0; row < DIM; ++row) {
+                    float sum = 0.0f;
+                    #pragma unroll
+                    for (int k = 0; k < DIM; ++k) sum += coefficient[(s * DIM + row) * DIM + k] * at.jacobian[k][i];
+                    part[(s * DIM + row) * LD + i] = sum;
+                }
             }
-            part[s * LD + i] = sum;
         }
         sync();
-        for (int m = 0, e = lane; e < ENTRIES; ++m, e += LANES) {
-            const int i = problem.tri_col.data[e], j = problem.tri_row.data[e];
-            float sum = sums[m];
-            #pragma unroll 4
-            for (int s = 0; s < count; ++s) sum += part[s * LD + i] * part[s * LD + j];
-            sums[m] = sum;
+        #pragma unroll 1
+        for (int s = 0; s < count; ++s) {
+            if (contact(begin + s).state == SATISFIED) continue;
+            #pragma unroll
+            for (int row = 0; row < DIM; ++row) {
+                const float* of = part + (s * DIM + row) * LD;
+                #pragma unroll ALL
+                for (int m = 0; m < MINE; ++m) {
+                    const int i = lane + m * LANES;
+                    const float own = i < NV ? of[i] : 0.0f;
+                    #pragma unroll ALL
+                    for (int j = 0; j < NV; j += 4) {
+                        const Four four = *(const Four*)(of + j);
+                        #pragma unroll
+                        for (int k = 0; k < 4; ++k) {
+                            if (j + k < NV) h[m][j + k] += own * four.of[k];
+                        }
+                    }
+                }
+            }
         }
         sync();
     }
-    for (int m = 0, e = lane; e < ENTRIES; ++m, e += LANES) {
-        const int at = problem.tri_col.data[e] * LD + problem.tri_row.data[e];
-        hessian[at] = inertia[at] + sums[m];
-    }
-    for (int i = lane; i < NV; i += LANES) search[i] = gradient[i];
-    sync();
-    solve_hessian();
+    for (int m = 0; m < MINE; ++m) search[m] = gradient[m];
+    solve(h, search);
     float dot = 0.0f, along = 0.0f;
-    for (int i = lane; i < NV; i += LANES) {
-        const float x = search[i];
-        dot += x * x;
-        along += gradient[i] * x;
-        search[i] = -x;
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        if (lane + m * LANES >= NV) search[m] = 0.0f;
+        dot += search[m] * search[m];
+        along += gradient[m] * search[m];
+        search[m] = -search[m];
     }
     search_dot = total(dot);
     decrement = total(along);
-    sync();
 };
 
-// Cost, slope and curvature along the search direction, of one row or contact. Costs at a step are told from those at 0.
-auto loss_at = [](const Row& row, float x) {
-    if (-row.range < x && x < row.range) return Point{0.5f * row.d * x * x, row.jv * row.d * x, row.jv * row.jv * row.d};
-    if (x <= -row.range) return Point{row.loss * (-0.5f * row.range - x), -row.loss * row.jv, 0.0f};
-    return Point{row.loss * (-0.5f * row.range + x), row.loss * row.jv, 0.0f};
+// Cost, slope and curvature along the search direction. Costs at a step are told from those at 0.
+struct Row {  // of a contact
+    int state0;
+    float cost0, q0, q1, q2, mu, u0, v0, uu, uv, vv, dm, t0, r0;
 };
-auto read_row = [&](int r) {
+auto read_contact = [&](const Contact& at) {
     Row row;
-    row.kind = NOTHING;
-    const int c = contact_of[r];
-    if (r < num_equal || c == NO_ROOM) return row;
-    row.jaref = jaref[r];
-    row.jv = jv[r];
-    row.d = d_of[r];
-    if (r < num_fixed) {
-        row.kind = LOSS;
-        row.loss = wp::index(problem.frictionloss, world, r);
-        row.range = safe(row.loss, row.d);
-        row.cost0 = loss_at(row, row.jaref).cost;
-    } else if (c == NO_CONTACT) {
-        row.kind = PLAIN;
-        row.cost0 = row.jaref < 0.0f ? 0.5f * row.d * row.jaref * row.jaref : 0.0f;
-    } else if (r == first_row(c)) {
-        row.kind = CONTACT;
-        const int dim = problem.condim.data[c];
-        row.mu = friction_of(c, 0) * root_impratio;
-        row.u0 = row.jaref * row.mu;
-        row.v0 = row.jv * row.mu;
-        row.q0 = row.q1 = row.q2 = row.uu = row.uv = row.vv = 0.0f;
-        #pragma unroll 1
-        for (int k = 0; k < dim; ++k) {
-            const float x = jaref[r + k], y = jv[r + k], dx = d_of[r + k] * x, dy = d_of[r + k] * y;
-            row.q0 += 0.5f * x * dx;
-            row.q1 += y * dx;
-            row.q2 += 0.5f * y * dy;
-            if (k == 0) continue;
-            const float u = x * friction_of(c, k - 1), v = y * friction_of(c, k - 1);
-            row.uu += u * u;
-            row.uv += u * v;
-            row.vv += v * v;
-        }
-        row.dm = row.d / (row.mu * row.mu * (1.0f + row.mu * row.mu));
-        row.t0 = row.uu <= 0.0f ? 0.0f : wp::sqrt(row.uu);
-        row.r0 = row.cost0 = 0.0f;
-        row.state0 = SATISFIED;
-        if (row.uu <= 0.0f ? row.u0 < 0.0f : row.u0 < row.mu * row.t0 && row.mu * row.u0 + row.t0 <= 0.0f) {
-            row.cost0 = row.q0;
-            row.state0 = QUADRATIC;
-        } else if (row.uu > 0.0f && row.u0 < row.mu * row.t0) {
-            row.r0 = row.u0 - row.mu * row.t0;
-            row.cost0 = 0.5f * row.dm * row.r0 * row.r0;
-            row.state0 = CONE;
-        }
+    row.mu = at.friction[0];
+    row.u0 = at.jaref[0] * row.mu;
+    row.v0 = at.jv[0] * row.mu;
+    row.q0 = row.q1 = row.q2 = row.uu = row.uv = row.vv = 0.0f;
+    #pragma unroll
+    for (int k = 0; k < DIM; ++k) {
+        const float x = at.jaref[k], y = at.jv[k], dx = at.d[k] * x, dy = at.d[k] * y;
+        row.q0 += 0.5f * x * dx;
+        row.q1 += y * dx;
+        row.q2 += 0.5f * y * dy;
+        if (k == 0) continue;
+        const float u = x * at.friction[k], v = y * at.friction[k];
+        row.uu += u * u;
+        row.uv += u * v;
+        row.vv += v * v;
+    }
+    row.dm = at.d[0] / (row.mu * row.mu * (1.0f + row.mu * row.mu));
+    row.t0 = row.uu <= 0.0f ? 0.0f : wp::sqrt(row.uu);
+    row.r0 = row.cost0 = 0.0f;
+    row.state0 = SATISFIED;
+    if (row.uu <= 0.0f ? row.u0 < 0.0f : row.u0 < row.mu * row.t0 && row.mu * row.u0 + row.t0 <= 0.0f) {
+        row.cost0 = row.q0;
+        row.state0 = QUADRATIC;
+    } else if (row.uu > 0.0f && row.u0 < row.mu * row.t0) {
+        row.r0 = row.u0 - row.mu * row.t0;
+        row.cost0 = 0.5f * row.dm * row.r0 * row.r0;
+        row.state0 = CONE;
     }
     return row;
-};
-auto at_zero = [&](const Row& row) {
-    if (row.kind == LOSS) return loss_at(row, row.jaref);
-    if (row.kind == PLAIN && row.jaref < 0.0f) {
-        return Point{row.cost0, row.jv * row.d * row.jaref, row.jv * row.jv * row.d};
-    }
-    if (row.kind == CONTACT && row.state0 == QUADRATIC) return Point{row.q0, row.q1, 2.0f * row.q2};
-    if (row.kind == CONTACT && row.state0 == CONE) {
-        const float t1 = row.uv / row.t0, t2 = (row.vv - t1 * t1) / row.t0, r1 = row.v0 - row.mu * t1;
-        return Point{row.cost0, row.dm * row.r0 * r1, row.dm * (r1 * r1 - row.mu * row.r0 * t2)};
-    }
-    return Point{0.0f, 0.0f, 0.0f};
 };
 auto cone_gap = [](const Row& row, float n, float t) {  // of the quadratic's cost over the cone's
     const float boundary = row.mu * n + t;
@@ -307,30 +338,43 @@ auto contact_at = [&](const Row& row, float alpha) {
     }
     return Point{cost, row.dm * rest * r1, row.dm * (r1 * r1 - rest * row.mu * t2)};
 };
-auto row_at = [&](const Row& row, float alpha) {
-    if (row.kind == CONTACT) return contact_at(row, alpha);
-    if (row.kind == NOTHING) return Point{0.0f, 0.0f, 0.0f};
-    const float x = row.jaref + alpha * row.jv;
-    if (row.kind == LOSS) {
-        const Point p = loss_at(row, x);
-        return Point{p.cost - row.cost0, p.slope, p.curve};
-    }
-    if (x >= 0.0f) return Point{-row.cost0, 0.0f, 0.0f};
-    const float curve = row.jv * row.jv * row.d, slope = row.jv * row.d * row.jaref;
-    const float offset = row.jaref < 0.0f ? 0.0f : 0.5f * row.d * row.jaref * row.jaref;
-    return Point{alpha * (slope + 0.5f * alpha * curve) + offset, slope + alpha * curve, curve};
+auto limit_at = [](float d, float x0, float v, float alpha) {
+    const float x = x0 + alpha * v, curve = d * v * v, slope = d * v * x0;
+    if (x >= 0.0f) return Point{x0 < 0.0f ? -0.5f * d * x0 * x0 : 0.0f, 0.0f, 0.0f};
+    if (x0 < 0.0f) return Point{alpha * (slope + 0.5f * alpha * curve), slope + alpha * curve, curve};
+    return Point{0.5f * d * x * x, d * v * x, curve};
 };
-constexpr int KEPT = LANES == 1 ? ROWS : 0;  // one thread reads a row once a search; 32 have one each, and no room
-Row rows[KEPT + 1];
-float gauss_slope, gauss_curve;  // of the inertia and of equalities: a parabola
+auto loss_at = [](float d, float most, float x, float v) {
+    const float range = most / d;
+    if (-range < x && x < range) return Point{0.5f * d * x * x, v * d * x, v * v * d};
+    const float sign = x < 0.0f ? -1.0f : 1.0f;
+    return Point{most * (sign * x - 0.5f * range), sign * most * v, 0.0f};
+};
+constexpr int READ = LANES == 1 ? MOST : 1;  // one thread reads contacts once a search; of a warp each lane its first
+Row rows[READ];
+float gauss_slope, gauss_curve;  // of the inertia: a parabola
 auto line_at = [&](float alpha) {
     Point sum = {0.0f, 0.0f, 0.0f};
-    #pragma unroll 1
-    for (int r = lane; r < num_rows; r += LANES) {
-        const Point p = row_at(KEPT > 0 ? rows[r] : read_row(r), alpha);
+    auto add = [&](const Point& p) {
         sum.cost += p.cost;
         sum.slope += p.slope;
         sum.curve += p.curve;
+    };
+    if (lane < num_contacts) add(contact_at(rows[0], alpha));
+    #pragma unroll 1
+    for (int c = lane + LANES; c < num_contacts; c += LANES) {
+        add(contact_at(LANES == 1 ? rows[c % READ] : read_contact(contact(c)), alpha));
+    }
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        if (limit_d[m] > 0.0f) {
+            add(limit_at(limit_d[m], side[m] * qacc[m] - limit_aref[m], side[m] * search[m], alpha));
+        }
+        if (HAS_LOSSES && loss[m] > 0.0f) {
+            const float x = qacc[m] - loss_aref[m];
+            add(loss_at(loss_d[m], loss[m], x + alpha * search[m], search[m]));
+            sum.cost -= loss_at(loss_d[m], loss[m], x, 0.0f).cost;
+        }
     }
     return Point{
         total(sum.cost) + alpha * (alpha * gauss_curve + gauss_slope),
@@ -338,138 +382,226 @@ auto line_at = [&](float alpha) {
         total(sum.curve) + 2.0f * gauss_curve
     };
 };
-// Newton steps from both ends of a bracket and its middle, until the slope is all but 0. False where the cap stopped it.
-auto search_line = [&](float search_dot, float scale, float& alpha, float& gained) {
-    Point start = {0.0f, 0.0f, 0.0f};
-    float slope = 0.0f, curve = 0.0f;
+auto cost_at_zero = [&]() {
+    float sum = 0.0f;
     #pragma unroll 1
-    for (int r = lane; r < num_rows; r += LANES) {
-        const Row row = read_row(r);
-        if (KEPT > 0) rows[r] = row;
-        const Point p = at_zero(row);
-        start.cost += p.cost;
-        start.slope += p.slope;
-        start.curve += p.curve;
-        if (r < num_equal) {
-            slope += jv[r] * d_of[r] * jaref[r];
-            curve += 0.5f * jv[r] * jv[r] * d_of[r];
-        }
+    for (int c = lane; c < num_contacts; c += LANES) {
+        const Row row = read_contact(contact(c));
+        if (c == lane || LANES == 1) rows[LANES == 1 ? c : 0] = row;
+        sum += row.cost0;
     }
-    for (int i = lane; i < NV; i += LANES) {
-        slope += search[i] * (momentum[i] - smooth[i]);
-        curve += 0.5f * search[i] * mv[i];
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        const float x = side[m] * qacc[m] - limit_aref[m];
+        if (x < 0.0f) sum += 0.5f * limit_d[m] * x * x;
+        if (HAS_LOSSES && loss[m] > 0.0f) sum += loss_at(loss_d[m], loss[m], qacc[m] - loss_aref[m], 0.0f).cost;
+    }
+    return total(sum);
+};
+// Newton steps from both ends of a bracket and its middle, until the slope is all but 0. False where the cap stopped it.
+auto search_line = [&](const Mine& mv, float search_dot, float scale, float& alpha, float& gained) {
+    float slope = 0.0f, curve = 0.0f;
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        slope += search[m] * (momentum[m] - smooth[m]);
+        curve += 0.5f * search[m] * mv[m];
     }
     gauss_slope = total(slope);
     gauss_curve = total(curve);
-    start = {total(start.cost), total(start.slope), total(start.curve)};
-    const float size = wp::sqrt(2.0f * wp::max(start.cost, 0.0f) * wp::max(start.curve, 0.0f)) + wp::abs(gauss_slope);
+    const float cost0 = cost_at_zero();
+    const Point start = line_at(0.0f);
+    const float size = wp::sqrt(2.0f * wp::max(cost0, 0.0f) * wp::max(start.curve - 2.0f * gauss_curve, 0.0f))
+        + wp::abs(gauss_slope);
     const float flat = wp::max(least * ls_least * wp::sqrt(search_dot) / scale, 1e-6f);
     const float accepted = wp::max(flat, EPS * size);  // slopes below are those of rounding
-    start = {0.0f, start.slope + gauss_slope, start.curve + 2.0f * gauss_curve};
     alpha = gained = 0.0f;
     if (wp::abs(start.slope) < EPS * size) return true;
 
     auto between = [](const Point& x, const Point& y) {
         return (x.slope < y.slope && y.slope < 0.0f) || (x.slope > y.slope && y.slope > 0.0f);
     };
-    Point low = start, high = start, p[3];
-    float low_alpha = 0.0f, high_alpha = 0.0f, at[3] = {-safe(start.slope, start.curve), 0.0f, 0.0f};
-    #pragma unroll 1
-    for (int iteration = 0; iteration <= problem.most_line_iterations; ++iteration) {
-        const int tries = iteration == 0 ? 1 : 3;  // the Newton step alone, then both ends' and the middle
-        int best = -1;
-        #pragma unroll 1
-        for (int k = 0; k < tries; ++k) {
-            p[k] = line_at(at[k]);
-            const bool good = wp::abs(p[k].slope) < accepted && p[k].cost < 0.0f;
-            if (good && (best < 0 || p[k].cost < p[best].cost)) best = k;
-        }
-        if (best >= 0) {
-            alpha = at[best];
-            gained = -p[best].cost;
+    const float first = -safe(start.slope, start.curve);
+    Point low = start, high = start;
+    float low_alpha = 0.0f, high_alpha = 0.0f;
+    low.cost = high.cost = 0.0f;
+    {  // the Newton step alone
+        const Point p = line_at(first);
+        if (wp::abs(p.slope) < accepted && p.cost < 0.0f) {
+            alpha = first;
+            gained = -p.cost;
             return true;
         }
-        if (iteration == 0) {
-            if (p[0].slope < start.slope) { low = p[0]; low_alpha = at[0]; }
-            else { high = p[0]; high_alpha = at[0]; }
-        } else {
-            bool moved = false;
-            auto raise = [&](int k) {
-                if (between(low, p[k])) { low = p[k]; low_alpha = at[k]; moved = true; }
-            };
-            auto lower = [&](int k) {
-                const bool crosses = k == 1 && high.slope < 0.0f && p[k].slope > 0.0f;
-                if (between(high, p[k]) || crosses) { high = p[k]; high_alpha = at[k]; moved = true; }
-            };
-            raise(0); raise(2); raise(1);
-            lower(1); lower(2); lower(0);
-            if (low.cost < 0.0f || high.cost < 0.0f) {
-                const bool is_low = low.cost < high.cost;
-                alpha = is_low ? low_alpha : high_alpha;
-                gained = -(is_low ? low.cost : high.cost);
+        if (p.slope < start.slope) { low = p; low_alpha = first; }
+        else { high = p; high_alpha = first; }
+    }
+    #pragma unroll 1
+    for (int iteration = 1; iteration <= problem.most_line_iterations; ++iteration) {
+        const float at[3] = {low_alpha - safe(low.slope, low.curve), high_alpha - safe(high.slope, high.curve),
+                             0.5f * (low_alpha + high_alpha)};
+        const Point p[3] = {line_at(at[0]), line_at(at[1]), line_at(at[2])};
+        float best = 0.0f;
+        #pragma unroll
+        for (int k = 0; k < 3; ++k) {
+            if (wp::abs(p[k].slope) < accepted && p[k].cost < best) {
+                best = p[k].cost;
+                alpha = at[k];
             }
-            if (!moved || (low.cost < 0.0f && low.slope < 0.0f && low.slope > -flat)
-                || (high.cost < 0.0f && high.slope > 0.0f && high.slope < flat)) return true;
         }
-        at[0] = low_alpha - safe(low.slope, low.curve);
-        at[1] = high_alpha - safe(high.slope, high.curve);
-        at[2] = 0.5f * (low_alpha + high_alpha);
+        if (best < 0.0f) {
+            gained = -best;
+            return true;
+        }
+        bool moved = false;
+        auto raise = [&](const Point& p, float at) {
+            if (between(low, p)) { low = p; low_alpha = at; moved = true; }
+        };
+        auto lower = [&](const Point& p, float at, bool crosses) {
+            if (between(high, p) || (crosses && high.slope < 0.0f && p.slope > 0.0f)) {
+                high = p;
+                high_alpha = at;
+                moved = true;
+            }
+        };
+        raise(p[0], at[0]);
+        raise(p[2], at[2]);
+        raise(p[1], at[1]);
+        lower(p[1], at[1], true);
+        lower(p[2], at[2], false);
+        lower(p[0], at[0], false);
+        if (low.cost < 0.0f || high.cost < 0.0f) {
+            const bool is_low = low.cost < high.cost;
+            alpha = is_low ? low_alpha : high_alpha;
+            gained = -(is_low ? low.cost : high.cost);
+        }
+        if (!moved || (low.cost < 0.0f && low.slope < 0.0f && low.slope > -flat)
+            || (high.cost < 0.0f && high.slope > 0.0f && high.slope < flat)) return true;
     }
     return false;
 };
 
+// What there is: inertia, joints at their limits, joints with friction, contacts.
 #pragma unroll 1
-for (int m = lane; m < NV * LD; m += LANES) inertia[m] = 0.0f;
+for (int m = lane; m < (NV + 1) * LD; m += LANES) inertia[m] = 0.0f;  // with the vector
 sync();
 #pragma unroll 1
 for (int m = lane; m < $inertia; m += LANES) {
     const int i = problem.inertia_row.data[m], j = problem.inertia_col.data[m];
     inertia[i * LD + j] = inertia[j * LD + i] = wp::index(problem.inertia, world, m);
 }
-for (int i = lane; i < NV; i += LANES) {
-    qacc[i] = num_rows > 0 ? wp::index(problem.qacc_warmstart, world, i) : 0.0f;
-}
+float num_rows = 0.0f, trace = 0.0f, speed[MINE];
 sync();
-float trace = 0.0f;
-for (int i = lane; i < NV; i += LANES) {
+#pragma unroll ALL
+for (int m = 0; m < MINE; ++m) {
+    const int i = lane + m * LANES;
+    qacc[m] = constraint[m] = smooth[m] = limit_d[m] = limit_aref[m] = side[m] = 0.0f;
+    momentum[m] = gradient[m] = search[m] = speed[m] = loss[m] = loss_d[m] = loss_aref[m] = 0.0f;
+    if (i >= NV) continue;
     trace += inertia[i * LD + i];
-    float sum = 0.0f;
-    for (int j = 0; j < NV; ++j) sum += inertia[i * LD + j] * qacc[j];
-    momentum[i] = sum;
+    qacc[m] = wp::index(problem.qacc_warmstart, world, i);
+    smooth[m] = wp::index(problem.qfrc_smooth, world, i);
+    speed[m] = qvel[i];
+    const int joint = problem.dof_joint.data[i];
+    const float weight = of_model(problem.dof_weight, i);
+    if (problem.joint_limited.data[joint]) {
+        const Vec2 range = of_model(problem.joint_range, joint);
+        const float q = qpos[problem.joint_qpos.data[joint]], low = q - range[0], high = range[1] - q;
+        const float beyond = wp::min(low, high) - of_model(problem.joint_margin, joint);
+        if (beyond < 0.0f) {
+            const Spring s = spring_at(
+                of_model(problem.joint_solref, joint), of_model(problem.joint_solimp, joint), beyond);
+            side[m] = low < high ? 1.0f : -1.0f;
+            limit_d[m] = stiffness_of(weight, s.impedance);
+            limit_aref[m] = -s.stiffness * s.impedance * beyond - s.damping * side[m] * speed[m];
+            num_rows += 1.0f;
+        }
+    }
+    if (HAS_LOSSES && of_model(problem.frictionloss, i) > 0.0f) {
+        const Spring s = spring_at(of_model(problem.dof_solref, i), of_model(problem.dof_solimp, i), 0.0f);
+        loss[m] = of_model(problem.frictionloss, i);
+        loss_d[m] = stiffness_of(weight, s.impedance);
+        loss_aref[m] = -s.damping * speed[m];
+        num_rows += 1.0f;
+    }
 }
+num_rows = total(num_rows);
 const float scale = 1.0f / wp::max(MINVAL, total(trace));
 #pragma unroll 1
-for (int r = lane; r < num_rows; r += LANES) {
-    float sum = -wp::index(problem.aref, world, r);
-    for (int i = 0; i < NV; ++i) sum += jacobian[r * stride + i] * qacc[i];
-    jaref[r] = sum;
-    contact_of[r] = NO_CONTACT;
-    if (wp::index(problem.row_type, world, r) == $elliptic) {
-        const int c = wp::index(problem.row_id, world, r);
-        contact_of[r] = c < num_contacts && first_row(c) >= 0 ? c : NO_ROOM;
+for (int c = 0; c < num_contacts; ++c) {
+    Contact& to = contact(c);
+    const int shape = wp::index(problem.contacts.shape, world, c), body = problem.surfaces.body.data[shape];
+    const int dim = problem.surfaces.condim.data[shape];
+    const Vec offset = wp::index(problem.contacts.point, world, c)
+        - wp::index(problem.subtree_com, world, problem.body_root.data[body]);
+    Vec frame[3];
+    frame_of(wp::index(problem.contacts.normal, world, c), frame);
+    #pragma unroll 1
+    for (int i = lane; i < LD; i += LANES) {
+        Vec turned, moved;
+        if (i < NV && wp::index(problem.is_ancestor, body, i)) {
+            const auto& s = wp::index(problem.cdof, world, i);
+            turned = Vec(s[0], s[1], s[2]);
+            moved = Vec(s[3], s[4], s[5]) + wp::cross(turned, offset);
+        }
+        #pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            to.jacobian[k][i] = k >= dim ? 0.0f : k < 3 ? wp::dot(frame[k], moved) : wp::dot(frame[k % 3], turned);
+        }
     }
 }
-sync();
-float search_dot, decrement, alpha, gained;
-int iteration = 0, bits = 0;
-if (num_rows == 0) {  // nothing to iterate: the inertia takes all forces
-    for (int i = lane; i < NV; i += LANES) {
-        for (int j = 0; j <= i; ++j) hessian[i * LD + j] = inertia[i * LD + j];
-        search[i] = momentum[i] = smooth[i];
-        constraint[i] = 0.0f;
+write_vector(speed);
+#pragma unroll 1
+for (int c = lane; c < num_contacts; c += LANES) {
+    Contact& to = contact(c);
+    const int shape = wp::index(problem.contacts.shape, world, c), dim = problem.surfaces.condim.data[shape];
+    Vec2 solref = of_model(problem.surfaces.solref, shape);
+    Vec5 solimp = of_model(problem.surfaces.solimp, shape);
+    const Vec5& friction = of_model(problem.surfaces.friction, shape);
+    const float factor = wp::index(problem.contacts.friction, world, c);
+    const float soft = wp::index(problem.contacts.time_constant, world, c);
+    if (soft > solref[0] && solref[0] > 0.0f) {  // of constant impedance
+        solref = Vec2(soft, 1.0f);
+        solimp[0] = solimp[1];
     }
-    sync();
-    solve_hessian();
-    for (int i = lane; i < NV; i += LANES) qacc[i] = search[i];
+    const float distance = wp::index(problem.contacts.distance, world, c);
+    const Spring s = spring_at(solref, solimp, distance);
+    const auto& weights = of_model(problem.body_weight, problem.surfaces.body.data[shape]);
+    const float d = stiffness_of(weights[0] + of_model(problem.body_weight, 0)[0], s.impedance);
+    #pragma unroll
+    for (int k = 0; k < DIM; ++k) {
+        const float mu = friction[wp::max(k, 1) - 1] * (k <= 2 ? factor : 1.0f), first = friction[0] * factor;
+        const float ratio = mu / (first * root_impratio);
+        to.d[k] = k == 0 ? d : d * ratio * ratio;
+        to.friction[k] = k == 0 ? mu * root_impratio : k < dim ? mu : 0.0f;
+        to.jaref[k] = s.damping * product(to.jacobian[k], vector);
+    }
+    to.jaref[0] += s.stiffness * s.impedance * distance;
+}
+write_vector(qacc);
+#pragma unroll 1
+for (int c = lane; c < num_contacts; c += LANES) {
+    Contact& to = contact(c);
+    #pragma unroll
+    for (int k = 0; k < DIM; ++k) to.jaref[k] += product(to.jacobian[k], vector);
+}
+times_inertia(momentum);
+
+int iteration = 0, bits = found > MOST ? $too_many_contacts : 0;
+float search_dot, decrement, alpha, gained, mv[MINE];
+if (num_contacts == 0 && num_rows == 0.0f) {  // nothing to iterate: the inertia takes all forces
+    for (int m = 0; m < MINE; ++m) gradient[m] = smooth[m];
+    find_direction(search_dot, decrement);
+    for (int m = 0; m < MINE; ++m) {
+        qacc[m] = -search[m];
+        momentum[m] = smooth[m];
+    }
     iteration = 1;
-}
-while (num_rows > 0) {
+} else while (true) {
     update_forces();
     float squares = 0.0f;
-    for (int i = lane; i < NV; i += LANES) {
-        const float g = momentum[i] - smooth[i] - constraint[i];
-        gradient[i] = g;
-        squares += g * g;
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        gradient[m] = momentum[m] - smooth[m] - constraint[m];
+        squares += gradient[m] * gradient[m];
     }
     squares = total(squares);
     // mujoco_warp's test, made before the Hessian that a robot that is done would not need.
@@ -481,91 +613,89 @@ while (num_rows > 0) {
         bits |= $too_many;
         break;
     }
-    for (int i = lane; i < NV; i += LANES) {
-        float sum = 0.0f;
-        for (int j = 0; j < NV; ++j) sum += inertia[i * LD + j] * search[j];
-        mv[i] = sum;
-    }
+    write_vector(search);
+    times_inertia(mv);
     #pragma unroll 1
-    for (int r = lane; r < num_rows; r += LANES) {
-        float sum = 0.0f;
-        for (int i = 0; i < NV; ++i) sum += jacobian[r * stride + i] * search[i];
-        jv[r] = sum;
+    for (int r = lane; r < num_contacts * DIM; r += LANES) {
+        Contact& at = contact(r / DIM);
+        at.jv[r % DIM] = product(at.jacobian[r % DIM], vector);
     }
     sync();
-    if (!search_line(search_dot, scale, alpha, gained)) bits |= $too_many_on_line;
-    sync();
-    for (int i = lane; i < NV; i += LANES) {
-        qacc[i] += alpha * search[i];
-        momentum[i] += alpha * mv[i];
+    if (!search_line(mv, search_dot, scale, alpha, gained)) bits |= $too_many_on_line;
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        qacc[m] += alpha * search[m];
+        momentum[m] += alpha * mv[m];
     }
+    sync();
     #pragma unroll 1
-    for (int r = lane; r < num_rows; r += LANES) jaref[r] += alpha * jv[r];
+    for (int r = lane; r < num_contacts * DIM; r += LANES) {
+        Contact& at = contact(r / DIM);
+        at.jaref[r % DIM] += alpha * at.jv[r % DIM];
+    }
     sync();
     ++iteration;
 }
-for (int i = lane; i < NV; i += LANES) {
-    wp::index(problem.qacc, world, i) = qacc[i];
-    wp::index(problem.momentum, world, i) = momentum[i];
-}
 #pragma unroll 1
-for (int r = lane; r < num_rows; r += LANES) {
-    wp::index(problem.force, world, r) = force[r];
-    wp::index(problem.state, world, r) = state[r];
+for (int c = lane; c < num_contacts; c += LANES) {
+    const Contact& at = contact(c);
+    Vec frame[3];
+    frame_of(wp::index(problem.contacts.normal, world, c), frame);
+    wp::index(problem.contacts.force, world, c) =
+        frame[0] * at.force[0] + frame[1] * at.force[1] + frame[2] * at.force[2];
 }
-if ($step) {
-    // Velocities by the forces found, those of joints as they change over the step (MuJoCo's implicitfast); then positions.
-    const float dt = wp::index(motion.timestep, world % motion.timestep.shape[0]);
-    float* qvel = &wp::index(motion.qvel, world, 0);
-    float* qpos = &wp::index(motion.qpos, world, 0);
-    sync();
-    for (int i = lane; i < NV; i += LANES) {
-        for (int j = 0; j <= i; ++j) hessian[i * LD + j] = inertia[i * LD + j];
-        hessian[i * LD + i] += dt * wp::index(motion.slope, world, i);
-        search[i] = momentum[i];
-        wp::index(problem.qacc_warmstart, world, i) = qacc[i];
+
+// Velocities by the forces found, those of joints as they change over the step (MuJoCo's implicitfast); then positions.
+float h[MINE][NV];
+#pragma unroll ALL
+for (int m = 0; m < MINE; ++m) {
+    const int i = lane + m * LANES;
+    const float more = i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f;
+    #pragma unroll ALL
+    for (int j = 0; j < NV; ++j) h[m][j] = (i < NV ? inertia[i * LD + j] : 0.0f) + (i == j ? more : 0.0f);
+}
+solve(h, momentum);
+#pragma unroll ALL
+for (int m = 0; m < MINE; ++m) {
+    const int i = lane + m * LANES;
+    speed[m] += momentum[m] * dt;
+    if (i >= NV) continue;
+    wp::index(problem.qacc_warmstart, world, i) = qacc[m];
+    qvel[i] = speed[m];
+}
+write_vector(speed);
+#pragma unroll 1
+for (int j = lane; j < problem.joint_type.shape[0]; j += LANES) {
+    const float* v = vector + problem.joint_dof.data[j];
+    float* q = qpos + problem.joint_qpos.data[j];
+    if (problem.joint_type.data[j] != $free) {
+        q[0] += dt * v[0];
+        continue;
     }
-    sync();
-    solve_hessian();
-    for (int i = lane; i < NV; i += LANES) {
-        search[i] = qvel[i] + search[i] * dt;
-        qvel[i] = search[i];
+    for (int i = 0; i < 3; ++i) q[i] += dt * v[i];
+    // Approximate sines of small angles would be too coarse for what adds up over a crossing: series, to rounding below 1.
+    const float square = 0.25f * dt * dt * (v[3] * v[3] + v[4] * v[4] + v[5] * v[5]), half = wp::sqrt(square);
+    float s = 1.0f, c = 1.0f;  // s over half
+    if (square < 1.0f) {
+        s -= square / 6.0f * (1.0f - square / 20.0f * (1.0f - square / 42.0f * (1.0f - square / 72.0f)));
+        c -= square / 2.0f * (1.0f - square / 12.0f * (1.0f - square / 30.0f * (1.0f - square / 56.0f)));
+    } else {
+        s = wp::sin(half) / half;
+        c = wp::cos(half);
     }
-    sync();
-    #pragma unroll 1
-    for (int j = lane; j < motion.joint_type.shape[0]; j += LANES) {
-        const float* v = search + motion.joint_dof.data[j];
-        float* q = qpos + motion.joint_qpos.data[j];
-        if (motion.joint_type.data[j] != $free) {
-            q[0] += dt * v[0];
-            continue;
-        }
-        for (int i = 0; i < 3; ++i) q[i] += dt * v[i];
-        // Approximate sines of small angles would be too coarse for what adds up over a crossing: series, to rounding below 1.
-        const float square = 0.25f * dt * dt * (v[3] * v[3] + v[4] * v[4] + v[5] * v[5]), half = wp::sqrt(square);
-        float s = 1.0f, c = 1.0f;  // s over half
-        if (square < 1.0f) {
-            s -= square / 6.0f * (1.0f - square / 20.0f * (1.0f - square / 42.0f * (1.0f - square / 72.0f)));
-            c -= square / 2.0f * (1.0f - square / 12.0f * (1.0f - square / 30.0f * (1.0f - square / 56.0f)));
-        } else {
-            s = wp::sin(half) / half;
-            c = wp::cos(half);
-        }
-        s *= 0.5f * dt;
-        const float length = wp::sqrt(q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]);
-        const float w = q[3] / length, x = q[4] / length, y = q[5] / length, z = q[6] / length;
-        const float a = s * v[3], b = s * v[4], d = s * v[5];
-        const float turned[4] = {
-            w * c - x * a - y * b - z * d, w * a + x * c + y * d - z * b, w * b - x * d + y * c + z * a,
-            w * d + x * b - y * a + z * c};
-        const float now = wp::sqrt(
-            turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2] + turned[3] * turned[3]);
-        for (int i = 0; i < 4; ++i) q[3 + i] = turned[i] / now;
-    }
-    if (problem.num_rows.data[world] > ROWS) bits |= $too_many_rows;
-    if (num_contacts > motion.most_contacts) bits |= $too_many_contacts;
+    s *= 0.5f * dt;
+    const float length = wp::sqrt(q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]);
+    const float w = q[3] / length, x = q[4] / length, y = q[5] / length, z = q[6] / length;
+    const float a = s * v[3], b = s * v[4], d = s * v[5];
+    const float turned[4] = {
+        w * c - x * a - y * b - z * d, w * a + x * c + y * d - z * b, w * b - x * d + y * c + z * a,
+        w * d + x * b - y * a + z * c};
+    const float now = wp::sqrt(
+        turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2] + turned[3] * turned[3]);
+    for (int i = 0; i < 4; ++i) q[3 + i] = turned[i] / now;
 }
 if (lane == 0) {
+    problem.num_rows.data[world] = (int)num_rows + DIM * num_contacts;
     problem.iterations.data[world] = iteration;
-    problem.overflow.data[world] |= bits;
+    problem.overflow.data[world] = bits;
 }

@@ -1,14 +1,15 @@
-"""One robot's contact problem, solved from beginning to end by 32 threads of a GPU, or by one of a CPU.
+"""One robot's step: its contact problem is put together, solved and acted on by 32 threads of a GPU, or by one of a CPU.
 
-mujoco_warp's Newton solver launches some seventy kernels a step, each over all robots, and hands gradient, Hessian and
-search direction from one to the next through global memory. A walking robot has six to twenty rows of constraints and
-mostly is done after one iteration. Here a warp takes one robot, keeps all but the constraint Jacobian in shared memory,
-and iterates until that robot is done.
+mujoco_warp takes some ninety kernels a step for it, each over all robots, and hands rows of constraints, gradient,
+Hessian and search direction from one to the next through global memory. A walking robot has two contacts and mostly is
+done after one or two iterations. Here a warp takes one robot: it makes the rows of its contacts, joint limits and joint
+friction in shared memory, iterates until that robot is done, and moves it on. Matrices are factorised in registers.
 
-Algorithm, tests of convergence and line search are mujoco_warp's (Todorov, "Convex and analytically-invertible
-dynamics with contacts and constraints", ICRA 2014; primal form, elliptic cones), so that iterates agree to rounding.
-Only the Hessian of a contact on the side of its cone is put together in another way: its C is positive semidefinite,
-so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``find_direction``).
+Constraints, algorithm, tests of convergence and line search are those of MuJoCo and mujoco_warp (Todorov, "Convex and
+analytically-invertible dynamics with contacts and constraints", ICRA 2014; primal form, elliptic cones), so that steps
+agree to rounding. Only the Hessian of a contact on the side of its cone is put together in another way: its C is
+positive semidefinite, so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu,
+``find_direction``).
 """
 
 from dataclasses import asdict, dataclass
@@ -19,72 +20,66 @@ from typing import Any
 import warp as wp
 
 from kernels import lanes
+from kernels.contact import Contacts, Surfaces
 
 _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
-_CHUNK = 16
-"""Rows of constraints whose part of the Hessian is summed at once."""
+_CHUNK = 4
+"""Contacts whose part of the Hessian is summed at once."""
+_SHARED_WORDS = 1792  # of a robot, so that 32 find room; contacts beyond these are in global memory
 
 
 _BODY = Path(__file__).with_suffix(".cu")
+_vec5 = wp.types.vector(5, float)
 
 
 @wp.struct
 class Problem:
-    """Every world's contact problem, in the solver's arrays; world first, then rows or dofs."""
+    """Model, state and contacts of every robot. Arrays of a model of shape (1, ...) hold for all, else for one each."""
 
     most_iterations: int
     most_line_iterations: int
     tolerance: wp.array[float]
     ls_tolerance: wp.array[float]
     impratio_invsqrt: wp.array[float]
-    tri_row: wp.array[int]
-    """Rows, then columns, of the upper triangle of a matrix of num_dofs x num_dofs."""
-    tri_col: wp.array[int]
+    timestep: wp.array[float]
+    joint_type: wp.array[int]
+    joint_qpos: wp.array[int]
+    joint_dof: wp.array[int]
+    joint_limited: wp.array[bool]
+    joint_range: wp.array2d[wp.vec2]
+    joint_margin: wp.array2d[float]
+    joint_solref: wp.array2d[wp.vec2]
+    joint_solimp: wp.array2d[_vec5]
+    dof_joint: wp.array[int]
+    dof_weight: wp.array2d[float]
+    """MuJoCo's ``invweight0``, of dofs and below of bodies."""
+    dof_solref: wp.array2d[wp.vec2]
+    """Of friction in the joints."""
+    dof_solimp: wp.array2d[_vec5]
+    frictionloss: wp.array2d[float]
+    body_root: wp.array[int]
+    body_weight: wp.array2d[wp.vec2]
+    is_ancestor: wp.array2d[int]
+    """Whether a body, in rows, moves with a dof."""
+    surfaces: Surfaces
     inertia_row: wp.array[int]
     """Rows, then columns, of the numbers kept of the inertia."""
     inertia_col: wp.array[int]
     inertia: wp.array2d[float]
-    qacc_warmstart: wp.array2d[float]
     qfrc_smooth: wp.array2d[float]
-    num_equalities: wp.array[int]
-    """Rows of equalities; then come those of friction losses, then all others."""
-    num_losses: wp.array[int]
-    num_rows: wp.array[int]
-    row_type: wp.array2d[int]
-    row_id: wp.array2d[int]
-    jacobian: wp.array3d[float]
-    stiffness: wp.array2d[float]
-    aref: wp.array2d[float]
-    frictionloss: wp.array2d[float]
-    num_contacts: wp.array[int]
-    """Of all worlds, shape (1,)."""
-    friction: wp.array[wp.types.vector(5, float)]
-    condim: wp.array[int]
-    address: wp.array2d[int]
-    """First row of each contact in its world, in column 0; -1 where it found no room."""
-    qacc: wp.array2d[float]
-    momentum: wp.array2d[float]
-    """Inertia times ``qacc``."""
-    qfrc_constraint: wp.array2d[float]
-    force: wp.array2d[float]
-    state: wp.array2d[int]
-    iterations: wp.array[int]
-    overflow: wp.array[int]
-
-
-@wp.struct
-class Motion:
-    """What a step needs once the accelerations are known."""
-
-    timestep: wp.array[float]
     slope: wp.array2d[float]
     """What a dof's force loses per speed of that dof."""
-    joint_type: wp.array[int]
-    joint_qpos: wp.array[int]
-    joint_dof: wp.array[int]
+    cdof: wp.array2d[wp.spatial_vector]
+    subtree_com: wp.array2d[wp.vec3]
+    contacts: Contacts
+    others: wp.array2d[float]
+    """Room for the contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.other_words`)."""
+    qacc_warmstart: wp.array2d[float]
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
-    most_contacts: int
+    num_rows: wp.array[int]
+    iterations: wp.array[int]
+    overflow: wp.array[int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,47 +87,74 @@ class Sizes:
     """What a model's kernel is made for."""
 
     dofs: int
-    rows: int
-    """Most rows of constraints of a world."""
+    contacts: int
+    """Most contacts of a robot."""
     dimensions: int
     """Most rows of a contact."""
     inertia: int
     """Numbers kept of an inertia."""
+    losses: bool
+    """Whether there is friction in any joint."""
+
+    @property
+    def stride(self) -> int:
+        """Words from row to row of a matrix: whole vectors of four, an odd number, so that 8 rows meet in no bank."""
+        return 4 * (-(-self.dofs // 4) | 1)
+
+    @property
+    def _contact_words(self) -> int:
+        return _fours(self.dimensions * (self.stride + 5) + 1)
+
+    @property
+    def _other_words(self) -> int:
+        matrices = (self.dofs + 1 + _CHUNK * self.dimensions) * self.stride
+        return matrices + _fours(_CHUNK * self.dimensions**2)
+
+    @property
+    def kept(self) -> int:
+        """Contacts in shared memory."""
+        return min(self.contacts, max(1, (_SHARED_WORDS - self._other_words) // self._contact_words))
 
     @property
     def words(self) -> int:
-        """Words of memory that a robot needs."""
-        stride = self.dofs | 1
-        matrices = 2 * self.dofs * stride + _CHUNK * (stride + self.dimensions)
-        return matrices + 5 * self.rows + 5 * self.dofs
+        """Words of shared memory that a robot needs."""
+        return self._other_words + self.kept * self._contact_words
+
+    @property
+    def other_words(self) -> int:
+        """Words of global memory that a robot needs."""
+        return (self.contacts - self.kept) * self._contact_words
+
+
+def _fours(words: int) -> int:
+    return -(-words // 4) * 4
 
 
 @cache
-def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...], step: bool) -> Any:
-    values = {"step": int(step), "chunk": _CHUNK} | asdict(sizes) | dict(codes)
-    snippet = lanes.snippet(_BODY, words=sizes.words, **values)
+def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
+    values = {"chunk": _CHUNK, "kept": sizes.kept, "stride": sizes.stride} | asdict(sizes) | dict(codes)
+    snippet = lanes.snippet(_BODY, words=sizes.words, **values | {"losses": str(sizes.losses).lower()})
 
     @wp.func_native(snippet=snippet)
-    def solve_one(problem: Problem, motion: Motion, thread: int): ...
+    def step_one(problem: Problem, thread: int): ...
 
     options = {"fast_math": True}  # approximate division and roots; slopes below rounding end a line search anyway
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options, cuda_max_registers=_REGISTERS)
-    def solve_all(problem: Problem, motion: Motion):
+    def step_all(problem: Problem):
         """Grid (num_worlds * lanes,)."""
-        solve_one(problem, motion, wp.tid())
+        step_one(problem, wp.tid())
 
-    return solve_all
+    return step_all
 
 
-def solve_problem(problem: Problem, sizes: Sizes, codes: dict[str, Any], motion: Any = None) -> None:
-    """Joint accelerations and constraint forces of every world, from a warm start.
+def step_robots(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
+    """Moves every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
-    The problem's arrays are written from ``qacc`` on: of ``overflow`` bits are added. With a motion ``qpos`` and
-    ``qvel`` are moved on by a step, and ``qacc_warmstart`` is written. The words of the sizes must
-    :func:`kernels.lanes.fits`. ``codes`` are the solver's own numbers, by their names in solver.cu: of constraint
-    states, of an elliptic contact's rows, of a free joint, of the bits in ``overflow``, and the least divisor.
+    It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of rows, that of
+    iterations, and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are
+    MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and the
+    least divisor.
     """
-    kernel = _kernel(sizes, tuple(codes.items()), motion is not None)
-    inputs, num_worlds = [problem, motion or Motion()], problem.qacc.shape[0]
-    lanes.launch(kernel, num_worlds, inputs, words=sizes.words, device=problem.qacc.device)
+    kernel, num_worlds = _kernel(sizes, tuple(codes.items())), problem.qvel.shape[0]
+    lanes.launch(kernel, num_worlds, [problem], words=sizes.words, device=problem.qvel.device)

@@ -219,7 +219,7 @@ class Rollout:
             for task, episode in self._latches:
                 latch_outcomes(
                     sim.joint_q, sim.joint_qd, self._last_action, sim.geom_force, sim.geom_role, sim.overflow,
-                    sim.contact_count, sim.contact_capacity, task, episode,
+                    task, episode,
                 )  # fmt: skip
             add_penalties(
                 sim.joint_q, sim.joint_qd, sim.sensors.base_com, self.command, sim.geom_force, sim.geom_role,

@@ -7,11 +7,10 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.contact import ContactBuffer, Layout, collide_strips
+from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay_targets, limit_torques, tell_solver
-from kernels.ground import GroundRecords, make_bodies, tell_contacts
+from kernels.ground import Ground
 from kernels.observation import Sensors
-from kernels.penalties import SolverContacts, sum_geom_forces
 from kernels.restart import clear_rows
 from sim.bank import TerrainBank
 from sim.crossing import GROUND_FRICTION, SolverCfg
@@ -19,9 +18,7 @@ from sim.robots.compiled import robot_spec
 from sim.robots.model import builder_of
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.solver import dynamics_of, use_own_solver
-
-use_own_solver()
+from sim.solver import dynamics_of
 
 
 class Simulation:
@@ -36,13 +33,11 @@ class Simulation:
         geom_role: Role bits of :mod:`kernels.penalties`, shape (num_geoms,).
         joint_torque: Actuator torques of the last step [N m] in columns 6 and up, shape (num_envs, 6 + num_joints).
         overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
-        contact_count: Terrain contacts found in the last step over all environments, shape (1,).
-        contact_capacity: Contacts that fit.
-        contact_records: The contacts themselves, as the solver reads them.
+        contacts: Terrain contacts of the last step.
         body_q: Body poses at the beginning of the last step, or of the last :meth:`refresh`, world-local frame,
-            transforms of shape (num_envs * bodies_per_env,).
-        solver_contacts: Contacts and constraint forces of the last step, as the solver keeps them.
-        column_of_geom: Column in ``geom_force`` of each solver geom, -1 for none.
+            transforms of shape (num_envs, bodies_per_env).
+        column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
+        geom_of_shape: The solver's number of each.
         motors: Effort limit [N m], stall torque [N m] and speed limit [rad/s] of each actuator, vectors of shape
             (num_actuators,); None without DC motors.
     """
@@ -147,57 +142,25 @@ class Simulation:
         self.solver.notify_model_changed(changed)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
-        shape_body = self.model.shape_body.numpy()
-        first_shape = int(np.flatnonzero(shape_body >= 0)[0])
-        self.layout = Layout()
-        self.layout.bodies_per_env = builder.body_count
-        self.layout.shapes_per_env = builder.shape_count
-        self.layout.first_shape = first_shape
-        self.layout.ground_shape = int(np.flatnonzero(shape_body < 0)[0])
+        shape_body, geom_of_shape = self.model.shape_body.numpy(), self.solver.newton_shape_to_mjc_geom.numpy()
+        first = int(np.flatnonzero(shape_body >= 0)[0])
+        self.geom_of_shape = geom_of_shape[first : first + builder.shape_count]
         self.probes = make_probes(builder)
-        self.contact_capacity = self.num_envs * self.robot.nconmax
-        self._contacts = newton.Contacts(
-            rigid_contact_max=self.contact_capacity,
-            soft_contact_max=0,
-            device=self.device,
-            per_contact_shape_properties=self.bank.ground is not None,
-        )
-        self.contact_count = self._contacts.rigid_contact_count
-        self.contact_records = ContactBuffer()
-        for field in ContactBuffer.vars:
-            setattr(self.contact_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
-        geom_of_shape = self.solver.newton_shape_to_mjc_geom.numpy()
-        if self.bank.ground is not None:
-            self._build_ground(geom_of_shape[first_shape:].reshape(self.num_envs, -1))
-        column_of_geom = np.full(self.solver.mjw_model.ngeom, -1)
-        for shape, name in enumerate(builder.shape_label):
-            if name in self.robot.geom_names:  # a mesh of several parts is several shapes of one name
-                column_of_geom[geom_of_shape[first_shape + shape]] = self.robot.geom_names.index(name)
-        self.column_of_geom = wp.array(column_of_geom, dtype=int)
-        self.geom_role = wp.array([self.robot.role_of(name) for name in self.robot.geom_names], dtype=int)
-
-    def _build_ground(self, geoms: np.ndarray) -> None:
-        """What contacts need to know of the robots' shapes, whose solver geoms are ``geoms``, (num_envs, shapes)."""
-        model, envs = self.solver.mjw_model, np.arange(self.num_envs)[:, None]
-        inverse_weight, solref, solimp = (
-            np.broadcast_to(array.numpy(), (self.num_envs, *array.numpy().shape[1:]))
-            for array in (model.body_invweight0, model.geom_solref, model.geom_solimp)
-        )
-        self._bodies = make_bodies(
-            inverse_weight[envs, model.geom_bodyid.numpy()[geoms], 0].ravel(),
-            solimp[envs, geoms, 1].ravel(),
-            solref[envs, geoms, 0].ravel(),
-            self.device,
-        )
-        self._ground_records = GroundRecords()
-        for field in GroundRecords.vars:
-            setattr(self._ground_records, field, getattr(self._contacts, f"rigid_contact_{field}"))
+        self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
+        # A mesh of several parts is several shapes of one name.
+        names = self.robot.geom_names
+        columns = [names.index(name) if name in names else -1 for name in builder.shape_label]
+        self.column_of_shape = wp.array(columns, dtype=int)
+        self.geom_role = wp.array([self.robot.role_of(name) for name in names], dtype=int)
+        ground = int(geom_of_shape[np.flatnonzero(shape_body < 0)[0]])
+        model, data = self.solver.mjw_model, self.solver.mjw_data
+        self._dynamics = dynamics_of(model, data, self.contacts, self.geom_of_shape, ground)
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
         self._state = model.state()
         self._control = model.control()
-        self.body_q = self._state.body_q
+        self.body_q = self._state.body_q.reshape((self.num_envs, -1))
         self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
         self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
         self.targets = self._control.joint_target_q.reshape((self.num_envs, 7 + num_joints))
@@ -205,11 +168,6 @@ class Simulation:
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
         self.geom_names = self.robot.geom_names
-        self.solver_contacts = SolverContacts()
-        self.solver_contacts.count, self.solver_contacts.capacity = data.nacon, data.naconmax
-        self.solver_contacts.world, self.solver_contacts.geom = data.contact.worldid, data.contact.geom
-        self.solver_contacts.frame, self.solver_contacts.efc_address = data.contact.frame, data.contact.efc_address
-        self.solver_contacts.efc_force = data.efc.force
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -218,7 +176,6 @@ class Simulation:
         self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
         self._coordinates = self._build_coordinates()
         self._build_drives()
-        self._dynamics = dynamics_of(self.solver.mjw_model, data)
 
     def _build_drives(self) -> None:
         """What ideal drives lack: torque limits that depend on the speed, and a delay of targets."""
@@ -257,7 +214,7 @@ class Simulation:
         coordinates.column_of_joint = wp.array(columns, dtype=int)
         coordinates.target_of_actuator = wp.array(followed, dtype=int)
         coordinates.column_of_body = wp.array(
-            [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.layout.bodies_per_env)], dtype=int
+            [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.body_q.shape[1])], dtype=int
         )
         coordinates.base_com = self.sensors.base_com
         return coordinates
@@ -269,15 +226,8 @@ class Simulation:
 
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
-        self._contacts.clear()
-        collide_strips(
-            self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, self.layout, self.contact_records
-        )
-        if self.bank.ground is not None:
-            tell_contacts(
-                self.terrain_of_env, self.bank.ground, self._bodies, self.layout, self.contact_records,
-                self._ground_records,
-            )  # fmt: skip
+        ground = self.bank.ground or Ground()
+        collide_strips(self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, ground, self.contacts)
 
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
@@ -293,16 +243,14 @@ class Simulation:
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self._dynamics.find()
-            ask_poses(coordinates, self.body_q.reshape((self.num_envs, -1)))
+            ask_poses(coordinates, self.body_q)
             self.collide()
-            solver._convert_contacts_to_mjwarp(self.model, self._state, self._contacts)
-            self.overflow.zero_()
             self._dynamics.step()
             ask_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:
         """Sum the last step's contact forces into ``geom_force``."""
-        sum_geom_forces(self.solver_contacts, self.column_of_geom, self.geom_force)
+        sum_forces(self.contacts, self.column_of_shape, self.geom_force)
 
     def clear_solver(self, mask: Any) -> None:
         """Forget warm start, Jacobian and former targets in the environments where ``mask`` (num_envs,) is not 0.

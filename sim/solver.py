@@ -1,7 +1,6 @@
-"""What is ours within a physics step of mujoco_warp: dynamics and contacts in a kernel each, for every model that fits.
+"""What is ours within a physics step: dynamics, and constraints with the move, in a kernel each, for models that fit.
 
-mujoco_warp has no hooks for its solver of contacts, so ours takes the place of a function of the pinned version.
-tests/sim/test_solver.py holds ours against theirs.
+Any other model takes mujoco_warp's step. tests/sim/test_solver.py holds ours against theirs.
 """
 
 from typing import Any
@@ -9,92 +8,88 @@ from typing import Any
 import mujoco_warp
 import numpy as np
 import warp as wp
-from mujoco_warp._src import constraint, solver, types
+from mujoco_warp._src import types
+from numpy.typing import NDArray
 
 from kernels import lanes
+from kernels.contact import Contacts, Surfaces
+from kernels.coordinates import SolverContacts, ask_forces, tell_contacts
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
-from kernels.solver import Motion, Problem, Sizes, solve_problem
-
-solve_theirs = solver.solve
+from kernels.solver import Problem, Sizes, step_robots
 
 _JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
-_CODES = {state.name.lower(): state.value for state in types.ConstraintState} | {
-    "elliptic": types.ConstraintType.CONTACT_ELLIPTIC.value,
+_CODES = {
     "free": types.JointType.FREE.value,
     "too_many": types.OverflowType.ITERATIONS.value,
     "too_many_on_line": types.OverflowType.LS_ITERATIONS.value,
-    "too_many_rows": types.OverflowType.NEFC.value,
     "too_many_contacts": types.OverflowType.NARROWPHASE.value,
     "minval": types.MJ_MINVAL,
+    "least_imp": types.MJ_MINIMP,
+    "most_imp": types.MJ_MAXIMP,
 }
 
 
-def sizes_of(m: Any, d: Any) -> Sizes:
-    """Sizes of mujoco_warp's model and data, for the kernel."""
-    dimensions = max(3, int(m.nmaxcondim))
-    return Sizes(dofs=m.nv, rows=d.njmax, dimensions=dimensions, inertia=m.M_colind.shape[0])
+def mix_surfaces(m: Any, geoms: NDArray[np.integer[Any]], ground: int) -> Surfaces:
+    """Surfaces of the solver's geoms ``geoms``, shape (num_shapes,), on that of the ground, as MuJoCo mixes two geoms.
+
+    It is what mujoco_warp's ``contact_params`` makes of a pair.
+    """
+    of_all = {name: alike(getattr(m, f"geom_{name}")).numpy() for name in ("solmix", "friction", "solref", "solimp")}
+    (solmix, friction, solref, solimp), (solmix_0, friction_0, solref_0, solimp_0) = (
+        [values[:, which] for values in of_all.values()] for which in (geoms, [ground])
+    )
+    priority, condim = m.geom_priority.numpy(), m.geom_condim.numpy()
+    above, below = priority[geoms] > priority[ground], priority[geoms] < priority[ground]
+    equal = np.where(solmix + solmix_0 < types.MJ_MINVAL, 0.5, solmix / np.maximum(solmix + solmix_0, types.MJ_MINVAL))
+    share = np.where(above, 1.0, np.where(below, 0.0, equal))[..., None]
+    above, below = above[:, None], below[:, None]
+    friction = np.where(above, friction, np.where(below, friction_0, np.maximum(friction, friction_0)))
+    mixed = share * solref + (1.0 - share) * solref_0
+    timed = (solref[..., :1] > 0.0) & (solref_0[..., :1] > 0.0)
+    dims = np.maximum(condim[geoms], condim[ground])
+    dims = np.where(above[:, 0], condim[geoms], np.where(below[:, 0], condim[ground], dims))
+    surfaces = Surfaces()
+    with wp.ScopedDevice(m.geom_condim.device):
+        surfaces.geom = wp.array(geoms, dtype=int)
+        surfaces.body = wp.array(m.geom_bodyid.numpy()[geoms], dtype=int)
+        surfaces.condim = wp.array(dims, dtype=int)
+        surfaces.friction = wp.array(np.maximum(friction[..., [0, 0, 1, 2, 2]], types.MJ_MINMU), dtype=types.vec5)
+        surfaces.solref = wp.array(np.where(timed, mixed, np.minimum(solref, solref_0)), dtype=wp.vec2)
+        surfaces.solimp = wp.array(share * solimp + (1.0 - share) * solimp_0, dtype=types.vec5)
+    return surfaces
 
 
-def fits(m: Any, d: Any) -> bool:
-    """Whether :func:`solve_contacts` solves problems of this model: dense, elliptic cones, by Newton, and small."""
-    return (
-        m.opt.solver == types.SolverType.NEWTON
-        and m.opt.cone == types.ConeType.ELLIPTIC
-        and m.opt.integrator != types.IntegratorType.DISCRETE
-        and not m.opt.enableflags & types.EnableBit.SLEEP
-        and not m.opt.disableflags & types.DisableBit.WARMSTART
-        and not m.is_sparse
-        and m.opt.noslip_iterations == 0
-        and m.opt.iterations > 0
-        and m.nv > 0
-        and d.njmax > 0
-        and lanes.fits(sizes_of(m, d).words)
+def alike(array: Any) -> Any:
+    """An array over worlds; its first row where all are the same, so that robots read the same memory."""
+    if array.shape[0] == 1 or array.strides[0] == 0:
+        return array[:1]
+    values = array.numpy()
+    return array[:1] if (values == values[:1]).all() else array
+
+
+def sizes_of(m: Any, contacts: Contacts) -> Sizes:
+    """Sizes of mujoco_warp's model with room for so many contacts, for the kernel."""
+    return Sizes(
+        dofs=m.nv,
+        contacts=contacts.shape.shape[1],
+        dimensions=max(3, int(m.nmaxcondim)),
+        inertia=m.M_colind.shape[0],
+        losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
     )
 
 
-def problem_of(m: Any, d: Any) -> Problem:
-    """Arrays of mujoco_warp's model and data, under the kernel's names."""
-    problem = Problem()
-    problem.most_iterations, problem.most_line_iterations = m.opt.iterations, m.opt.ls_iterations
-    problem.tolerance, problem.ls_tolerance = m.opt.tolerance, m.opt.ls_tolerance
-    problem.impratio_invsqrt = m.opt.impratio_invsqrt
-    problem.tri_row, problem.tri_col = m.dof_tri_row, m.dof_tri_col
-    problem.inertia_row, problem.inertia_col, problem.inertia = m.M_hinit_i, m.M_colind, d.M
-    problem.qacc_warmstart, problem.qfrc_smooth = d.qacc_warmstart, d.qfrc_smooth
-    problem.num_equalities, problem.num_losses, problem.num_rows = d.ne, d.nf, d.nefc
-    problem.row_type, problem.row_id, problem.jacobian = d.efc.type, d.efc.id, d.efc.J
-    problem.stiffness, problem.aref, problem.frictionloss = d.efc.D, d.efc.aref, d.efc.frictionloss
-    problem.num_contacts, problem.friction, problem.condim = d.nacon, d.contact.friction, d.contact.dim
-    problem.address = d.contact.efc_address
-    problem.qacc, problem.momentum, problem.qfrc_constraint = d.qacc, d.efc.Ma, d.qfrc_constraint
-    problem.force, problem.state = d.efc.force, d.efc.state
-    problem.iterations, problem.overflow = d.solver_niter, d.overflow
-    return problem
-
-
-def solve_contacts(m: Any, d: Any) -> None:
-    """Joint accelerations and constraint forces of every world of a model that :func:`fits`, by our kernel."""
-    solve_problem(problem_of(m, d), sizes_of(m, d), _CODES)
-
-
-def _solve(m: Any, d: Any) -> None:
-    (solve_contacts if fits(m, d) else solve_theirs)(m, d)
-
-
-def use_own_solver(wanted: bool = True) -> None:
-    """Make steps that are captured from now on solve contacts in one kernel, or as mujoco_warp does."""
-    solver.solve = _solve if wanted else solve_theirs
-
-
-def fits_dynamics(m: Any, d: Any) -> bool:
+def fits(m: Any, contacts: Contacts) -> bool:
     """Whether :class:`Dynamics` takes this model: robots of joints and position actuators, and nothing else."""
     flags = types.DisableBit
-    unforced = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL
+    needed = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL | flags.CONSTRAINT
+    needed |= flags.FRICTIONLOSS | flags.LIMIT | flags.CONTACT | flags.WARMSTART | flags.REFSAFE
     joints, actuated = m.jnt_type.numpy(), m.actuator_trnid.numpy()[:, 0]
     free, bodies = joints == types.JointType.FREE, m.jnt_bodyid.numpy()
     misfits = (
         m.opt.run_collision_detection or m.flg_surfacevel or any(vars(m.callback).values()) or m.nsensor,
-        m.opt.integrator != types.IntegratorType.IMPLICITFAST or m.opt.disableflags & unforced,
+        m.opt.integrator != types.IntegratorType.IMPLICITFAST or m.opt.disableflags & needed,
+        m.opt.solver != types.SolverType.NEWTON or m.opt.cone != types.ConeType.ELLIPTIC,
+        m.opt.enableflags or m.is_sparse or m.opt.noslip_iterations or not m.opt.iterations or not m.nv,
         m.neq or m.ntendon or m.nflex or m.nmocap or m.nhistory or m.has_fluid or m.flg_adhesion,
         m.body_gravcomp.numpy().any() or m.body_freeadr.size,
         (joints == types.JointType.BALL).any() or (np.bincount(bodies, minlength=1)[bodies[free]] != 1).any(),
@@ -105,7 +100,8 @@ def fits_dynamics(m: Any, d: Any) -> bool:
         m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
         (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
     )
-    return fits(m, d) and lanes.fits(tree_sizes_of(m).words) and not any(misfits)
+    words = tree_sizes_of(m).words, sizes_of(m, contacts).words
+    return all(map(lanes.fits, words)) and not any(misfits)
 
 
 def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -129,51 +125,55 @@ def _floats(array: Any) -> Any:
 
 
 class Dynamics:
-    """A physics step's dynamics, of a model and its data, in two kernels around the constraints' rows.
+    """A physics step's dynamics, of a model and its data, in two kernels, before and after contacts are found.
 
-    Forces from outside (``qfrc_applied``, ``xfrc_applied``) are left out. Numbers of the model may change, its arrays
-    may not be replaced.
+    Forces from outside (``qfrc_applied``, ``xfrc_applied``) are left out. Numbers of the model may change if they do so
+    in all worlds alike, or were not the same in all; its arrays may not be replaced.
     """
 
-    def __init__(self, m: Any, d: Any) -> None:
-        """For a model that :func:`fits_dynamics`."""
-        self._model, self._data = m, d
+    def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces) -> None:
+        """For a model that :func:`fits`, and its contacts, whose forces are written."""
+        self._tree_sizes, self._sizes = tree_sizes_of(m), sizes_of(m, contacts)
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
         actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)
-        self._sizes = tree_sizes_of(m)
-        device = d.qpos.device
-        tree = self._tree = Tree()
-        with wp.ScopedDevice(device):
+        limited = np.isin(np.arange(m.njnt), m.jnt_limited_slide_hinge_adr.numpy())
+        tree, problem, robots = self._tree, self._problem, self._robots = Tree(), Problem(), Robots()
+        with wp.ScopedDevice(d.qpos.device):
             tree.level, tree.order, tree.actuator = (wp.array(x, dtype=int) for x in (levels, order, actuator))
             tree.roots = wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int)
             tree.biased = wp.array(m.actuator_biastype.numpy() == types.BiasType.AFFINE, dtype=bool)
-            self._slope = wp.zeros((d.nworld, m.nv), dtype=float)
-        for name, of_model in _NAMES.items():
-            setattr(tree, name, getattr(m, of_model))
+            problem.joint_limited = wp.array(limited, dtype=bool)
+            problem.slope = robots.slope = wp.zeros((d.nworld, m.nv), dtype=float)
+            problem.others = wp.zeros((d.nworld, max(1, self._sizes.other_words)), dtype=float)
+        for struct, names in ((tree, _OF_TREE), (problem, _OF_PROBLEM)):
+            for name, of_model in names.items():
+                array = getattr(m, of_model)
+                over_worlds = array.ndim > 1 and of_model not in _NOT_OVER_WORLDS
+                setattr(struct, name, alike(array) if over_worlds else array)
         tree.gravity = m.opt.gravity
-        tree.gain, tree.bias = _floats(m.actuator_gainprm), _floats(m.actuator_biasprm)
-        robots = self._robots = Robots()
+        tree.gain, tree.bias = _floats(alike(m.actuator_gainprm)), _floats(alike(m.actuator_biasprm))
+        problem.most_iterations, problem.most_line_iterations = m.opt.iterations, m.opt.ls_iterations
+        for name in ("tolerance", "ls_tolerance", "impratio_invsqrt", "timestep"):
+            setattr(problem, name, getattr(m.opt, name))
         for name in ("qpos", "qvel", "xpos", "xquat", "subtree_com", "cdof", "qfrc_actuator", "qfrc_smooth"):
             setattr(robots, name, getattr(d, name))
-        robots.control, robots.inertia, robots.slope = d.ctrl, d.M, self._slope
-        motion = self._motion = Motion()
-        motion.timestep, motion.slope, motion.most_contacts = m.opt.timestep, self._slope, d.naconmax
-        motion.joint_type, motion.joint_qpos, motion.joint_dof = m.jnt_type, m.jnt_qposadr, m.jnt_dofadr
-        motion.qpos, motion.qvel = d.qpos, d.qvel
+        for name in ("qpos", "qvel", "subtree_com", "cdof", "qfrc_smooth", "qacc_warmstart", "overflow"):
+            setattr(problem, name, getattr(d, name))
+        robots.control, robots.inertia, problem.inertia = d.ctrl, d.M, d.M
+        problem.contacts, problem.surfaces = contacts, surfaces
+        problem.num_rows, problem.iterations = d.nefc, d.solver_niter
 
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
-        find_dynamics(self._tree, self._robots, self._sizes, _JOINT_CODES)
+        find_dynamics(self._tree, self._robots, self._tree_sizes, _JOINT_CODES)
 
     def step(self) -> None:
         """Constraints, contacts among them, and the move to the next state."""
-        m, d = self._model, self._data
-        constraint.make_constraint(m, d)
-        solve_problem(problem_of(m, d), sizes_of(m, d), _CODES, self._motion)
+        step_robots(self._problem, self._sizes, _CODES)
 
 
-_NAMES = {
+_OF_TREE = {
     "parent": "body_parentid", "root": "body_rootid", "joint": "body_jntadr", "num_joints": "body_jntnum",
     "joint_type": "jnt_type", "joint_body": "jnt_bodyid", "joint_qpos": "jnt_qposadr", "joint_dof": "jnt_dofadr",
     "dof_body": "dof_bodyid", "dof_joint": "dof_jntid", "dof_parent": "dof_parentid", "inertia_start": "M_rowadr",
@@ -185,14 +185,30 @@ _NAMES = {
     "control_limited": "actuator_ctrllimited", "control_range": "actuator_ctrlrange",
     "force_limited": "actuator_forcelimited", "force_range": "actuator_forcerange",
 }  # fmt: skip
-"""Arrays of mujoco_warp's model by their names in :class:`kernels.dynamics.Tree`."""
+_OF_PROBLEM = {
+    "joint_type": "jnt_type", "joint_qpos": "jnt_qposadr", "joint_dof": "jnt_dofadr", "joint_range": "jnt_range",
+    "joint_margin": "jnt_margin", "joint_solref": "jnt_solref", "joint_solimp": "jnt_solimp", "dof_joint": "dof_jntid",
+    "dof_weight": "dof_invweight0", "dof_solref": "dof_solref", "dof_solimp": "dof_solimp",
+    "frictionloss": "dof_frictionloss", "body_root": "body_rootid", "body_weight": "body_invweight0",
+    "is_ancestor": "body_isdofancestor", "inertia_row": "M_hinit_i", "inertia_col": "M_colind",
+}  # fmt: skip
+"""Arrays of mujoco_warp's model by their names in :class:`kernels.dynamics.Tree` and :class:`kernels.solver.Problem`."""
+_NOT_OVER_WORLDS = ("body_isdofancestor", "actuator_forcerange")
+"""Of arrays with several dimensions: what a drive writes anew in each step may come to differ."""
 
 
 class TheirDynamics:
     """The same by mujoco_warp's own step, of any model."""
 
-    def __init__(self, m: Any, d: Any) -> None:
-        self._model, self._data = m, d
+    def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, ground: int) -> None:
+        self._model, self._data, self._contacts, self._surfaces = m, d, contacts, surfaces
+        theirs = self._theirs = SolverContacts()
+        theirs.count, theirs.efc_force, theirs.overflow = d.nacon, d.efc.force, d.overflow
+        theirs.too_many, theirs.ground = types.OverflowType.NARROWPHASE.value, ground
+        for name in ("worldid", "geom", "dist", "pos", "frame", "dim", "friction", "solref", "solimp", "efc_address"):
+            setattr(theirs, name, getattr(d.contact, name))
+        d.contact.type.fill_(int(types.ContactType.CONSTRAINT))
+        theirs.slot = wp.zeros(contacts.shape.shape, dtype=int, device=d.qpos.device)
 
     def find(self) -> None:
         """Poses alone."""
@@ -200,9 +216,17 @@ class TheirDynamics:
 
     def step(self) -> None:
         """All of the step, poses once more."""
+        tell_contacts(self._contacts, self._surfaces, self._theirs)
         mujoco_warp.step(self._model, self._data)
+        ask_forces(self._theirs, self._contacts)
 
 
-def dynamics_of(m: Any, d: Any) -> Dynamics | TheirDynamics:
-    """Ours where the model lets it, else mujoco_warp's."""
-    return Dynamics(m, d) if fits_dynamics(m, d) else TheirDynamics(m, d)
+def dynamics_of(m: Any, d: Any, contacts: Contacts, geoms: NDArray[np.integer[Any]], ground: int) -> Any:
+    """:class:`Dynamics` where the model lets it, else :class:`TheirDynamics`.
+
+    ``geoms`` are the solver's of a robot's shapes, (num_shapes,), the same in all worlds, and that of the ground.
+    """
+    surfaces = mix_surfaces(m, geoms, ground)
+    if fits(m, contacts):
+        return Dynamics(m, d, contacts, surfaces)
+    return TheirDynamics(m, d, contacts, surfaces, ground)

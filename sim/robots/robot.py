@@ -64,9 +64,9 @@ class RobotCfg:
     max_speed: PositiveFloat = 100.0
     """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
     nconmax: PositiveInt = 40
-    """Contacts an environment on average; the buffer is shared by all."""
+    """Most contacts of a robot with the ground."""
     njmax: PositiveInt = 100
-    """Constraint rows an environment."""
+    """Most constraint rows of a robot that takes mujoco_warp's own step, such as one with joints that follow others."""
     stiffness: tuple[PositiveFloat, ...] | None = None
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
     damping: tuple[NonNegativeFloat, ...] | None = None

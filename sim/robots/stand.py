@@ -50,8 +50,8 @@ class Standing:
     """Share of the weight that each touching geom carries, on average over the last half second."""
     restless: float
     """How much the forces on its feet change from one physics step to the next in that time, in weights."""
-    contacts: float
-    """Most contacts a robot, on average over all."""
+    contacts: int
+    """Most contacts of a robot."""
     rows: int
     """Most constraint rows of a robot."""
     overflowed: bool
@@ -87,7 +87,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     sim.joint_q.assign(q)
     contacts, rows, overflowed, forces = _let_fall(sim, seconds)
     first = sim.joint_q.numpy()[0].astype(np.float64)
-    weight = float(sim.model.body_mass.numpy()[: sim.layout.bodies_per_env].sum()) * _GRAVITY
+    weight = float(sim.model.body_mass.numpy()[: sim.body_q.shape[1]].sum()) * _GRAVITY
     up = 1.0 - 2.0 * (first[3] ** 2 + first[4] ** 2)
     on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
     carried = zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True)
@@ -110,8 +110,8 @@ def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
     return float(heights[max(row - room, 0) : row + room + 1, max(column - room, 0) : column + room + 1].max())
 
 
-def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArray[np.float64]]:
-    """Most contacts a robot, most rows, overflow, and the first robot's vertical forces in the last steps [N]."""
+def _let_fall(sim: Simulation, seconds: float) -> tuple[int, int, bool, NDArray[np.float64]]:
+    """Most contacts and most rows of a robot, overflow, and the first robot's vertical forces in the last steps [N]."""
     start = sim.joint_q.numpy().copy()
 
     def launch() -> None:
@@ -122,17 +122,17 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[float, int, bool, NDArra
     sim.joint_q.assign(start)
     sim.joint_qd.zero_()
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    contacts, rows, overflowed, forces = 0.0, 0, False, []
+    contacts, rows, overflowed, forces = 0, 0, False, []
     steps = max(1, round(seconds / sim.robot.physics_dt))
     for step in range(steps):
         sim.launch(graph)
         if step >= steps - max(2, round(_REST_S / sim.robot.physics_dt)):
             forces.append(sim.geom_force.numpy()[0][:, 2].copy())
         if step % sim.robot.decimation == 0:
-            contacts = max(contacts, int(sim.contact_count.numpy()[0]) / sim.num_envs)
+            contacts = max(contacts, int(sim.contacts.count.numpy().max()))
             rows = max(rows, int(sim.solver.mjw_data.nefc.numpy().max()))
             overflowed |= bool((sim.overflow.numpy() & CAPACITY_OVERFLOWS).any())
-    return contacts, rows, overflowed or contacts > sim.robot.nconmax, np.array(forces, dtype=np.float64)
+    return contacts, rows, overflowed, np.array(forces, dtype=np.float64)
 
 
 def describe_model(robot: RobotCfg) -> str:
@@ -157,9 +157,8 @@ def describe_model(robot: RobotCfg) -> str:
         limits = ["-" if drive is None else f"{limit:g}" for limit in motors[drive or 0]]
         joints.append((name, f"{angle:.3f}", span, f"{kp:g}", f"{kd:g}", most, *passive, *limits))
     geoms = [("geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]")]
-    numbers_of = np.array(sim.solver.newton_shape_to_mjc_geom.numpy())[sim.layout.first_shape :]
     for k, name in enumerate(builder.shape_label):
-        geom, kind = int(numbers_of[k]), newton.GeoType(builder.shape_type[k]).name.lower()
+        geom, kind = int(sim.geom_of_shape[k]), newton.GeoType(builder.shape_type[k]).name.lower()
         role = next((role for role in ("base", "foot", "limb") if name in getattr(robot, f"{role}_geoms")), "-")
         size = " ".join(f"{length:.3g}" for length in model.geom_size[geom][: _SIZES_OF.get(kind, 3)])
         contact = f"{model.geom_friction[geom, 0]:g}", f"{model.geom_solref[geom, 0]:g}"
@@ -235,8 +234,8 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
     lines = [
         f"On flat ground: base from {first:.3f} to {last:.3f} m, tilt {standing.tilt_deg:.1f} degrees, joints at most "
         f"{standing.joint_error:.3f} rad off; its weight is on {carried}",
-        f"Dropped on rough ground: at most {standing.contacts:.1f} contacts a robot on average (nconmax "
-        f"{robot.nconmax}) and {standing.rows} constraint rows (njmax {robot.njmax})",
+        f"Dropped on rough ground: at most {standing.contacts} contacts of a robot (nconmax {robot.nconmax}) "
+        f"and {standing.rows} constraint rows (njmax {robot.njmax})",
         *(mistakes or [falls] * (not standing.stands)),
         *["It stands."] * standing.stands,
     ]

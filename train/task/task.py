@@ -175,7 +175,7 @@ class CommandTask:
         sim.read_geom_forces()
         latch_outcomes(
             sim.joint_q, sim.joint_qd, training.last_action, sim.geom_force, sim.geom_role, sim.overflow,
-            sim.contact_count, sim.contact_capacity, self._task, episodes,
+            self._task, episodes,
         )  # fmt: skip
         self._reward.pay(episodes.outcome)
         record_steps(
