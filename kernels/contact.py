@@ -1,6 +1,7 @@
 """Terrain contact: strips of sphere probes against height grids.
 
 A strip is a row of equal spheres on one collision shape, straight but for meshes (:mod:`sim.robots.probes` makes them).
+Some strips of a body that lie together are a bundle, in one ball: most are far from the ground.
 Of the probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its
 two ends and on the highest point between, and a robot on its back cannot flood the solver.
 """
@@ -18,7 +19,7 @@ _vec5 = wp.types.vector(5, float)
 
 @wp.struct
 class Probes:
-    """Sphere probes of one robot, grouped in strips."""
+    """Sphere probes of one robot, in strips, and these in bundles."""
 
     position: wp.array[wp.vec3]
     """Probe centres in the frame of their body [m], shape (num_probes,), strip after strip in order along the strip."""
@@ -28,10 +29,14 @@ class Probes:
     """Probe radius of each strip [m], shape (num_strips,)."""
     strip_spread: wp.array[float]
     """Farthest that a strip's centres lie from the line between its ends [m], shape (num_strips,); 0 if straight."""
-    strip_body: wp.array[int]
-    """Body of each strip, counted within one robot, shape (num_strips,)."""
     strip_shape: wp.array[int]
     """Collision shape of each strip, counted within one robot, shape (num_strips,)."""
+    bundle_start: wp.array[int]
+    """First strip of each bundle, shape (num_bundles + 1,)."""
+    bundle_body: wp.array[int]
+    """Body of each bundle, counted within one robot, shape (num_bundles,)."""
+    bundle_ball: wp.array[wp.vec4]
+    """Ball round each bundle: its middle in the frame of the body, and its radius [m], shape (num_bundles,)."""
 
 
 @wp.struct
@@ -94,21 +99,12 @@ def _write_contact(
         contacts.time_constant[env, slot] = time_constant
 
 
-@wp.kernel
-def _collide_strips_kernel(
-    body_q: wp.array[wp.transform],
-    terrain_of_env: wp.array[int],
-    terrain: Terrain,
-    probes: Probes,
-    ground: Ground,
-    bodies_per_env: int,
+@wp.func
+def _collide_strip(
+    pose: wp.transform, strip: int, terrain: Terrain, ground: Ground, t: int, env: int, probes: Probes,
     contacts_out: Contacts,
-):
-    """Grid (num_strips, num_envs): the threads of a warp look at the same part of different robots."""
-    strip, env = wp.tid()
-    t = terrain_of_env[env]
+):  # fmt: skip
     radius = probes.strip_radius[strip]
-    pose = body_q[env * bodies_per_env + probes.strip_body[strip]]
     begin = probes.strip_start[strip]
     end = probes.strip_start[strip + 1]
     a = wp.transform_point(pose, probes.position[begin])
@@ -119,7 +115,7 @@ def _collide_strips_kernel(
     upper = wp.vec2(wp.max(a[0], b[0]) + reach, wp.max(a[1], b[1]) + reach)
     ceiling = ceiling_over(terrain, t, lower, upper)
     if not (lowest < ceiling):
-        return  # also where the state is NaN
+        return
     first = int(-1)
     last = int(-1)
     deepest = int(-1)
@@ -154,6 +150,29 @@ def _collide_strips_kernel(
         _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
 
 
+@wp.kernel
+def _collide_strips_kernel(
+    body_q: wp.array2d[wp.transform],
+    terrain_of_env: wp.array[int],
+    terrain: Terrain,
+    probes: Probes,
+    ground: Ground,
+    contacts_out: Contacts,
+):
+    """Grid (num_bundles, num_envs): the threads of a warp look at the same part of different robots."""
+    bundle, env = wp.tid()
+    t = terrain_of_env[env]
+    pose = body_q[env, probes.bundle_body[bundle]]
+    ball = probes.bundle_ball[bundle]
+    middle = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
+    lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
+    upper = wp.vec2(middle[0] + ball[3], middle[1] + ball[3])
+    if not (middle[2] - ball[3] < ceiling_over(terrain, t, lower, upper)):
+        return  # also where the state is NaN
+    for strip in range(probes.bundle_start[bundle], probes.bundle_start[bundle + 1]):
+        _collide_strip(pose, strip, terrain, ground, t, env, probes, contacts_out)
+
+
 def collide_strips(
     body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, contacts_out: Contacts
 ) -> None:
@@ -162,12 +181,11 @@ def collide_strips(
     ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
     the same everywhere.
     """
-    num_envs, bodies_per_env = body_q.shape
+    num_envs, device = body_q.shape[0], body_q.device
     if terrain_of_env.shape[0] != num_envs:
         raise ValueError(f"body_q must hold {terrain_of_env.shape[0]} robots, one a terrain_of_env, got {num_envs}")
     contacts_out.count.zero_()
-    inputs = [body_q.flatten(), terrain_of_env, terrain, probes, ground, bodies_per_env]
-    size, device = (probes.strip_radius.shape[0], num_envs), body_q.device
+    inputs, size = [body_q, terrain_of_env, terrain, probes, ground], (probes.bundle_body.shape[0], num_envs)
     wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=device)
 
 
@@ -179,17 +197,16 @@ def make_contacts(num_envs: int, capacity: int, device: str | None = None) -> Co
 
 @wp.kernel
 def _sum_forces_kernel(contacts: Contacts, column_of_shape: wp.array[int], geom_force_out: wp.array2d[wp.vec3]):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    for column in range(geom_force_out.shape[1]):
-        geom_force_out[env, column] = wp.vec3(0.0)
+    """Grid (num_envs, num_geoms)."""
+    env, column = wp.tid()
+    force = wp.vec3(0.0)
     for c in range(wp.min(contacts.count[env], contacts.shape.shape[1])):
-        column = column_of_shape[contacts.shape[env, c]]
-        if column >= 0:
-            geom_force_out[env, column] += contacts.force[env, c]
+        if column_of_shape[contacts.shape[env, c]] == column:
+            force += contacts.force[env, c]
+    geom_force_out[env, column] = force
 
 
 def sum_forces(contacts: Contacts, column_of_shape: Any, geom_force_out: Any) -> None:
     """Sum the contact forces on each robot geom; ``column_of_shape`` is that of each collision shape, -1 for others."""
     inputs, device = [contacts, column_of_shape], geom_force_out.device
-    wp.launch(_sum_forces_kernel, geom_force_out.shape[0], inputs, outputs=[geom_force_out], device=device)
+    wp.launch(_sum_forces_kernel, geom_force_out.shape, inputs, outputs=[geom_force_out], device=device)

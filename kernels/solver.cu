@@ -11,7 +11,8 @@ struct alignas(16) Contact {
     int state;
 };
 using Mine = float[MINE];
-using Rows = float[MINE][NV];  // of a matrix
+using Row = float[NV];  // of a matrix
+using Rows = Row[MINE];
 using Vec = wp::vec_t<3, float>;
 using Vec2 = wp::vec_t<2, float>;
 using Vec5 = wp::vec_t<5, float>;
@@ -53,6 +54,16 @@ auto times_inertia = [&](Mine& out) {  // of the vector
     for (int m = 0; m < MINE; ++m) {
         const int i = lane + m * LANES;
         out[m] = i < NV ? product(inertia + i * LD, vector) : 0.0f;
+    }
+};
+auto read_inertia = [&](Row& row, int i, float more) {  // a row, with more on the diagonal
+    #pragma unroll ALL
+    for (int j = 0; j < NV; j += 4) {
+        const Four four = *(const Four*)(inertia + wp::min(i, NV - 1) * LD + j);
+        #pragma unroll
+        for (int k = 0; k < 4; ++k) {
+            if (j + k < NV) row[j + k] = four.of[k] + (i == j + k ? more : 0.0f);
+        }
     }
 };
 // MuJoCo's "solver parameters": what solref and solimp make of a distance.
@@ -179,8 +190,7 @@ auto find_direction = [&](float& search_dot, float& decrement) {
         const int i = lane + m * LANES;
         float more = side[m] * qacc[m] < limit_aref[m] ? limit_d[m] : 0.0f;
         if (HAS_LOSSES && wp::abs(loss_d[m] * (qacc[m] - loss_aref[m])) < loss[m]) more += loss_d[m];
-        #pragma unroll ALL
-        for (int j = 0; j < NV; ++j) h[m][j] = (i < NV ? inertia[i * LD + j] : 0.0f) + (i == j ? more : 0.0f);
+        read_inertia(h[m], i, more);
     }
     #pragma unroll 1
     for (int begin = 0; begin < num_contacts; begin += CHUNK) {
@@ -277,12 +287,12 @@ auto find_direction = [&](float& search_dot, float& decrement) {
 };
 
 // Cost, slope and curvature along the search direction. Costs at a step are told from those at 0.
-struct Row {  // of a contact
+struct Line {  // of a contact
     int state0;
     float cost0, q0, q1, q2, mu, u0, v0, uu, uv, vv, dm, t0, r0;
 };
 auto read_contact = [&](const Contact& at) {
-    Row row;
+    Line row;
     row.mu = at.friction[0];
     row.u0 = at.jaref[0] * row.mu;
     row.v0 = at.jv[0] * row.mu;
@@ -313,11 +323,11 @@ auto read_contact = [&](const Contact& at) {
     }
     return row;
 };
-auto cone_gap = [](const Row& row, float n, float t) {  // of the quadratic's cost over the cone's
+auto cone_gap = [](const Line& row, float n, float t) {  // of the quadratic's cost over the cone's
     const float boundary = row.mu * n + t;
     return 0.5f * row.dm * boundary * boundary;
 };
-auto contact_at = [&](const Row& row, float alpha) {
+auto contact_at = [&](const Line& row, float alpha) {
     const float n = row.u0 + alpha * row.v0, more = alpha * (2.0f * row.uv + alpha * row.vv), tt = row.uu + more;
     const float t = tt <= 0.0f ? 0.0f : wp::sqrt(tt);
     if (tt <= 0.0f ? n < 0.0f : n < row.mu * t && row.mu * n + t <= 0.0f) {
@@ -351,7 +361,7 @@ auto loss_at = [](float d, float most, float x, float v) {
     return Point{most * (sign * x - 0.5f * range), sign * most * v, 0.0f};
 };
 constexpr int READ = LANES == 1 ? MOST : 1;  // one thread reads contacts once a search; of a warp each lane its first
-Row rows[READ];
+Line rows[READ];
 float gauss_slope, gauss_curve;  // of the inertia: a parabola
 auto line_at = [&](float alpha) {
     Point sum = {0.0f, 0.0f, 0.0f};
@@ -386,7 +396,7 @@ auto cost_at_zero = [&]() {
     float sum = 0.0f;
     #pragma unroll 1
     for (int c = lane; c < num_contacts; c += LANES) {
-        const Row row = read_contact(contact(c));
+        const Line row = read_contact(contact(c));
         if (c == lane || LANES == 1) rows[LANES == 1 ? c : 0] = row;
         sum += row.cost0;
     }
@@ -526,25 +536,32 @@ for (int m = 0; m < MINE; ++m) {
 num_rows = total(num_rows);
 const float scale = 1.0f / wp::max(MINVAL, total(trace));
 #pragma unroll 1
-for (int c = 0; c < num_contacts; ++c) {
-    Contact& to = contact(c);
-    const int shape = wp::index(problem.contacts.shape, world, c), body = problem.surfaces.body.data[shape];
-    const int dim = problem.surfaces.condim.data[shape];
-    const Vec offset = wp::index(problem.contacts.point, world, c)
+for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads a contact, all look at all
+    const int own = wp::min(begin + lane, num_contacts - 1), shape = wp::index(problem.contacts.shape, world, own);
+    const int body = problem.surfaces.body.data[shape], condim = problem.surfaces.condim.data[shape];
+    const Vec normal = wp::index(problem.contacts.normal, world, own);
+    const Vec place = wp::index(problem.contacts.point, world, own)
         - wp::index(problem.subtree_com, world, problem.body_root.data[body]);
-    Vec frame[3];
-    frame_of(wp::index(problem.contacts.normal, world, c), frame);
+    auto of_lane = [&](const Vec& v, int s) { return Vec(from(v[0], s), from(v[1], s), from(v[2], s)); };
     #pragma unroll 1
-    for (int i = lane; i < LD; i += LANES) {
-        Vec turned, moved;
-        if (i < NV && wp::index(problem.is_ancestor, body, i)) {
-            const auto& s = wp::index(problem.cdof, world, i);
-            turned = Vec(s[0], s[1], s[2]);
-            moved = Vec(s[3], s[4], s[5]) + wp::cross(turned, offset);
-        }
-        #pragma unroll
-        for (int k = 0; k < DIM; ++k) {
-            to.jacobian[k][i] = k >= dim ? 0.0f : k < 3 ? wp::dot(frame[k], moved) : wp::dot(frame[k % 3], turned);
+    for (int s = 0; s < wp::min(LANES, num_contacts - begin); ++s) {
+        Contact& to = contact(begin + s);
+        const Vec offset = of_lane(place, s);
+        const int touching = (int)from((float)body, s), dim = (int)from((float)condim, s);
+        Vec frame[3];
+        frame_of(of_lane(normal, s), frame);
+        #pragma unroll 1
+        for (int i = lane; i < LD; i += LANES) {
+            Vec turned, moved;
+            if (i < NV && wp::index(problem.is_ancestor, touching, i)) {
+                const auto& motion = wp::index(problem.cdof, world, i);
+                turned = Vec(motion[0], motion[1], motion[2]);
+                moved = Vec(motion[3], motion[4], motion[5]) + wp::cross(turned, offset);
+            }
+            #pragma unroll
+            for (int k = 0; k < DIM; ++k) {
+                to.jacobian[k][i] = k >= dim ? 0.0f : k < 3 ? wp::dot(frame[k], moved) : wp::dot(frame[k % 3], turned);
+            }
         }
     }
 }
@@ -650,9 +667,7 @@ float h[MINE][NV];
 #pragma unroll ALL
 for (int m = 0; m < MINE; ++m) {
     const int i = lane + m * LANES;
-    const float more = i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f;
-    #pragma unroll ALL
-    for (int j = 0; j < NV; ++j) h[m][j] = (i < NV ? inertia[i * LD + j] : 0.0f) + (i == j ? more : 0.0f);
+    read_inertia(h[m], i, i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f);
 }
 solve(h, momentum);
 #pragma unroll ALL

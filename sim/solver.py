@@ -133,7 +133,7 @@ class Dynamics:
 
     def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces) -> None:
         """For a model that :func:`fits`, and its contacts, whose forces are written."""
-        self._tree_sizes, self._sizes = tree_sizes_of(m), sizes_of(m, contacts)
+        self._tree_sizes, self._sizes, self.surfaces = tree_sizes_of(m), sizes_of(m, contacts), surfaces
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
         actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)

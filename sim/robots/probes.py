@@ -3,7 +3,8 @@
 A mesh is covered by balls that touch its convex hull from inside.
 """
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -21,6 +22,7 @@ from sim.device import host_device
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
+_BUNDLE = 8  # strips
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,14 +303,35 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
             shape.append(k)
     if problems:
         raise ValueError("; ".join(problems))
+    bundles = _bundles(body)
+    balls = [_ball_round(centres[a:b], radius[a:b]) for a, b in itertools.pairwise(bundles)]
     probes = Probes()
     probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
     probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
     probes.strip_radius = wp.array(radius, dtype=float)
     probes.strip_spread = wp.array(spread, dtype=float)
-    probes.strip_body = wp.array(body, dtype=int)
     probes.strip_shape = wp.array(shape, dtype=int)
+    probes.bundle_start = wp.array(bundles, dtype=int)
+    probes.bundle_body = wp.array([body[first] for first in bundles[:-1]], dtype=int)
+    probes.bundle_ball = wp.array(balls, dtype=wp.vec4)
     return probes
+
+
+def _bundles(body: Sequence[int]) -> list[int]:
+    """First strip of each bundle and the end: neighbours on one body, few enough that one thread looks at all."""
+    starts = [0]
+    for k in range(1, len(body)):
+        if body[k] != body[k - 1] or k - starts[-1] == _BUNDLE:
+            starts.append(k)
+    return [*starts[: len(body)], len(body)]
+
+
+def _ball_round(strips: Sequence[Sequence[Any]], radii: Sequence[float]) -> tuple[float, ...]:
+    """Middle and radius of a ball round strips of spheres [m]."""
+    points = np.array([centre for strip in strips for centre in strip], dtype=np.float64)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    reach = np.linalg.norm(points - middle, axis=1) + np.repeat(radii, [len(strip) for strip in strips])
+    return *map(float, middle), float(reach.max()) + 1e-6
 
 
 def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
@@ -334,10 +357,9 @@ def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str
         state: Any = model.state()
         counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)
         counts = counts[: len(probes.strip_radius)]
-        body, shape, radius = (
-            np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("body", "shape", "radius")
-        )
+        shape, radius = (np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("shape", "radius"))
         points, names = probes.position.numpy(), np.array(builder.shape_label)[shape]
+        body = np.array(builder.shape_body)[shape]
         for pose in poses:
             state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
             newton.eval_fk(model, state.joint_q, state.joint_qd, state)
