@@ -81,10 +81,8 @@ auto spring_at = [&](const Vec2& solref, const Vec5& solimp, float x) {
     } else {
         const float middle = wp::clamp(solimp[3], ${least_imp}f, ${most_imp}f), power = wp::max(1.0f, solimp[4]);
         const bool below = share <= middle;
-        const float whole = below ? middle : 1.0f - middle, rest = below ? share : 1.0f - share;
-        float y = rest;
-        if (power == 2.0f) y = rest * rest / whole;
-        else if (power != 1.0f) y = rest <= 0.0f ? 0.0f : wp::pow(rest, power) / wp::pow(whole, power - 1.0f);
+        const float whole = below ? middle : 1.0f - middle, rest = (below ? share : 1.0f - share) / whole;
+        const float y = whole * (power == 2.0f ? rest * rest : rest <= 0.0f ? 0.0f : wp::pow(rest, power));
         s.impedance = wp::clamp(low + (below ? y : 1.0f - y) * (high - low), low, high);
     }
     return s;
@@ -100,7 +98,7 @@ auto frame_of = [](const Vec& normal, Vec (&frame)[3]) {  // normal and two tang
 };
 
 // Force and state of each contact at the present residuals, and what all constraints do to the joints.
-float qacc[MINE], constraint[MINE], smooth[MINE];
+float qacc[MINE], momentum[MINE], gradient[MINE], search[MINE], constraint[MINE], smooth[MINE];
 float limit_d[MINE], limit_aref[MINE], side[MINE];  // of a joint beyond its limit: the way back; else d is 0
 float loss[MINE], loss_d[MINE], loss_aref[MINE];    // of a joint with friction
 auto update_forces = [&]() {
@@ -175,23 +173,14 @@ auto solve = [&](Rows& h, Mine& y) {
     }
 };
 
-// Newton's direction at the present gradient. Returns |direction|^2 and the decrement.
+// Adds what contacts make of the Hessian to the rows of h.
 //
 // The Hessian is M, what joints at their limits and with friction add to its diagonal, and a sum of squares of rows g. A contact
 // that sticks gives sqrt(D) J of each of its rows. One on the side of its cone, of normal row a = mu J_0, tangent rows
 // z_k = friction_k J_k and unit tangent residual e, gives
 //     sqrt(dm) (a - mu sum_k e_k z_k)      and      sqrt(dm (mu^2 - mu n / t)) (what of z is at right angles to e),
 // the latter as rows of the reflection that turns e into an axis.
-float momentum[MINE], gradient[MINE], search[MINE];
-auto find_direction = [&](float& search_dot, float& decrement) {
-    float h[MINE][NV];
-    #pragma unroll ALL
-    for (int m = 0; m < MINE; ++m) {
-        const int i = lane + m * LANES;
-        float more = side[m] * qacc[m] < limit_aref[m] ? limit_d[m] : 0.0f;
-        if (HAS_LOSSES && wp::abs(loss_d[m] * (qacc[m] - loss_aref[m])) < loss[m]) more += loss_d[m];
-        read_inertia(h[m], i, more);
-    }
+auto add_contacts = [&](Rows& h) {
     #pragma unroll 1
     for (int begin = 0; begin < num_contacts; begin += CHUNK) {
         const int count = wp::min(CHUNK, num_contacts - begin);
@@ -272,18 +261,6 @@ auto find_direction = [&](float& search_dot, float& decrement) {
         }
         sync();
     }
-    for (int m = 0; m < MINE; ++m) search[m] = gradient[m];
-    solve(h, search);
-    float dot = 0.0f, along = 0.0f;
-    #pragma unroll ALL
-    for (int m = 0; m < MINE; ++m) {
-        if (lane + m * LANES >= NV) search[m] = 0.0f;
-        dot += search[m] * search[m];
-        along += gradient[m] * search[m];
-        search[m] = -search[m];
-    }
-    search_dot = total(dot);
-    decrement = total(along);
 };
 
 // Cost, slope and curvature along the search direction. Costs at a step are told from those at 0.
@@ -419,72 +396,81 @@ auto search_line = [&](const Mine& mv, float search_dot, float scale, float& alp
     gauss_slope = total(slope);
     gauss_curve = total(curve);
     const float cost0 = cost_at_zero();
-    const Point start = line_at(0.0f);
-    const float size = wp::sqrt(2.0f * wp::max(cost0, 0.0f) * wp::max(start.curve - 2.0f * gauss_curve, 0.0f))
-        + wp::abs(gauss_slope);
     const float flat = wp::max(least * ls_least * wp::sqrt(search_dot) / scale, 1e-6f);
-    const float accepted = wp::max(flat, EPS * size);  // slopes below are those of rounding
-    alpha = gained = 0.0f;
-    if (wp::abs(start.slope) < EPS * size) return true;
-
     auto between = [](const Point& x, const Point& y) {
         return (x.slope < y.slope && y.slope < 0.0f) || (x.slope > y.slope && y.slope > 0.0f);
     };
-    const float first = -safe(start.slope, start.curve);
-    Point low = start, high = start;
-    float low_alpha = 0.0f, high_alpha = 0.0f;
-    low.cost = high.cost = 0.0f;
-    {  // the Newton step alone
-        const Point p = line_at(first);
-        if (wp::abs(p.slope) < accepted && p.cost < 0.0f) {
-            alpha = first;
-            gained = -p.cost;
-            return true;
-        }
-        if (p.slope < start.slope) { low = p; low_alpha = first; }
-        else { high = p; high_alpha = first; }
-    }
+    Point start, low, high, p0, p1;  // of a round: from the low end, from the high one, from the middle
+    float low_alpha = 0.0f, high_alpha = 0.0f, at0 = 0.0f, at1 = 0.0f, at = 0.0f, accepted = 0.0f;
+    float best = 0.0f, best_alpha = 0.0f;
+    alpha = gained = 0.0f;
     #pragma unroll 1
-    for (int iteration = 1; iteration <= problem.most_line_iterations; ++iteration) {
-        const float at[3] = {low_alpha - safe(low.slope, low.curve), high_alpha - safe(high.slope, high.curve),
-                             0.5f * (low_alpha + high_alpha)};
-        const Point p[3] = {line_at(at[0]), line_at(at[1]), line_at(at[2])};
-        float best = 0.0f;
-        #pragma unroll
-        for (int k = 0; k < 3; ++k) {
-            if (wp::abs(p[k].slope) < accepted && p[k].cost < best) {
-                best = p[k].cost;
-                alpha = at[k];
-            }
+    for (int round = -2, k = 0; round < problem.most_line_iterations;) {
+        Point p = line_at(at);
+        if (round == -2) {
+            const float size = wp::sqrt(2.0f * wp::max(cost0, 0.0f) * wp::max(p.curve - 2.0f * gauss_curve, 0.0f))
+                + wp::abs(gauss_slope);
+            accepted = wp::max(flat, EPS * size);  // slopes below are those of rounding
+            if (wp::abs(p.slope) < EPS * size) return true;
+            p.cost = 0.0f;
+            start = low = high = p;
+            at = -safe(p.slope, p.curve);  // the Newton step alone
+            ++round;
+            continue;
+        }
+        if (wp::abs(p.slope) < accepted && p.cost < best) {
+            best = p.cost;
+            best_alpha = at;
+        }
+        if (round == -1) {
+            if (p.slope < start.slope) { low = p; low_alpha = at; }
+            else { high = p; high_alpha = at; }
+        } else if (k == 0) {
+            p0 = p;
+            at = at1;
+            k = 1;
+            continue;
+        } else if (k == 1) {
+            p1 = p;
+            at = 0.5f * (low_alpha + high_alpha);
+            k = 2;
+            continue;
         }
         if (best < 0.0f) {
+            alpha = best_alpha;
             gained = -best;
             return true;
         }
-        bool moved = false;
-        auto raise = [&](const Point& p, float at) {
-            if (between(low, p)) { low = p; low_alpha = at; moved = true; }
-        };
-        auto lower = [&](const Point& p, float at, bool crosses) {
-            if (between(high, p) || (crosses && high.slope < 0.0f && p.slope > 0.0f)) {
-                high = p;
-                high_alpha = at;
-                moved = true;
+        if (round >= 0) {
+            bool moved = false;
+            auto raise = [&](const Point& q, float x) {
+                if (between(low, q)) { low = q; low_alpha = x; moved = true; }
+            };
+            auto lower = [&](const Point& q, float x, bool crosses) {
+                if (between(high, q) || (crosses && high.slope < 0.0f && q.slope > 0.0f)) {
+                    high = q;
+                    high_alpha = x;
+                    moved = true;
+                }
+            };
+            raise(p0, at0);
+            raise(p, at);
+            raise(p1, at1);
+            lower(p1, at1, true);
+            lower(p, at, false);
+            lower(p0, at0, false);
+            if (low.cost < 0.0f || high.cost < 0.0f) {
+                const bool is_low = low.cost < high.cost;
+                alpha = is_low ? low_alpha : high_alpha;
+                gained = -(is_low ? low.cost : high.cost);
             }
-        };
-        raise(p[0], at[0]);
-        raise(p[2], at[2]);
-        raise(p[1], at[1]);
-        lower(p[1], at[1], true);
-        lower(p[2], at[2], false);
-        lower(p[0], at[0], false);
-        if (low.cost < 0.0f || high.cost < 0.0f) {
-            const bool is_low = low.cost < high.cost;
-            alpha = is_low ? low_alpha : high_alpha;
-            gained = -(is_low ? low.cost : high.cost);
+            if (!moved || (low.cost < 0.0f && low.slope < 0.0f && low.slope > -flat)
+                || (high.cost < 0.0f && high.slope > 0.0f && high.slope < flat)) return true;
         }
-        if (!moved || (low.cost < 0.0f && low.slope < 0.0f && low.slope > -flat)
-            || (high.cost < 0.0f && high.slope > 0.0f && high.slope < flat)) return true;
+        at = at0 = low_alpha - safe(low.slope, low.curve);
+        at1 = high_alpha - safe(high.slope, high.curve);
+        k = 0;
+        ++round;
     }
     return false;
 };
@@ -603,34 +589,61 @@ for (int c = lane; c < num_contacts; c += LANES) {
 times_inertia(momentum);
 
 int iteration = 0, bits = found > MOST ? $too_many_contacts : 0;
-float search_dot, decrement, alpha, gained, mv[MINE];
-if (num_contacts == 0 && num_rows == 0.0f) {  // nothing to iterate: the inertia takes all forces
-    for (int m = 0; m < MINE; ++m) gradient[m] = smooth[m];
-    find_direction(search_dot, decrement);
-    for (int m = 0; m < MINE; ++m) {
-        qacc[m] = -search[m];
-        momentum[m] = smooth[m];
-    }
-    iteration = 1;
-} else while (true) {
-    update_forces();
+float alpha = 0.0f, gained = 0.0f;
+bool done = false;
+while (true) {
     float squares = 0.0f;
+    if (!done) {
+        update_forces();
+        #pragma unroll ALL
+        for (int m = 0; m < MINE; ++m) {
+            gradient[m] = momentum[m] - smooth[m] - constraint[m];
+            squares += gradient[m] * gradient[m];
+        }
+        squares = total(squares);
+        // mujoco_warp's test, made before the Hessian that a robot that is done would not need.
+        done = iteration > 0 && (alpha == 0.0f || (scale * gained > 0.0f && scale * gained < least)
+            || scale * wp::sqrt(squares) < least);
+    }
+    // Newton's direction; at the end velocities by the forces found, those of joints as they change over the step (MuJoCo's
+    // implicitfast). Both in one place: a kernel that does not fit into the instruction cache is slow.
+    float h[MINE][NV], solved[MINE];
     #pragma unroll ALL
     for (int m = 0; m < MINE; ++m) {
-        gradient[m] = momentum[m] - smooth[m] - constraint[m];
-        squares += gradient[m] * gradient[m];
+        const int i = lane + m * LANES;
+        float more = 0.0f;
+        if (done) {
+            more = i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f;
+        } else {
+            if (side[m] * qacc[m] < limit_aref[m]) more = limit_d[m];
+            if (HAS_LOSSES && wp::abs(loss_d[m] * (qacc[m] - loss_aref[m])) < loss[m]) more += loss_d[m];
+        }
+        solved[m] = done ? momentum[m] : gradient[m];
+        read_inertia(h[m], i, more);
     }
-    squares = total(squares);
-    // mujoco_warp's test, made before the Hessian that a robot that is done would not need.
-    if (iteration > 0 && (alpha == 0.0f || (scale * gained > 0.0f && scale * gained < least)
-        || scale * wp::sqrt(squares) < least)) break;
-    find_direction(search_dot, decrement);
-    if (iteration > 0 && scale * 0.5f * decrement < least) break;
-    if (iteration == problem.most_iterations) {
-        bits |= $too_many;
+    if (!done) add_contacts(h);
+    solve(h, solved);
+    if (done) {
+        #pragma unroll ALL
+        for (int m = 0; m < MINE; ++m) speed[m] += solved[m] * dt;
         break;
     }
+    float dot = 0.0f, along = 0.0f;
+    #pragma unroll ALL
+    for (int m = 0; m < MINE; ++m) {
+        search[m] = lane + m * LANES < NV ? -solved[m] : 0.0f;
+        dot += search[m] * search[m];
+        along -= gradient[m] * search[m];
+    }
+    const float search_dot = total(dot), decrement = total(along);
+    done = iteration > 0 && scale * 0.5f * decrement < least;
+    if (!done && iteration == problem.most_iterations) {
+        bits |= $too_many;
+        done = true;
+    }
+    if (done) continue;
     write_vector(search);
+    float mv[MINE];
     times_inertia(mv);
     #pragma unroll 1
     for (int r = lane; r < num_contacts * DIM; r += LANES) {
@@ -662,18 +675,9 @@ for (int c = lane; c < num_contacts; c += LANES) {
         frame[0] * at.force[0] + frame[1] * at.force[1] + frame[2] * at.force[2];
 }
 
-// Velocities by the forces found, those of joints as they change over the step (MuJoCo's implicitfast); then positions.
-float h[MINE][NV];
 #pragma unroll ALL
 for (int m = 0; m < MINE; ++m) {
     const int i = lane + m * LANES;
-    read_inertia(h[m], i, i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f);
-}
-solve(h, momentum);
-#pragma unroll ALL
-for (int m = 0; m < MINE; ++m) {
-    const int i = lane + m * LANES;
-    speed[m] += momentum[m] * dt;
     if (i >= NV) continue;
     wp::index(problem.qacc_warmstart, world, i) = qacc[m];
     qvel[i] = speed[m];

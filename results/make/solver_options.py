@@ -17,7 +17,7 @@ from sim.spaces.registry import SUPER_GAUSSIAN
 
 ITERATIONS = (3, 4, 5, 6, 8, 50)
 CAPACITIES = (0.5, 0.75, 1.5)
-"""Rows and contacts an environment, by the robot's own."""
+"""Most contacts of a robot, by its own number."""
 
 
 def numbers_of(result: RolloutResult, wall_s: float) -> dict[str, Any]:
@@ -43,10 +43,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     robot = script.robot
     finest, finest_solver = resolved(robot)
     choices = [(finest_solver, finest), *((SolverCfg(iterations=cap), robot) for cap in ITERATIONS)]
-    choices += [
-        (SolverCfg(), replace(robot, njmax=round(share * robot.njmax), nconmax=round(share * robot.nconmax)))
-        for share in CAPACITIES
-    ]
+    choices += [(SolverCfg(), replace(robot, nconmax=round(share * robot.nconmax))) for share in CAPACITIES]
     rows, reference = [], None
     for solver, sized in choices[-1:] if script.small else choices:
         rollout = Rollout(
@@ -55,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         results = [rollout.evaluate(genes, seeds) for _ in range(rounds)]  # the median of the times counts
         result = results[-1]
         row = {name: getattr(solver, name) for name in ("iterations", "ls_iterations")}
-        row |= {name: getattr(sized, name) for name in ("physics_dt", "njmax", "nconmax")}
+        row |= {name: getattr(sized, name) for name in ("physics_dt", "nconmax")}
         row |= numbers_of(result, statistics.median(result.wall_s for result in results))
         if reference is not None:
             row["against_resolved"] = agreement(result.outcome, reference.outcome, script.seed)

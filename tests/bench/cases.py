@@ -29,8 +29,8 @@ from tests.bench.ceiling import Work
 FLOAT = 4
 FLOPS_PER_TRIANGLE = 60  # six dot products, their differences, comparisons up to an edge (Ericson's nearest point)
 FLOPS_PER_PROBE = 30  # turning a probe into the world, sign and size of its distance
-RECORD = (2 + 5 * 3 + 2) * FLOAT  # two shapes, five vectors, two margins
-SOLVER_CONTACT = (1 + 2 + 9 + 1 + 3 + 1) * FLOAT  # world, geoms, frame, first row, three forces, column
+CONTACT = (1 + 3 + 3 + 1 + 1 + 1) * FLOAT  # shape, point, normal, distance, friction, time constant
+FORCE = (1 + 3) * FLOAT  # shape and force
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,58 +149,61 @@ def _rasterise_case(scene: Scene) -> Case:
     )
 
 
-RECORDED = ("point0", "point1", "normal", "offset1")
+def _kernel_contacts(scene: Scene, tables: counterparts.ProbeTables) -> np.ndarray:
+    """Contacts of the kernel by robot and probe, (num_envs, num_probes, 7), NaN where there is none.
 
-
-def _kernel_contacts(scene: Scene) -> np.ndarray:
-    """Records of the contact kernel by environment and probe, (num_envs, num_probes, 12), NaN where there is none."""
+    They are point, normal and distance, of one of the shape's probes.
+    """
     sim: Any = scene.rollout.sim
-    count = int(sim.contact_count.numpy()[0])
-    if count > sim.contact_capacity:
-        raise ValueError(f"{count} contacts do not fit in {sim.contact_capacity}: raise the robot's nconmax")
-    records = np.concatenate([getattr(sim.contact_records, name).numpy()[:count] for name in RECORDED], axis=1)
-    shape1 = sim.contact_records.shape1.numpy()[:count]
-    env, shape = np.divmod(shape1 - sim.layout.first_shape, sim.layout.shapes_per_env)
-    position = sim.probes.position.numpy()
+    count, capacity = sim.contacts.count.numpy(), sim.contacts.shape.shape[1]
+    if count.max() > capacity:
+        raise ValueError(f"{count.max()} contacts of a robot do not fit in {capacity}: raise its nconmax")
+    env, slot = np.nonzero(np.arange(capacity) < count[:, None])
+    shape, point, normal, distance = (
+        getattr(sim.contacts, name).numpy()[env, slot] for name in ("shape", "point", "normal", "distance")
+    )
+    body_q = wp.to_torch(sim.body_q)
+    centres = counterparts.probe_centres(body_q, counterparts.rotation_matrices(body_q[..., 3:]), tables).cpu().numpy()
+    radius, distance = tables.radius.cpu().numpy(), distance[:, None]
+    # The point is half way between the surfaces, from where a radius and half of the distance lead to the centre.
+    found = point[:, None] + normal[:, None] * (0.5 * distance + radius)[..., None]
     shape_of_probe = np.repeat(sim.probes.strip_shape.numpy(), np.diff(sim.probes.strip_start.numpy()))
-    # A record names its shape and the probe's centre.
-    distance = np.abs(records[:, None, 3:6] - position).sum(2)
-    probe = np.argmin(np.where(shape_of_probe == shape[:, None], distance, np.inf), axis=1)
-    values = np.full((scene.num_envs, len(position), records.shape[1]), np.nan, np.float32)
-    values[env, probe] = records
+    away = np.abs(found - centres[env]).sum(2)
+    probe = np.argmin(np.where(shape_of_probe == shape[:, None], away, np.inf), axis=1)
+    values = np.full((scene.num_envs, len(radius), 7), np.nan, np.float32)
+    values[env, probe] = np.concatenate([point, normal, distance], axis=1)
     return values
 
 
 def _torch_contacts(outputs: tuple[torch.Tensor, ...], num_probes: int) -> np.ndarray:
-    """The same of the counterpart, which has a slot for each record that there may be."""
+    """The same of the counterpart, which has a slot for each contact that there may be."""
     probe, *vectors = (output.cpu().numpy() for output in outputs)
     exists = probe >= 0
-    values = np.full((len(probe), num_probes, 3 * len(vectors)), np.nan, np.float32)
-    values[np.nonzero(exists)[0], probe[exists]] = np.concatenate([vector[exists] for vector in vectors], axis=1)
+    contacts = np.concatenate([vector[exists] for vector in vectors], axis=1)
+    values = np.full((len(probe), num_probes, contacts.shape[1]), np.nan, np.float32)
+    values[np.nonzero(exists)[0], probe[exists]] = contacts
     return values
 
 
 def _contact_case(scene: Scene) -> Case:
     sim: Any = scene.rollout.sim
-    body_q = wp.to_torch(sim.body_q).view(sim.num_envs, -1, 7)
+    body_q = wp.to_torch(sim.body_q)
     tables = counterparts.make_tables(sim.probes, SPACING, body_q.device)
     arguments = (body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables)
-    num_probes, poses = len(tables.position), 7 * len(tables.strip_body.unique())
-    # Poses and probes read, records written, and of each contact at least the four nodes of a cell: two triangles.
-    count = int(sim.contact_count.numpy()[0])
-    read = FLOAT * (sim.num_envs * (poses + 1) + 3 * num_probes + 4 * count)
+    num_probes, poses = len(tables.position), 7 * len(tables.body.unique())
+    # Poses and probes read, contacts and their numbers written, and of each contact at least the four nodes of a cell:
+    # two triangles.
+    count = int(sim.contacts.count.numpy().sum())
+    moved = FLOAT * (sim.num_envs * (poses + 2) + 3 * num_probes + 4 * count) + CONTACT * count
     return Case(
         name="contact",
         launch=sim.collide,
-        output=sim.contact_count,
-        read=lambda: _kernel_contacts(scene),
+        output=sim.contacts.count,
+        read=lambda: _kernel_contacts(scene, tables),
         counterpart=counterparts.collide,
         arguments=arguments,
         read_torch=lambda outputs: _torch_contacts(outputs, num_probes),
-        work=Work(
-            bytes=read + count * RECORD,
-            flops=2 * FLOPS_PER_TRIANGLE * count + FLOPS_PER_PROBE * num_probes * sim.num_envs,
-        ),
+        work=Work(bytes=moved, flops=2 * FLOPS_PER_TRIANGLE * count + FLOPS_PER_PROBE * num_probes * sim.num_envs),
         atol=5e-4,
         undecided=0.01,  # probes that just touch, that are equally deep, or whose centre lies on the surface
     )
@@ -267,18 +270,18 @@ def _penalties_case(scene: Scene) -> Case:
 
 def _geom_forces_case(scene: Scene) -> Case:
     sim: Any = scene.rollout.sim
-    names = ("count", "world", "geom", "frame", "efc_address", "efc_force")
-    tensors = [wp.to_torch(getattr(sim.solver_contacts, name)) for name in names]
-    # The solver's contacts read, the forces written; 18 flops a contact: a vector turned, added.
-    count = min(int(sim.solver_contacts.count.numpy()[0]), sim.solver_contacts.capacity)
-    forces = 3 * FLOAT * sim.geom_force.size
+    contacts = sim.contacts
+    tensors = [wp.to_torch(array) for array in (contacts.count, contacts.shape, contacts.force, sim.column_of_shape)]
+    # Numbers, shapes and forces of contacts read, sums written; 3 flops a contact.
+    count = int(np.minimum(contacts.count.numpy(), contacts.shape.shape[1]).sum())
+    moved = FLOAT * (sim.num_envs + 3 * sim.geom_force.size) + FORCE * count
     return Case(
         name="contact_forces",
         launch=sim.read_geom_forces,
         output=sim.geom_force,
         counterpart=counterparts.geom_forces,
-        arguments=(*tensors, wp.to_torch(sim.column_of_geom), len(sim.geom_names)),
-        work=Work(bytes=count * SOLVER_CONTACT + forces, flops=18 * count),
+        arguments=(*tensors, len(sim.geom_names)),
+        work=Work(bytes=moved, flops=3 * count),
         atol=5e-3,
         rtol=2e-5,
     )

@@ -127,27 +127,21 @@ def penalties(
     return sums + dt * (counted != 0)[:, None] * step
 
 
-def geom_forces(
-    count: Tensor, world: Tensor, geom: Tensor, frame: Tensor, efc_address: Tensor, efc_force: Tensor,
-    column_of_geom: Tensor, num_geoms: int,
-) -> Tensor:  # fmt: skip
-    """Contact force on each geom (E, G, 3) [N]: rows to forces for the whole buffer, then one scatter.
+def geom_forces(count: Tensor, shape: Tensor, force: Tensor, column_of_shape: Tensor, num_geoms: int) -> Tensor:
+    """Contact force on each geom (E, G, 3) [N] from those on contacts (E, C, 3): one scatter of all there is room for.
 
     How many contacts there are is known on the device alone, so every slot is computed. Those without a contact add
     zero to places spread over the result: adding them all to one place would queue them up.
     """
-    capacity, num_envs = len(world), len(efc_force)
-    slot = torch.arange(capacity, device=world.device)
-    column = column_of_geom[geom[:, 1].clamp(0, len(column_of_geom) - 1).long()]
-    row = efc_address[:, 0]
-    exists = (slot < count) & (row >= 0) & (column >= 0)
-    env = world.masked_fill(~exists, 0).long()
-    first = row.masked_fill(~exists, 0).long()
-    local = efc_force.view(-1)[(env * efc_force.shape[1] + first)[:, None] + torch.arange(3, device=world.device)]
-    force = (frame * local[:, :, None]).sum(1).masked_fill(~exists[:, None], 0.0)
-    place = torch.where(exists, env * num_geoms + column, slot % (num_envs * num_geoms))
-    total = torch.zeros((num_envs * num_geoms, 3), device=world.device)
-    return total.index_add_(0, place, force).view(num_envs, num_geoms, 3)
+    num_envs, capacity = shape.shape
+    slot = torch.arange(capacity, device=shape.device)
+    column = column_of_shape[shape.clamp(0, len(column_of_shape) - 1).long()]
+    exists = (slot < count[:, None]) & (column >= 0)
+    env = torch.arange(num_envs, device=shape.device)[:, None]
+    place = env * num_geoms + torch.where(exists, column, slot % num_geoms)
+    total = torch.zeros((num_envs * num_geoms, 3), device=shape.device)
+    total.index_add_(0, place.view(-1), force.masked_fill(~exists[..., None], 0.0).view(-1, 3))
+    return total.view(num_envs, num_geoms, 3)
 
 
 _FAR = 1.0e6
@@ -164,14 +158,13 @@ class ProbeTables:
     groups: tuple[tuple[float, int, Tensor], ...]  # radius, cells along a side of its window, and its probes
     order: Tensor  # where each probe stands in the groups' probes one after another, (P,)
     strip_probes: Tensor  # of each strip in order, the last one repeated, (S, longest)
-    strip_body: Tensor  # (S,)
     strip_radius: Tensor  # [m], (S,)
 
 
 def make_tables(probes: Any, spacing: float, device: torch.device) -> ProbeTables:
     """Tables of strips given as :class:`kernels.contact.Probes`."""
-    names = ("position", "strip_start", "strip_radius", "strip_body")
-    position, start, strip_radius, strip_body = (getattr(probes, name).numpy() for name in names)
+    names = ("position", "strip_start", "strip_radius", "bundle_start", "bundle_body")
+    position, start, strip_radius, bundle_start, bundle_body = (getattr(probes, name).numpy() for name in names)
     lengths = np.diff(start)
     radius = np.repeat(strip_radius, lengths)
     groups = [np.flatnonzero(radius == value) for value in np.unique(radius)]
@@ -179,12 +172,11 @@ def make_tables(probes: Any, spacing: float, device: torch.device) -> ProbeTable
     tensor = partial(torch.tensor, device=device)
     return ProbeTables(
         position=tensor(position),
-        body=tensor(np.repeat(strip_body, lengths)),
+        body=tensor(np.repeat(bundle_body, np.diff(start[bundle_start]))),
         radius=tensor(radius),
         groups=tuple((float(radius[g[0]]), window, tensor(g)) for g, window in zip(groups, windows, strict=True)),
         order=tensor(np.argsort(np.concatenate(groups))),
         strip_probes=tensor(np.minimum(start[:-1, None] + np.arange(lengths.max()), start[1:, None] - 1)),
-        strip_body=tensor(strip_body),
         strip_radius=tensor(strip_radius),
     )
 
@@ -250,11 +242,16 @@ def from_surface(
     return vectors.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
 
 
+def probe_centres(body_q: Tensor, rotation: Tensor, tables: ProbeTables) -> Tensor:
+    """World centres (E, P, 3) of all probes."""
+    return body_q[:, tables.body, :3] + (rotation[:, tables.body] * tables.position[:, None, :]).sum(-1)
+
+
 def probe_contacts(
     body_q: Tensor, rotation: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
 ) -> tuple[Tensor, Tensor, Tensor]:
     """World centres (E, P, 3), signed distances (E, P) and normals (E, P, 3) of all probes, exact where they touch."""
-    centre = body_q[:, tables.body, :3] + (rotation[:, tables.body] * tables.position[:, None, :]).sum(-1)
+    centre = probe_centres(body_q, rotation, tables)
     vectors = [
         from_surface(heights, terrain_of_env, spacing, centre[:, group], radius, window)
         for radius, window, group in tables.groups
@@ -291,19 +288,17 @@ def choose_probes(distance: Tensor, tables: ProbeTables) -> Tensor:
 def collide(
     body_q: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
 ) -> tuple[Tensor, ...]:
-    """Contact records of every strip of robots with poses (E, bodies, 7), in slots for its deepest, first, last probe.
+    """Contacts of every strip of robots with poses (E, bodies, 7), in slots for its deepest, first and last probe.
 
     Returns:
-        Probe of each slot, -1 where there is no contact, (E, S, 3); surface points in the world, probe centres in the
-        body, normals in the world and offsets in the body, (E, S, 3, 3) each.
+        Probe of each slot, -1 where there is no contact, (E, S, 3); points in the middle between the surfaces, normals,
+        (E, S, 3, 3) each, and distances of the surfaces, (E, S, 3, 1), world frame.
     """
     rotation = rotation_matrices(body_q[..., 3:])  # (E, bodies, 3, 3)
     centre, distance, normal = probe_contacts(body_q, rotation, terrain_of_env, heights, spacing, tables)
     chosen = choose_probes(distance, tables)
     probe = chosen.clamp(min=0)
     of_slot = torch.arange(len(probe), device=probe.device)[:, None, None], probe
-    normal = normal[of_slot]
-    point = centre[of_slot] - normal * distance[of_slot][..., None]
-    to_body = rotation[:, tables.strip_body][:, :, None]  # a world vector times it: its coordinates in the body
-    offset = -tables.strip_radius[:, None, None] * (normal[..., None] * to_body).sum(-2)
-    return chosen, point, tables.position[probe], normal, offset
+    normal, distance = normal[of_slot], (distance[of_slot] - tables.strip_radius[:, None])[..., None]
+    point = centre[of_slot] - normal * (0.5 * distance + tables.strip_radius[:, None, None])
+    return chosen, point, normal, distance

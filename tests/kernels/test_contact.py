@@ -1,10 +1,11 @@
-"""Terrain contact of sphere probes: nothing invented, nothing missed, and records as the solver reads them."""
+"""Terrain contact of sphere probes: nothing invented, nothing missed, and contacts as the solver reads them."""
 
 import numpy as np
 import pytest
 import warp as wp
 
-from kernels.contact import ContactBuffer, Layout, Probes, collide_strips
+from kernels.contact import Contacts, Probes, collide_strips, make_contacts, sum_forces
+from kernels.ground import FIRM, Ground
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import SPACING, crossing_terrain
 from tests.kernels import oracle
@@ -12,48 +13,52 @@ from tests.kernels.states import filled, make_terrain
 
 RADII = (0.0175, 0.03, 0.06, 0.1)
 UNDECIDED = 1e-5  # a sphere this close to touching may go either way in float32
-FIRST_SHAPE, GROUND_SHAPE = 5, 2
+UNTOUCHED = -7
 
 
-def make_probes(strips, spread=0.0):
-    """Strips as (centres (n, 3), radius), each on a body and a shape of its own; how far from straight they are [m]."""
+def make_probes(strips, spread=0.0, bundled=False):
+    """Strips as (centres (n, 3), radius), each a shape of its own; how far from straight they are [m].
+
+    Each is on a body of its own, or all are a bundle on the first one.
+    """
     centres, numbers = [np.reshape(row, (-1, 3)) for row, _ in strips], np.arange(len(strips))
+    bundles = [list(zip(centres, [radius for _, radius in strips], strict=True))]
+    bundles = bundles if bundled else [[strip] for strip in bundles[0]]
+    balls = []
+    for bundle in bundles:
+        middle = np.concatenate([row for row, _ in bundle]).mean(axis=0)
+        reach = max(np.linalg.norm(row - middle, axis=1).max() + radius for row, radius in bundle)
+        balls.append([*middle, reach + 1e-6])
     return filled(
         Probes, position=np.concatenate(centres), strip_start=np.cumsum([0, *map(len, centres)]),
-        strip_radius=[radius for _, radius in strips], strip_spread=np.full(len(strips), spread),
-        strip_body=numbers, strip_shape=numbers,
+        strip_radius=[radius for _, radius in strips], strip_spread=np.full(len(strips), spread), strip_shape=numbers,
+        bundle_start=np.cumsum([0, *map(len, bundles)]), bundle_body=numbers[: len(bundles)], bundle_ball=balls,
     )  # fmt: skip
 
 
-def make_buffer(capacity):
-    vectors = dict.fromkeys(("point0", "point1", "normal", "offset0", "offset1"), np.zeros((capacity, 3)))
-    numbers = dict.fromkeys(("shape0", "shape1", "margin0", "margin1"), np.full(capacity, -1))
-    return filled(ContactBuffer, count=[0], **vectors, **numbers)
+def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundled=False):
+    """Contacts of all robots as a dict of arrays, with ``env``, the probe's ``centre`` in its body, and ``touched``.
 
-
-def make_layout(shapes, first_shape):
-    return filled(
-        Layout, bodies_per_env=shapes, shapes_per_env=shapes, first_shape=first_shape, ground_shape=GROUND_SHAPE
-    )
-
-
-def collide(poses, terrain_of_env, grids, strips, capacity=None, spread=0.0):
-    """Contact records as a dict of arrays, plus ``env``, ``strip`` and the world ``centre`` and ``distance``."""
-    num_envs = len(terrain_of_env)
-    layout = make_layout(len(strips), FIRST_SHAPE)
-    buffer = make_buffer(capacity or 3 * num_envs * len(strips))
-    poses = np.float32(poses).reshape(-1, 7)
+    The latter is on the ground. ``count`` is by robot; ``buffer`` has all.
+    """
+    poses = np.float32(poses).reshape(-1, len(strips), 7)
+    buffer = make_contacts(len(poses), 3 * len(strips))
+    buffer.count.fill_(5)  # of another step
+    buffer.shape.fill_(UNTOUCHED)
     world, on = wp.array(poses, dtype=wp.transform), wp.array(terrain_of_env, dtype=int)
-    collide_strips(world, on, make_terrain(grids), make_probes(strips, spread), layout, buffer)
-    count = int(buffer.count.numpy()[0])
-    records = {name: getattr(buffer, name).numpy()[:count] for name in ContactBuffer.vars if name != "count"}
-    records["count"] = count
-    records["env"], records["strip"] = np.divmod(records["shape1"] - FIRST_SHAPE, len(strips))
-    records["rotation"] = np.array([oracle.rotation_matrix(poses[k, 3:]) for k in records["shape1"] - FIRST_SHAPE])
-    origin = np.float64(poses)[records["shape1"] - FIRST_SHAPE, :3]
-    records["centre"] = origin + np.einsum("nij,nj->ni", records["rotation"].reshape(-1, 3, 3), records["point1"])
-    records["distance"] = ((records["centre"] - records["point0"]) * records["normal"]).sum(1)
-    return records
+    collide_strips(world, on, make_terrain(grids), make_probes(strips, spread, bundled), ground or Ground(), buffer)
+    count, room = buffer.count.numpy(), buffer.shape.shape[1]
+    env, slot = np.nonzero(np.arange(room) < count[:, None])
+    names = [name for name in Contacts.vars if name not in ("count", "force")]
+    records = {name: getattr(buffer, name).numpy()[env, slot] for name in names}
+    pose, half = np.float64(poses)[env, records["shape"]], 0.5 * records["distance"][:, None]
+    radius = np.array([radius for _, radius in strips])[records["shape"]][:, None]
+    to_world = np.array([oracle.rotation_matrix(row[3:]) for row in pose]).reshape(-1, 3, 3)
+    # The point lies half way between the surfaces.
+    centre = records["point"] + (half + radius) * records["normal"]
+    records["centre"] = np.einsum("nji,nj->ni", to_world, centre - pose[:, :3])
+    records["touched"] = records["point"] - half * records["normal"]
+    return records | {"count": count, "env": env, "buffer": buffer}
 
 
 def hard_terrain(kind):
@@ -84,9 +89,9 @@ def test_a_row_that_sags_is_looked_at_where_it_touches():
     poses = np.float32([[8, 4, 0, 0, 0, 0, 1]])
     flat = np.zeros((1, 161, 321), np.float32)
     records = collide(poses, [0], flat, [(np.array(sagging), 0.05)], spread=0.52)
-    assert records["count"] == 1
-    np.testing.assert_allclose(records["point1"][0], sagging[1], atol=1e-6)
-    assert collide(poses, [0], flat, [(np.array(sagging), 0.05)])["count"] == 0
+    assert records["count"].tolist() == [1]
+    np.testing.assert_allclose(records["centre"][0], sagging[1], atol=1e-6)
+    assert not collide(poses, [0], flat, [(np.array(sagging), 0.05)])["count"].any()
 
 
 def test_strips_report_first_deepest_and_last():
@@ -100,7 +105,7 @@ def test_strips_report_first_deepest_and_last():
         distance = np.array([oracle.nearest_on_surface(grid, SPACING, p, radius + UNDECIDED)[0] for p in world])
         if (np.abs(distance - radius) < UNDECIDED).any() or (np.sort(distance)[:2] == -np.inf).any():
             continue  # too close to call, or so deep that the depth is another definition
-        touching, reported = np.flatnonzero(distance < radius), records["point1"][records["env"] == env]
+        touching, reported = np.flatnonzero(distance < radius), records["centre"][records["env"] == env]
         chosen = {int(np.argmin(np.abs(centres - point).sum(1))) for point in reported}
         assert len(reported) == len(chosen)
         if len(touching):
@@ -112,34 +117,78 @@ def test_strips_report_first_deepest_and_last():
     assert touched > 20
 
 
-def test_records_are_what_the_solver_reads():
+def test_a_bundle_of_strips_touches_what_each_does_alone():
+    grid, rng = hard_terrain("genes"), np.random.default_rng(10)
+    strips = [(rng.uniform(-0.3, 0.3, 3) + np.linspace([0, 0, -0.1], [0, 0, 0.1], 5), radius) for radius in RADII]
+    poses, found = np.repeat(sphere_poses(rng, grid, 200)[:, :1], len(RADII), axis=1), []
+    poses[..., 2] += np.float32(rng.uniform(0.0, 0.6, (200, 1)))
+    for bundled in (False, True):
+        records = collide(poses, np.zeros(200, int), grid[None], strips, bundled=bundled)
+        columns = [records["env"], records["shape"], records["distance"], *records["point"].T, *records["normal"].T]
+        found.append(np.array(sorted(np.stack(columns, axis=1).tolist())))
+    assert len(found[0]) > 100 and (records["count"] == 0).sum() > 20
+    np.testing.assert_array_equal(*found)
+
+
+def test_contacts_are_what_the_solver_reads():
     rng = np.random.default_rng(9)
     grid = hard_terrain("genes")
     poses = sphere_poses(rng, grid, 100)
-    records = collide(poses, np.zeros(100, int), grid[None], [(rng.normal(0, 0.02, 3), radius) for radius in RADII])
-    assert records["count"] > 50
-    radius = np.array(RADII)[records["strip"]]
-    assert (records["shape0"] == GROUND_SHAPE).all()
-    assert (records["margin0"] == 0).all()
-    assert not records["offset0"].any()
-    np.testing.assert_array_equal(records["margin1"], np.float32(radius))
+    strips = [(rng.normal(0, 0.02, 3), radius) for radius in RADII]
+    records = collide(poses, np.zeros(100, int), grid[None], strips)
+    assert records["count"].sum() > 50
     np.testing.assert_allclose(np.linalg.norm(records["normal"], axis=1), 1, atol=1e-5)
-    # offset1, turned into the world, leads from the centre to the sphere's lowest point against the normal.
-    offset_w = np.einsum("nij,nj->ni", records["rotation"], records["offset1"])
-    np.testing.assert_allclose(offset_w, -records["normal"] * radius[:, None], atol=1e-6)
-    for point in records["point0"][np.abs(records["distance"]) < radius]:
-        assert abs(oracle.nearest_on_surface(grid, SPACING, point, 0.05)[0]) < 1e-5
+    # The sphere's lowest point against the normal and the surface below it are as far apart as the distance says, with
+    # the point in their middle: only then it is the probe's centre from which a radius and half of it lead there.
+    centres, radius = np.array([centre for centre, _ in strips]), np.array(RADII)[records["shape"]]
+    np.testing.assert_allclose(records["centre"], centres[records["shape"]], atol=3e-6)
+    assert (records["distance"] < 0).all()
+    for touched in records["touched"][np.abs(records["distance"] + radius) < radius]:
+        assert abs(oracle.nearest_on_surface(grid, SPACING, touched, 0.05)[0]) < 1e-5
+    assert (records["friction"] == 1).all() and (records["time_constant"] == FIRM).all()
 
 
 def test_contacts_past_the_capacity_are_counted_but_not_written():
-    poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (6, 1))
-    records = collide(poses, np.zeros(6, int), np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)], capacity=4)
-    assert records["count"] == 6
-    assert (records["shape1"] >= FIRST_SHAPE).sum() == 4
+    # Robot 0 touches with three shapes, robot 1 with one, and has room for two.
+    poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (2, 3, 1))
+    poses[1, 1:, 2] = 1.0
+    buffer = make_contacts(3, 2)
+    buffer.shape.fill_(UNTOUCHED)
+    world, on = wp.array(np.float32(poses), dtype=wp.transform), wp.zeros(2, dtype=int)
+    flat = make_terrain(np.zeros((1, 161, 321)))
+    collide_strips(world, on, flat, make_probes([(np.zeros(3), 0.1)] * 3), Ground(), buffer)
+    shapes = buffer.shape.numpy()
+    assert buffer.count.numpy().tolist() == [3, 1, 0]
+    assert len(set(shapes[0])) == 2 and (shapes[0] >= 0).all()
+    assert shapes[1:].tolist() == [[0, UNTOUCHED], [UNTOUCHED] * 2]
 
 
 def test_a_state_that_is_not_finite_touches_nothing():
     strip, flat = [(np.zeros(3), 0.1)], np.zeros((1, 161, 321))
-    assert collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"] == 0
+    assert not collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"].any()
     with pytest.raises(ValueError, match="body_q"):
         collide(np.zeros((3, 7)), np.zeros(4, int), flat, strip)
+
+
+def geom_forces(*, count, column_of_shape, num_geoms):
+    """Two robots with room for two contacts; contact k is on shape k of robot k % 2, with 10 k + (1, 2, 3) N."""
+    force = [[(1, 2, 3), (21, 22, 23)], [(11, 12, 13), (31, 32, 33)]]
+    contacts = filled(Contacts, count=count, shape=[[0, 2], [1, 3]], force=np.float32(force))
+    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3)
+    sum_forces(contacts, wp.array(column_of_shape, dtype=int), out)
+    return out.numpy()
+
+
+def test_contact_forces_of_one_geom_add_up_and_others_are_left_out():
+    # Shapes 0 and 2 share column 1, shape 1 has column 2, shape 3 has none.
+    expected = np.zeros((2, 3, 3))
+    expected[0, 1], expected[1, 2] = (22, 24, 26), (11, 12, 13)
+    np.testing.assert_array_equal(geom_forces(count=[2, 2], column_of_shape=[1, 2, 1, -1], num_geoms=3), expected)
+
+
+@pytest.mark.parametrize(("count", "last"), [([1, 0], 0), ([900, 0], 21)])
+def test_only_contacts_that_exist_are_read(count, last):
+    # Contacts 1, 2 and 3 are stale in the first case; in the second, robot 0's count ran on past the capacity.
+    forces = geom_forces(count=count, column_of_shape=[0, 1, 2, 3], num_geoms=4)
+    assert forces[0, :, 0].tolist() == [1, 0, last, 0]
+    assert not forces[1].any()

@@ -4,12 +4,23 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.coordinates import SolverState, ask_poses, ask_solver, tell_solver
+from kernels.contact import Contacts, Surfaces
+from kernels.coordinates import (
+    SolverContacts,
+    SolverState,
+    ask_forces,
+    ask_poses,
+    ask_solver,
+    tell_contacts,
+    tell_solver,
+)
+from kernels.ground import FIRM
 from sim.mujoco_c.model import to_mujoco
 from tests.kernels.states import filled, random_states
 
 ENVS = 5
 COM = (0.03, -0.02, 0.1)
+TOO_MANY, GROUND = 8, 9
 COLUMNS, FOLLOWED, BODIES = (9, 7, 8), (8, -1, 7, 9), (2, 1)
 
 
@@ -69,3 +80,64 @@ def test_poses_are_those_of_the_bodies_with_quaternions_turned_round(solver):
     ask_poses(solver, poses)
     expected = np.concatenate([positions, rotations[..., [1, 2, 3, 0]]], axis=-1)[:, list(BODIES)]
     np.testing.assert_array_equal(poses.numpy(), np.float32(expected))
+
+
+@pytest.fixture
+def contacts():
+    """Of two robots with room for two contacts: one and, of three, two."""
+    return filled(
+        Contacts, count=[1, 3], shape=[[1, 0], [0, 1]], friction=[[0.5, 9], [1, 0.25]],
+        point=np.float32([[[1, 2, 3], [0, 0, 0]], [[4, 5, 6], [7, 8, 9]]]), distance=[[-0.01, 9], [-0.02, -0.03]],
+        normal=np.float32([[[0, 0, 1], [0, 0, 0]], [[0, 0.8, 0.6], [0.6, 0, 0.8]]]),
+        time_constant=[[0.03, 9], [FIRM, 0.015]], force=np.zeros((2, 2, 3)),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def theirs():
+    """Room for four contacts in two worlds, the rows of which have the forces 1, 2, ... and 11, 12, ..."""
+    return filled(
+        SolverContacts, count=[4], worldid=[-1] * 4, geom=[[-1, -1]] * 4, dist=[0] * 4, pos=np.zeros((4, 3)),
+        frame=np.zeros((4, 3, 3)), dim=[0] * 4, friction=np.zeros((4, 5)), solref=np.zeros((4, 2)),
+        solimp=np.zeros((4, 5)), efc_address=np.zeros((4, 4)), efc_force=np.add.outer([0, 10], np.arange(1, 7)),
+        overflow=[5, 5], too_many=TOO_MANY, ground=GROUND, slot=[[-1, -1]] * 2,
+    )  # fmt: skip
+
+
+def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
+    # Shape 0 is firmer than all ground, but 0.02 s is not exceeded by 0.015 s: softer ground alone counts.
+    surfaces = filled(
+        Surfaces, geom=[4, 7], body=[1, 2], condim=[3, 4], friction=[[[0.8, 0.8, 0.1, 0.2, 0.2]] * 2],
+        solref=[[[0.01, 1.5], [0.02, 1.5]]], solimp=[[[0.7, 0.9, 0.1, 0.5, 2.0]] * 2],
+    )  # fmt: skip
+    tell_contacts(contacts, surfaces, theirs)
+    found = {name: getattr(theirs, name).numpy() for name in SolverContacts.vars if name not in ("too_many", "ground")}
+    slots = found["slot"][[0, 1, 1], [0, 0, 1]]
+    assert found["count"][0] == 3 and sorted(slots) == [0, 1, 2]
+    assert found["overflow"].tolist() == [0, TOO_MANY]
+    expected = {
+        "worldid": [0, 1, 1], "geom": [[GROUND, 7], [GROUND, 4], [GROUND, 7]], "dist": [-0.01, -0.02, -0.03],
+        "pos": [[1, 2, 3], [4, 5, 6], [7, 8, 9]], "dim": [4, 3, 4], "efc_address": [[-1] * 4] * 3,
+        "friction": [[factor * 0.8, factor * 0.8, 0.1, 0.2, 0.2] for factor in (0.5, 1, 0.25)],
+        "solref": [[0.03, 1.0], [0.01, 1.5], [0.02, 1.5]],
+        "solimp": [[0.9, 0.9, 0.1, 0.5, 2.0]] + [[0.7, 0.9, 0.1, 0.5, 2.0]] * 2,
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name][slots], np.float32(values), rtol=1e-6, err_msg=name)
+    frame = found["frame"][slots]
+    np.testing.assert_array_equal(frame[:, 0], contacts.normal.numpy()[[0, 1, 1], [0, 0, 1]])
+    np.testing.assert_allclose(frame @ frame.transpose(0, 2, 1), [np.eye(3)] * 3, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(frame), 1.0, rtol=1e-6)
+
+
+def test_forces_of_contacts_are_put_together_from_their_rows(contacts, theirs):
+    # Normal along world y, tangents along z and x. The first robot's has rows 3 to 5; of the other's, one has row 1
+    # without friction, and one is not active.
+    contacts.force.fill_(wp.vec3(7.0))
+    theirs.slot.assign(np.int32([[2, -1], [0, 1]]))
+    theirs.frame.assign(np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4))
+    theirs.dim.assign(np.int32([1, 3, 4, 0]))
+    theirs.efc_address.assign(np.int32([[1, -1, -1, -1], [-1] * 4, [2, 3, 4, 5], [0] * 4]))
+    ask_forces(theirs, contacts)
+    np.testing.assert_array_equal(contacts.force.numpy()[0], [[5, 3, 4], [7, 7, 7]])
+    np.testing.assert_array_equal(contacts.force.numpy()[1], [[0, 12, 0], [0, 0, 0]])

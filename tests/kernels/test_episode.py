@@ -35,7 +35,7 @@ def make_state(num_envs, outcome=0, steps=0):
     return state
 
 
-def latch(states, state, *, action=0.0, force=0.0, overflow=0, contacts=(0, 10), task=None, **limits):
+def latch(states, state, *, action=0.0, force=0.0, overflow=0, task=None, **limits):
     """One judged step; ``force`` [N] acts on the second base geom of every environment, ``action`` is of one joint."""
     num_envs, task = len(states[0]), task or task_of()
     forces = np.zeros((num_envs, len(ROLES), 3), np.float32)
@@ -46,8 +46,7 @@ def latch(states, state, *, action=0.0, force=0.0, overflow=0, contacts=(0, 10),
     actions, bits = np.broadcast_to(np.float32(action), num_envs)[:, None], np.broadcast_to(overflow, num_envs)
     latch_outcomes(
         *(wp.array(np.float32(array)) for array in (*states, actions)), wp.array(forces, dtype=wp.vec3),
-        wp.array(ROLES, dtype=int), wp.array(bits, dtype=int), wp.array([contacts[0]], dtype=int), contacts[1], task,
-        state,
+        wp.array(ROLES, dtype=int), wp.array(bits, dtype=int), task, state,
     )  # fmt: skip
     return [Outcome(k) for k in state.outcome.numpy()]
 
@@ -114,13 +113,6 @@ def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it():
     begin_episodes(wp.ones(8, dtype=int), state)
     assert latch(upright(8, 3, x=14.0), state) == [Outcome.GOAL] * 8
     assert not state.invalidity.numpy().any()
-
-
-def test_dropped_contacts_make_every_running_episode_invalid():
-    state = make_state(3, outcome=[0, Outcome.GOAL, 0])
-    assert latch(upright(3, 3), state, contacts=(11, 10)) == [Outcome.INVALID, Outcome.GOAL, Outcome.INVALID]
-    assert state.invalidity.numpy()[[0, 2]].tolist() == [Invalidity.OVERFLOW] * 2
-    assert latch(upright(1, 3), make_state(1), contacts=(10, 10)) == [Outcome.RUNNING]
 
 
 def test_penalties_may_count_from_a_later_step():

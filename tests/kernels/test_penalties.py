@@ -1,12 +1,12 @@
-"""Raw penalties and contact forces: float64 oracle, hand-computed steps, contracts."""
+"""Raw penalties: float64 oracle, hand-computed steps, contracts."""
 
 import numpy as np
 import pytest
 import warp as wp
 
-from kernels.penalties import BASE, FOOT, LIMB, SolverContacts, add_penalties, sum_geom_forces
+from kernels.penalties import BASE, FOOT, LIMB, add_penalties
 from sim.mujoco_c.model import step_penalties, to_mujoco
-from tests.kernels.states import filled, random_states, upright
+from tests.kernels.states import random_states, upright
 
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
 BASE_COM = (0.05, -0.02, 0.1)
@@ -76,38 +76,3 @@ def test_steps_that_do_not_count_add_nothing():
 def test_wrong_number_of_columns_is_named():
     with pytest.raises(ValueError, match="sums_out"):
         sums_after(upright(2, 3), np.zeros((2, 3)), np.zeros((2, 5, 3)), sums=np.zeros((2, 5), np.float32))
-
-
-def geom_forces(*, count, capacity, column_of_geom, num_geoms):
-    """Two worlds; contact k is on geom k of world k % 2, with forces 10 k + (1, 2, 3) along its normal and tangents."""
-    contacts = filled(
-        SolverContacts,
-        count=[count],
-        capacity=capacity,
-        world=[0, 1, 0, 1],
-        geom=[[9, k] for k in range(4)],
-        frame=np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4),  # normal along world y, tangents along z and x
-        # World 0 has contacts 0 and 2 in rows 0.. and 3..; world 1 contact 1 in rows 0.., and contact 3 is inactive.
-        efc_address=[[0, 1, 2], [0, 1, 2], [3, 4, 5], [-1] * 3],
-        efc_force=[[1, 2, 3, 21, 22, 23], [11, 12, 13, 0, 0, 0]],
-    )
-    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3)
-    sum_geom_forces(contacts, wp.array(column_of_geom, dtype=int), out)
-    return out.numpy()
-
-
-def test_contact_forces_of_one_geom_add_up_and_others_are_left_out():
-    # Contact 0: 1 N along y, 2 N along z, 3 N along x; contact 2 likewise 21, 22, 23; contact 1 11, 12, 13. Geoms 0 and
-    # 2 share column 1, geom 1 has column 2.
-    forces = geom_forces(count=4, capacity=4, column_of_geom=[1, 2, 1, 0] + [-1] * 6, num_geoms=3)
-    expected = np.zeros((2, 3, 3))
-    expected[0, 1], expected[1, 2] = (26, 22, 24), (13, 11, 12)
-    np.testing.assert_allclose(forces, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize(("count", "capacity"), [(2, 4), (900, 2)])
-def test_only_contacts_that_exist_are_read(count, capacity):
-    # Contact 2 is stale in the first case, and beyond the capacity in the second, whose count ran on past it.
-    forces = geom_forces(count=count, capacity=capacity, column_of_geom=[0, 1, 2, 3] + [-1] * 6, num_geoms=4)
-    assert forces[0, 0, 1] == 1
-    assert not forces[0, 2].any()

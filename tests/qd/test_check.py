@@ -44,10 +44,10 @@ def test_a_controller_that_stands_still_does_not_walk(monkeypatch, tmp_path, cap
 def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     pose = "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n"
-    file, policy = write_toml(tmp_path / "dog", f"{pose}njmax = 8\n"), f"{tmp_path / 'trot.py'}:Trot"
+    file, policy = write_toml(tmp_path / "dog", f"{pose}nconmax = 2\n"), f"{tmp_path / 'trot.py'}:Trot"
     (tmp_path / "trot.py").write_text(CONTROLLER)
     robot = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
-    assert robot == get_robot(str(file)) and robot.njmax > 8
+    assert robot == get_robot(str(file)) and robot.nconmax > 2
     assert len(read_penalty_scales(robot)) == len(robot.penalties)
     assert made_ready(robot, policy, compute_by(Robots(stop_after=0))) is robot
     file.write_text(f"speed = 0.5\n{file.read_text()}")

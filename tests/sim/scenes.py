@@ -65,7 +65,6 @@ def free_body(folder: Path, geom: str, *, mass: float, friction: float = 0.5) ->
         contact_force_limit=500.0,
         penalties=(),
         collision_bit=False,
-        njmax=160,
     )
 
 

@@ -1,4 +1,4 @@
-"""Our dynamics and our solver of contacts find what mujoco_warp's find, from the same state."""
+"""Our dynamics and our step find what mujoco_warp's find, from the same state."""
 
 from typing import Any
 
@@ -8,43 +8,39 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.solver import (
-    Dynamics,
-    TheirDynamics,
-    dynamics_of,
-    fits,
-    fits_dynamics,
-    solve_contacts,
-    solve_theirs,
-    use_own_solver,
-)
+from kernels import solver
+from kernels.contact import make_contacts
+from sim.solver import Dynamics, TheirDynamics, dynamics_of
 from tests.sim.scenes import put, standing
 
 Mujoco: Any = mujoco  # it names its types at run time
-WORLDS = 16
-# A thing with equality, friction losses, a limit and contacts of 1, 3, 4 and 6 dimensions.
+WORLDS, CAPACITY = 16, 24
+# A thing with friction losses, a limit and contacts of 1, 3, 4 and 6 dimensions, one of which has its own way.
 EVERYTHING = """
 <mujoco>
-  <option cone="{cone}" iterations="30" ls_iterations="20" timestep="0.004" integrator="implicitfast"/>
+  <compiler angle="radian"/>
+  <option cone="elliptic" iterations="30" ls_iterations="20" timestep="0.004" integrator="implicitfast" impratio="2"/>
   <worldbody>
-    <geom type="plane" size="3 3 .1" condim="1" friction=".6 .02 .01"/>
+    <geom type="plane" size="3 3 .1" condim="1" friction=".6 .02 .01" solmix="2"/>
     <body pos="0 0 .21"><freejoint/>
-      <geom type="box" size=".2 .1 .1" condim="3" friction=".6 .02 .01"/>
-      <body pos=".25 0 0"><joint name="left" axis="0 1 0" frictionloss=".4" range="-.3 .3" limited="true"/>
-        <geom type="capsule" size=".04" fromto="0 0 0 .3 0 -.1" condim="4" friction=".8 .03 .01"/></body>
+      <geom type="box" size=".2 .1 .1" condim="3" friction=".6 .02 .01" solref=".03 .8"/>
+      <body pos=".25 0 0"><joint name="left" axis="0 1 0" frictionloss=".4" range="-.3 .3" limited="true" margin=".01"/>
+        <geom type="capsule" size=".04" fromto="0 0 0 .3 0 -.1" condim="4" friction=".8 .03 .01"
+          solimp=".8 .9 .01 .3 3"/></body>
       <body pos="-.25 0 0"><joint name="right" axis="0 1 0" frictionloss=".2" damping=".1"/>
-        <geom type="sphere" size=".08" pos="-.1 0 -.1" condim="6" friction=".9 .05 .02"/></body>
-      <body pos="0 .3 .1"><joint axis="1 0 0"/><geom type="sphere" size=".05" condim="1"/></body>
+        <geom type="sphere" size=".08" pos="-.1 0 -.1" condim="6" friction=".9 .05 .02" solref="-900 -30"/></body>
+      <body pos="0 .3 .1"><joint name="third" axis="1 0 0"/>
+        <geom type="sphere" size=".05" condim="1" priority="1" solimp=".7 .7 .01 .5 1"/></body>
     </body>
   </worldbody>
-  <equality><joint joint1="left" joint2="right" polycoef=".1 .5 0 0 0"/></equality>
+  <actuator><motor joint="third"/></actuator>
 </mujoco>
 """
 # A robot of several joints a body, an arm fixed to the world and a post that cannot move: what no shipped robot has.
 MODEL = """
 <mujoco>
   <compiler angle="radian"/>
-  <option cone="elliptic" timestep="0.004" integrator="implicitfast" gravity=".3 -.2 -9.7" {option}/>
+  <option timestep="0.004" integrator="implicitfast" gravity=".3 -.2 -9.7" {option}/>
   <worldbody>
     <geom type="plane" size="3 3 .1"/>
     <body name="post" pos="3 0 0"><geom size=".1"/></body>
@@ -80,121 +76,57 @@ MODEL = """
 
 
 def build(xml, device, **parts):
-    parts = dict.fromkeys(("option", "inner", "outer", "actuator", "more"), "") | parts
+    """A model whose contacts are those that mujoco_warp finds, its data, and ours of it."""
+    parts = dict.fromkeys(("inner", "outer", "actuator", "more"), "") | {"option": 'cone="elliptic"'} | parts
     model = Mujoco.MjModel.from_xml_string(xml.format(**parts))
     with wp.ScopedDevice(device):
         m = mjw.put_model(model)
-        return m, mjw.put_data(model, Mujoco.MjData(model), nworld=WORLDS, nconmax=24, njmax=90)
+        d = mjw.put_data(model, Mujoco.MjData(model), nworld=WORLDS, nconmax=24, njmax=90)
+        return m, d, make_contacts(WORLDS, CAPACITY)
 
 
-def everything(device, cone="elliptic"):
-    m, d = build(EVERYTHING, device, cone=cone)
-    rng = np.random.default_rng(5)
-    qpos = d.qpos.numpy()
-    qpos[:, 2] += rng.uniform(-0.05, 0.05, WORLDS)
-    qpos[:, 3:] += rng.normal(0.0, 0.2, (WORLDS, 7))
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    d.qpos.assign(qpos)
-    d.qvel.assign(rng.normal(0.0, 1.0, d.qvel.shape))
-    return m, d
-
-
-def solved(solve, m, d):
-    d.overflow.zero_()
-    d.qacc_warmstart.zero_()  # a step has left its solution there
-    solve(m, d)
-    force, state = d.efc.force.numpy(), d.efc.state.numpy()
-    for world, count in enumerate(d.nefc.numpy()):
-        force[world, count:], state[world, count:] = 0.0, 0
-    arrays = {"qacc": d.qacc, "qfrc": d.qfrc_constraint, "momentum": d.efc.Ma, "iterations": d.solver_niter}
-    return {name: array.numpy().copy() for name, array in arrays.items()} | {"force": force, "state": state}
-
-
-def assert_solved_alike(m, d):
-    """To 2e-3 of the largest number of a world; where rounding made one more iteration, ten times that."""
-    theirs, ours = solved(solve_theirs, m, d), solved(solve_contacts, m, d)
-    differs = np.abs(ours["iterations"] - theirs["iterations"])
-    assert differs.max() <= 1
-    assert (differs > 0).mean() <= 0.25
-    for name in ("qacc", "qfrc", "momentum", "force"):
-        size = np.abs(theirs[name]).max(axis=1) + 1.0
-        error = np.abs(ours[name] - theirs[name]).max(axis=1) / size
-        assert (error < np.where(differs > 0, 2e-2, 2e-3)).all(), (name, error)
-    return ours
-
-
-def test_every_kind_of_constraint(device):
-    m, d = everything(device)
-    assert fits(m, d)
-    kinds, states = set(), set()
-    use_own_solver(False)
-    try:
-        with wp.ScopedDevice(device):
-            for _ in range(15):
-                mjw.step(m, d)
-                ours = assert_solved_alike(m, d)
-                for world, count in enumerate(d.nefc.numpy()):
-                    kinds |= set(d.efc.type.numpy()[world, :count].tolist())
-                    states |= set(ours["state"][world, :count].tolist())
-    finally:
-        use_own_solver()
-    names = ("EQUALITY", "FRICTION_DOF", "LIMIT_JOINT", "CONTACT_FRICTIONLESS", "CONTACT_ELLIPTIC")
-    assert kinds >= {getattr(Mujoco.mjtConstraint, f"mjCNSTR_{name}") for name in names}
-    assert states == {0, 1, 2, 3, 4}
-
-
-def test_robots_that_fall(eight):
-    """Steps of the robots that searches cross with, in all states of their contacts."""
-    m, d = eight.solver.mjw_model, eight.solver.mjw_data
-    assert fits(m, d)
-    states, mean_iterations = set(), []
-    q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
-    put(eight, q, np.random.default_rng(2).normal(0.0, 0.7, eight.joint_qd.shape))
-    with wp.ScopedDevice(eight.device):
-        for _ in range(120):
-            eight.physics_step()
-            ours = assert_solved_alike(m, d)
-            states |= set(ours["state"].ravel().tolist())
-            mean_iterations.append(ours["iterations"].mean())
-    assert states >= {0, 1, 4}
-    assert np.mean(mean_iterations) > 1.5
-
-
-def test_a_model_that_does_not_fit_is_solved_as_before(device):
-    m, d = everything(device, cone="pyramidal")
-    assert not fits(m, d)
-    with wp.ScopedDevice(device):
-        mjw.step(m, d)
-    assert np.isfinite(d.qacc.numpy()).all()
-    assert d.solver_niter.numpy().max() > 0
-
-
-def test_worlds_without_rows_and_worlds_that_are_not_finite_end(device):
-    m, d = everything(device)
-    with wp.ScopedDevice(device):
-        mjw.step(m, d)
-        rows = d.nefc.numpy().copy()
-        for count in (d.nefc, d.ne, d.nf):
-            count.zero_()
-        solve_contacts(m, d)
-        np.testing.assert_allclose(d.qacc.numpy(), d.qacc_smooth.numpy(), rtol=1e-3, atol=1e-2)
-        d.nefc.assign(rows)
-        d.qacc_warmstart.fill_(float("nan"))
-        solve_contacts(m, d)
-    assert (d.solver_niter.numpy() <= m.opt.iterations).all()
-    assert not np.isfinite(d.qacc.numpy()).any()
-
-
-def robot_of(device, **parts):
-    m, d = build(MODEL, device, **parts)
+def ours_of(m, d, contacts):
+    """Our dynamics of it, or theirs by our road, and whether it is the former."""
     m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
-    return m, d
+    found = dynamics_of(m, d, contacts, 1 + np.arange(m.ngeom - 1), 0)
+    m.opt.run_collision_detection = True
+    return found
 
 
-def shake(d):
-    rng = np.random.default_rng(3)
-    for array, spread in ((d.qpos, 0.3), (d.qvel, 1.5), (d.ctrl, 1.0)):
-        array.assign((array.numpy() + rng.normal(0.0, spread, array.shape)).astype(np.float32))
+def assign(array, values):
+    """Writes the first columns of an array, (WORLDS, some)."""
+    whole = array.numpy().copy()
+    whole[:, : values.shape[1]] = values
+    array.assign(whole)
+
+
+def tell(d, contacts):
+    """Hands ours the contacts that mujoco_warp has found, each with a geom of the ground first."""
+    count = int(d.nacon.numpy()[0])
+    world, found = d.contact.worldid.numpy()[:count], {}
+    assert (d.contact.geom.numpy()[:count, 0] == 0).all()
+    of_theirs = {"shape": d.contact.geom.numpy()[:, 1] - 1, "point": d.contact.pos.numpy(),
+                 "normal": d.contact.frame.numpy()[:, 0], "distance": d.contact.dist.numpy()}  # fmt: skip
+    for name, values in of_theirs.items():
+        found[name] = np.zeros(getattr(contacts, name).numpy().shape, values.dtype)
+    places = []
+    for k in range(WORLDS):
+        chosen = np.flatnonzero(world == k)
+        places.append(chosen)
+        for name, values in of_theirs.items():
+            found[name][k, : len(chosen)] = values[chosen]
+    for name, values in found.items():
+        getattr(contacts, name).assign(values)
+    contacts.friction.fill_(1.0)
+    contacts.count.assign(np.array([len(chosen) for chosen in places], np.int32))
+    return places
+
+
+def force_of(d, contact):
+    """Their force of a contact, world frame."""
+    rows = d.contact.efc_address.numpy()[contact][: min(3, d.contact.dim.numpy()[contact])]
+    world = d.contact.worldid.numpy()[contact]
+    return d.efc.force.numpy()[world, rows] @ d.contact.frame.numpy()[contact][: len(rows)] if rows[0] >= 0 else 0.0
 
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
@@ -204,90 +136,231 @@ def state_of(d):
     return [getattr(d, name).numpy().copy() for name in STATE]
 
 
-def assert_steps_alike(d, theirs, ours, before_step, relative):
-    """Their step and ours from the same state, to a share of a world's largest number."""
-    before = state_of(d)
-    theirs()
-    expected = state_of(d)
-    for name, value in zip(STATE, before, strict=True):
+def restore(d, state):
+    for name, value in zip(STATE, state, strict=True):
         getattr(d, name).assign(value)
-    before_step()
+
+
+def assert_steps_alike(m, d, contacts, ours, relative=2e-3, find=None):
+    """Their step and ours from the same state, to a share of a world's largest number, forces of contacts too.
+
+    Where rounding made one more iteration, ten times that.
+    """
+    before = state_of(d)
+    mjw.step(m, d)
+    expected, iterations, rows = state_of(d), d.solver_niter.numpy().copy(), d.nefc.numpy().copy()
+    places = tell(d, contacts)
+    forces = [np.array([force_of(d, c) * np.ones(3) for c in chosen]).reshape(-1, 3) for chosen in places]
+    restore(d, before)
+    (find or ours.find)()
     ours.step()
-    for array, value in zip(state_of(d), expected, strict=True):
-        size = np.abs(value).max(axis=1, keepdims=True) + 1.0
-        assert (np.abs(array - value) / size).max() < relative
+    differs = np.abs(d.solver_niter.numpy() - iterations)
+    assert differs.max() <= 1 and (differs > 0).mean() <= 0.25
+    limit = np.where(differs > 0, 10.0 * relative, relative)
+    for name, array, value in zip(STATE, state_of(d), expected, strict=True):
+        error = np.abs(array - value).max(axis=1) / (np.abs(value).max(axis=1) + 1.0)
+        assert (error < limit).all(), (name, error)
+    found = contacts.force.numpy()
+    for k, force in enumerate(forces):
+        size = np.abs(force).max(initial=0.0) + 1.0
+        np.testing.assert_allclose(found[k, : len(force)], force, atol=limit[k] * size)
+    assert (d.nefc.numpy() >= rows).all()
+    return iterations
+
+
+def everything(device):
+    m, d, contacts = build(EVERYTHING, device)
+    rng = np.random.default_rng(5)
+    qpos = d.qpos.numpy()
+    qpos[:, 2] += rng.uniform(-0.05, 0.05, WORLDS)
+    qpos[:, 3:] += rng.normal(0.0, 0.2, (WORLDS, 7))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    d.qpos.assign(qpos)
+    d.qvel.assign(rng.normal(0.0, 1.0, d.qvel.shape))
+    return m, d, contacts
+
+
+def test_every_kind_of_constraint(device):
+    m, d, contacts = everything(device)
+    ours = ours_of(m, d, contacts)
+    assert isinstance(ours, Dynamics)
+    kinds, states, dims = set(), set(), set()
+    with wp.ScopedDevice(device):
+        for _ in range(20):
+            before = state_of(d)
+            mjw.step(m, d)
+            for world, count in enumerate(d.nefc.numpy()):
+                kinds |= set(d.efc.type.numpy()[world, :count].tolist())
+                states |= set(d.efc.state.numpy()[world, :count].tolist())
+            dims |= set(d.contact.dim.numpy()[: int(d.nacon.numpy()[0])].tolist())
+            restore(d, before)
+            assert_steps_alike(m, d, contacts, ours)
+    names = ("FRICTION_DOF", "LIMIT_JOINT", "CONTACT_FRICTIONLESS", "CONTACT_ELLIPTIC")
+    assert kinds >= {getattr(Mujoco.mjtConstraint, f"mjCNSTR_{name}") for name in names}
+    assert states == {0, 1, 2, 3, 4} and dims == {1, 3, 4, 6}
+
+
+def test_contacts_beyond_shared_memory(device, monkeypatch):
+    """The same to the bit, wherever contacts are kept."""
+    seen = []
+    for words in (solver._SHARED_WORDS, 1):
+        monkeypatch.setattr(solver, "_SHARED_WORDS", words)
+        solver._kernel.cache_clear()
+        m, d, contacts = everything(device)
+        ours = ours_of(m, d, contacts)
+        assert (ours._sizes.kept == 1) == (words == 1)
+        with wp.ScopedDevice(device):
+            for _ in range(5):
+                before = state_of(d)
+                mjw.step(m, d)
+                tell(d, contacts)
+                restore(d, before)
+                ours.find()
+                ours.step()
+        assert contacts.count.numpy().max() > 2
+        seen.append([*state_of(d), contacts.force.numpy().copy()])
+    solver._kernel.cache_clear()
+    for kept, others in zip(*seen, strict=True):
+        np.testing.assert_array_equal(kept, others)
+
+
+def test_robots_that_fall(eight):
+    """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's."""
+    m, d = eight.solver.mjw_model, eight.solver.mjw_data
+    ours = eight._dynamics
+    assert isinstance(ours, Dynamics)
+    theirs = TheirDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
+    states, iterations = set(), []
+    q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
+    put(eight, q, np.random.default_rng(2).normal(0.0, 0.7, eight.joint_qd.shape))
+    with wp.ScopedDevice(eight.device):
+        eight.physics_step()
+        for _ in range(120):
+            before = state_of(d)
+            eight.physics_step()
+            found, forces = state_of(d), eight.contacts.force.numpy().copy()
+            counted = d.solver_niter.numpy().copy()
+            restore(d, before)
+            theirs.find()
+            theirs.step()
+            for world, count in enumerate(d.nefc.numpy()):
+                states |= set(d.efc.state.numpy()[world, :count].tolist())
+            iterations.append(d.solver_niter.numpy().mean())
+            differs = np.abs(d.solver_niter.numpy() - counted)
+            assert differs.max() <= 1
+            limit = np.where(differs > 0, 2e-2, 2e-3)
+            for array, value in zip([*found, forces], [*state_of(d), eight.contacts.force.numpy()], strict=True):
+                error, size = (np.abs(x.reshape(8, -1)).max(axis=1) for x in (array - value, value))
+                assert (error < limit * (size + 1.0)).all()
+            restore(d, found)
+    assert states >= {1, 4}
+    assert np.mean(iterations) > 1.2
+
+
+def test_worlds_without_rows_and_worlds_that_are_not_finite_end(device):
+    m, d, contacts = everything(device)
+    d.qvel.zero_()
+    qpos = d.qpos.numpy()
+    qpos[:, 2], qpos[:, 7:] = 50.0, 0.0
+    d.qpos.assign(qpos)
+    m.dof_frictionloss.zero_()
+    ours = ours_of(m, d, contacts)
+    with wp.ScopedDevice(device):
+        ours.find()
+        ours.step()
+        np.testing.assert_allclose(d.qvel.numpy()[:, 2], -9.81 * 0.004, rtol=1e-3)
+        assert not d.nefc.numpy().any() and (d.solver_niter.numpy() == 1).all()
+        d.qvel.fill_(float("nan"))
+        contacts.count.fill_(2)
+        ours.find()
+        ours.step()
+    assert (d.solver_niter.numpy() <= m.opt.iterations).all()
+    assert not np.isfinite(d.qvel.numpy()).any()
+
+
+def shake(d):
+    rng = np.random.default_rng(3)
+    for array, spread in ((d.qpos, 0.3), (d.qvel, 1.5), (d.ctrl, 1.0)):
+        array.assign((array.numpy() + rng.normal(0.0, spread, array.shape)).astype(np.float32))
 
 
 def test_every_quantity_of_a_step(device):
     """Free and fixed trees, joints of all kinds with springs, actuators of all kinds at and off their limits."""
-    m, d = robot_of(device)
+    m, d, contacts = build(MODEL, device)
     masses = np.repeat(m.body_mass.numpy(), WORLDS, 0) * np.linspace(0.9, 1.1, WORLDS)[:, None]
     m.body_mass = wp.array(masses, dtype=float, device=device)
-    assert fits_dynamics(m, d)
-    ours, theirs = Dynamics(m, d), TheirDynamics(m, d)
+    ours = ours_of(m, d, contacts)
     shake(d)
-    limited, expected = np.zeros(3, int), {}
+    limited, touched = np.zeros(3, int), 0
     roots = m.body_rootid.numpy()[1:]
-
-    def step_theirs():
-        theirs.find()
-        mjw.com_pos(m, d)
-        mjw.collision(m, d)
-        theirs.step()
-        for name in ("xpos", "xquat", "cdof", "M", "qfrc_actuator", "qfrc_smooth"):
-            expected[name] = getattr(d, name).numpy().copy()
-        expected["com"] = d.subtree_com.numpy()[:, roots].copy()
-        force, of_joint = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
-        limits = np.isin(force[:, 0], (-4.0, 5.0)), np.isin(of_joint, (-3.0, 2.0)), np.isclose(abs(force[:, 1]), 0.5)
-        limited[:] += np.sum(limits, axis=1)
-
-    def find_ours():
-        ours.find()
-        np.testing.assert_allclose(d.subtree_com.numpy()[:, roots], expected.pop("com"), atol=1e-5)
-        for name, value in expected.items():
-            size = np.abs(value).max() + 1e-3
-            np.testing.assert_allclose(getattr(d, name).numpy(), value, atol=3e-6 * size, err_msg=name)
-
     with wp.ScopedDevice(device):
         for _ in range(25):
-            assert_steps_alike(d, step_theirs, ours, find_ours, 2e-3)
+            before, expected = state_of(d), {}
+            mjw.step(m, d)
+            restore(d, before)
+            mjw.forward(m, d)
+            for name in ("xpos", "xquat", "cdof", "M", "qfrc_actuator", "qfrc_smooth"):
+                expected[name] = getattr(d, name).numpy().copy()
+            com = d.subtree_com.numpy()[:, roots].copy()
+            force, of_joint = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
+            limits = np.isin(force[:, 0], (-4.0, 5.0)), np.isin(of_joint, (-3.0, 2.0)), np.isclose(abs(force[:, 1]), 0.5)
+            limited += np.sum(limits, axis=1)
+
+            def find_ours(expected=expected, com=com):
+                ours.find()
+                np.testing.assert_allclose(d.subtree_com.numpy()[:, roots], com, atol=1e-5)
+                for name, value in expected.items():
+                    size = np.abs(value).max() + 1e-3
+                    np.testing.assert_allclose(getattr(d, name).numpy(), value, atol=3e-6 * size, err_msg=name)
+
+            restore(d, before)
+            assert_steps_alike(m, d, contacts, ours, find=find_ours)
+            touched = max(touched, int(contacts.count.numpy().max()))
     assert limited.min() > 5  # forces, joints and controls at their limits
-    assert d.nefc.numpy().max() > 0
+    assert touched > 0
 
 
 def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
     """Without constraints a step is that of the forces alone, and agrees to rounding."""
-    m, d = robot_of(device)
+    m, d, contacts = build(MODEL, device)
     qpos = d.qpos.numpy()
     qpos[:, 2] += 50.0
     d.qpos.assign(qpos)
-    ours = Dynamics(m, d)
+    ours = ours_of(m, d, contacts)
     shake(d)
     with wp.ScopedDevice(device):
         for _ in range(10):
-            assert_steps_alike(d, TheirDynamics(m, d).step, ours, ours.find, 3e-5)
+            assert_steps_alike(m, d, contacts, ours, relative=3e-5)
     assert d.nefc.numpy().max() == 0
 
 
-def test_too_many_contacts_are_noted(device):
-    m, d = robot_of(device)
-    ours, too_many = Dynamics(m, d), mjw.OverflowType.NEFC | mjw.OverflowType.NARROWPHASE
+@pytest.mark.parametrize("solver", ["Newton", "CG"])
+def test_too_many_contacts_are_noted(device, solver):
+    m, d, contacts = build(MODEL, device, option=f'cone="elliptic" solver="{solver}"')
+    dynamics = ours_of(m, d, contacts)
+    assert isinstance(dynamics, Dynamics) == (solver == "Newton")
+    m.opt.run_collision_detection = False
     with wp.ScopedDevice(device):
-        d.overflow.zero_()
-        ours.find()
-        ours.step()
-        assert not (d.overflow.numpy() & too_many).any()
-        d.nacon.fill_(d.naconmax + 1)
-        ours.step()
-        assert (d.overflow.numpy() & mjw.OverflowType.NARROWPHASE).all()
+        for count in (CAPACITY, CAPACITY + 1):
+            contacts.normal.fill_(wp.vec3(0.0, 0.0, 1.0))
+            contacts.distance.fill_(-1e-3)
+            contacts.friction.fill_(1.0)
+            contacts.count.fill_(1)
+            contacts.count[:2].fill_(count)
+            dynamics.find()
+            dynamics.step()
+            noted = (d.overflow.numpy() & mjw.OverflowType.NARROWPHASE) > 0
+            assert noted[:2].all() == (count > CAPACITY) and not noted[2:].any()
 
 
 @pytest.mark.parametrize(
     "parts",
     [
-        {"option": 'solver="CG"'},
+        {"option": 'cone="elliptic" solver="CG"'},
+        {"option": 'cone="pyramidal"'},
+        {"option": 'cone="elliptic" noslip_iterations="3"'},
         {"more": '<option><flag gravity="disable"/></option>'},
-        {"option": 'density="1.2"'},
+        {"option": 'cone="elliptic" density="1.2"'},
         {"inner": '<body><joint type="ball"/><geom size=".02"/></body>'},
         {"outer": '<body pos="1 1 1"><freejoint/><geom size=".1"/></body>'},
         {"outer": '<body pos="1 1 1" mocap="true"><geom size=".1"/></body>'},
@@ -302,7 +375,5 @@ def test_too_many_contacts_are_noted(device):
     ],
 )
 def test_other_models_take_their_step(device, parts):
-    m, d = robot_of(device)
-    assert isinstance(dynamics_of(m, d), Dynamics)
-    m, d = robot_of(device, **parts)
-    assert not fits_dynamics(m, d) and isinstance(dynamics_of(m, d), TheirDynamics)
+    assert isinstance(ours_of(*build(MODEL, device)), Dynamics)
+    assert isinstance(ours_of(*build(MODEL, device, **parts)), TheirDynamics)

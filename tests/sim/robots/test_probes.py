@@ -117,7 +117,12 @@ def test_a_mesh_without_volume_is_refused():
 def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     builder = build_robot(robot)
     probes = make_probes(builder)
-    shapes, bodies, starts = (getattr(probes, f"strip_{name}").numpy() for name in ("shape", "body", "start"))
+    shapes, starts, first = (getattr(probes, name).numpy() for name in ("strip_shape", "strip_start", "bundle_start"))
+    bodies = np.repeat(probes.bundle_body.numpy(), np.diff(first))
+    ball = np.repeat(probes.bundle_ball.numpy(), np.diff(starts[first]), axis=0)
+    radius = np.repeat(probes.strip_radius.numpy(), np.diff(starts))
+    away = np.linalg.norm(probes.position.numpy() - ball[:, :3], axis=1) + radius
+    assert (away <= ball[:, 3]).all()
     assert [builder.shape_label[shape] for shape in shapes] == builder.shape_label  # once: no cylinders, no boxes
     np.testing.assert_array_equal(bodies, np.array(builder.shape_body)[shapes])
     if robot.name == "cassie":
