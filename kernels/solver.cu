@@ -269,61 +269,61 @@ struct Line {  // of a contact
     float cost0, q0, q1, q2, mu, u0, v0, uu, uv, vv, dm, t0, r0;
 };
 auto read_contact = [&](const Contact& at) {
-    Line row;
-    row.mu = at.friction[0];
-    row.u0 = at.jaref[0] * row.mu;
-    row.v0 = at.jv[0] * row.mu;
-    row.q0 = row.q1 = row.q2 = row.uu = row.uv = row.vv = 0.0f;
+    Line line;
+    line.mu = at.friction[0];
+    line.u0 = at.jaref[0] * line.mu;
+    line.v0 = at.jv[0] * line.mu;
+    line.q0 = line.q1 = line.q2 = line.uu = line.uv = line.vv = 0.0f;
     #pragma unroll
     for (int k = 0; k < DIM; ++k) {
         const float x = at.jaref[k], y = at.jv[k], dx = at.d[k] * x, dy = at.d[k] * y;
-        row.q0 += 0.5f * x * dx;
-        row.q1 += y * dx;
-        row.q2 += 0.5f * y * dy;
+        line.q0 += 0.5f * x * dx;
+        line.q1 += y * dx;
+        line.q2 += 0.5f * y * dy;
         if (k == 0) continue;
         const float u = x * at.friction[k], v = y * at.friction[k];
-        row.uu += u * u;
-        row.uv += u * v;
-        row.vv += v * v;
+        line.uu += u * u;
+        line.uv += u * v;
+        line.vv += v * v;
     }
-    row.dm = at.d[0] / (row.mu * row.mu * (1.0f + row.mu * row.mu));
-    row.t0 = row.uu <= 0.0f ? 0.0f : wp::sqrt(row.uu);
-    row.r0 = row.cost0 = 0.0f;
-    row.state0 = SATISFIED;
-    if (row.uu <= 0.0f ? row.u0 < 0.0f : row.u0 < row.mu * row.t0 && row.mu * row.u0 + row.t0 <= 0.0f) {
-        row.cost0 = row.q0;
-        row.state0 = QUADRATIC;
-    } else if (row.uu > 0.0f && row.u0 < row.mu * row.t0) {
-        row.r0 = row.u0 - row.mu * row.t0;
-        row.cost0 = 0.5f * row.dm * row.r0 * row.r0;
-        row.state0 = CONE;
+    line.dm = at.d[0] / (line.mu * line.mu * (1.0f + line.mu * line.mu));
+    line.t0 = line.uu <= 0.0f ? 0.0f : wp::sqrt(line.uu);
+    line.r0 = line.cost0 = 0.0f;
+    line.state0 = SATISFIED;
+    if (line.uu <= 0.0f ? line.u0 < 0.0f : line.u0 < line.mu * line.t0 && line.mu * line.u0 + line.t0 <= 0.0f) {
+        line.cost0 = line.q0;
+        line.state0 = QUADRATIC;
+    } else if (line.uu > 0.0f && line.u0 < line.mu * line.t0) {
+        line.r0 = line.u0 - line.mu * line.t0;
+        line.cost0 = 0.5f * line.dm * line.r0 * line.r0;
+        line.state0 = CONE;
     }
-    return row;
+    return line;
 };
-auto cone_gap = [](const Line& row, float n, float t) {  // of the quadratic's cost over the cone's
-    const float boundary = row.mu * n + t;
-    return 0.5f * row.dm * boundary * boundary;
+auto cone_gap = [](const Line& line, float n, float t) {  // of the quadratic's cost over the cone's
+    const float boundary = line.mu * n + t;
+    return 0.5f * line.dm * boundary * boundary;
 };
-auto contact_at = [&](const Line& row, float alpha) {
-    const float n = row.u0 + alpha * row.v0, more = alpha * (2.0f * row.uv + alpha * row.vv), tt = row.uu + more;
+auto contact_at = [&](const Line& line, float alpha) {
+    const float n = line.u0 + alpha * line.v0, more = alpha * (2.0f * line.uv + alpha * line.vv), tt = line.uu + more;
     const float t = tt <= 0.0f ? 0.0f : wp::sqrt(tt);
-    if (tt <= 0.0f ? n < 0.0f : n < row.mu * t && row.mu * n + t <= 0.0f) {
-        float cost = alpha * (alpha * row.q2 + row.q1);
-        if (row.state0 == CONE) cost += cone_gap(row, row.u0, row.t0);
-        if (row.state0 == SATISFIED) cost = 0.5f * row.dm * (1.0f + row.mu * row.mu) * (n * n + wp::max(tt, 0.0f));
-        return Point{cost, 2.0f * alpha * row.q2 + row.q1, 2.0f * row.q2};
+    if (tt <= 0.0f ? n < 0.0f : n < line.mu * t && line.mu * n + t <= 0.0f) {
+        float cost = alpha * (alpha * line.q2 + line.q1);
+        if (line.state0 == CONE) cost += cone_gap(line, line.u0, line.t0);
+        if (line.state0 == SATISFIED) cost = 0.5f * line.dm * (1.0f + line.mu * line.mu) * (n * n + wp::max(tt, 0.0f));
+        return Point{cost, 2.0f * alpha * line.q2 + line.q1, 2.0f * line.q2};
     }
-    if (tt <= 0.0f || n >= row.mu * t) return Point{-row.cost0, 0.0f, 0.0f};
-    const float t1 = (row.uv + alpha * row.vv) / t, t2 = (row.vv - t1 * t1) / t;
-    const float rest = n - row.mu * t, r1 = row.v0 - row.mu * t1;
-    float cost = 0.5f * row.dm * rest * rest;
-    if (row.state0 == CONE) {  // t - t0 without cancellation
-        const float change = alpha * row.v0 - row.mu * (more / (t + row.t0));
-        cost = 0.5f * row.dm * change * (2.0f * row.r0 + change);
-    } else if (row.state0 == QUADRATIC) {
-        cost = alpha * (alpha * row.q2 + row.q1) - cone_gap(row, n, t);
+    if (tt <= 0.0f || n >= line.mu * t) return Point{-line.cost0, 0.0f, 0.0f};
+    const float t1 = (line.uv + alpha * line.vv) / t, t2 = (line.vv - t1 * t1) / t;
+    const float rest = n - line.mu * t, r1 = line.v0 - line.mu * t1;
+    float cost = 0.5f * line.dm * rest * rest;
+    if (line.state0 == CONE) {  // t - t0 without cancellation
+        const float change = alpha * line.v0 - line.mu * (more / (t + line.t0));
+        cost = 0.5f * line.dm * change * (2.0f * line.r0 + change);
+    } else if (line.state0 == QUADRATIC) {
+        cost = alpha * (alpha * line.q2 + line.q1) - cone_gap(line, n, t);
     }
-    return Point{cost, row.dm * rest * r1, row.dm * (r1 * r1 - rest * row.mu * t2)};
+    return Point{cost, line.dm * rest * r1, line.dm * (r1 * r1 - rest * line.mu * t2)};
 };
 auto limit_at = [](float d, float x0, float v, float alpha) {
     const float x = x0 + alpha * v, curve = d * v * v, slope = d * v * x0;
@@ -338,52 +338,46 @@ auto loss_at = [](float d, float most, float x, float v) {
     return Point{most * (sign * x - 0.5f * range), sign * most * v, 0.0f};
 };
 constexpr int READ = LANES == 1 ? MOST : 1;  // one thread reads contacts once a search; of a warp each lane its first
-Line rows[READ];
+Line lines[READ];
 float gauss_slope, gauss_curve;  // of the inertia: a parabola
-auto line_at = [&](float alpha) {
+// With `first` contacts are read, and the constraints' cost at 0 is found.
+auto line_at = [&](float alpha, bool first, float& cost0) {
     Point sum = {0.0f, 0.0f, 0.0f};
+    float before = 0.0f;
     auto add = [&](const Point& p) {
         sum.cost += p.cost;
         sum.slope += p.slope;
         sum.curve += p.curve;
     };
-    if (lane < num_contacts) add(contact_at(rows[0], alpha));
     #pragma unroll 1
-    for (int c = lane + LANES; c < num_contacts; c += LANES) {
-        add(contact_at(LANES == 1 ? rows[c % READ] : read_contact(contact(c)), alpha));
+    for (int c = lane; c < num_contacts; c += LANES) {
+        Line& own = lines[LANES == 1 ? c % READ : 0];
+        Line line = own;
+        if (first || (LANES > 1 && c != lane)) line = read_contact(contact(c));
+        if (first && (LANES == 1 || c == lane)) own = line;
+        before += line.cost0;
+        add(contact_at(line, alpha));
     }
     #pragma unroll ALL
     for (int m = 0; m < MINE; ++m) {
         if (limit_d[m] > 0.0f) {
-            add(limit_at(limit_d[m], side[m] * qacc[m] - limit_aref[m], side[m] * search[m], alpha));
+            const float x = side[m] * qacc[m] - limit_aref[m];
+            if (x < 0.0f) before += 0.5f * limit_d[m] * x * x;
+            add(limit_at(limit_d[m], x, side[m] * search[m], alpha));
         }
         if (HAS_LOSSES && loss[m] > 0.0f) {
-            const float x = qacc[m] - loss_aref[m];
+            const float x = qacc[m] - loss_aref[m], cost = loss_at(loss_d[m], loss[m], x, 0.0f).cost;
+            before += cost;
+            sum.cost -= cost;
             add(loss_at(loss_d[m], loss[m], x + alpha * search[m], search[m]));
-            sum.cost -= loss_at(loss_d[m], loss[m], x, 0.0f).cost;
         }
     }
+    if (first) cost0 = total(before);
     return Point{
         total(sum.cost) + alpha * (alpha * gauss_curve + gauss_slope),
         total(sum.slope) + 2.0f * alpha * gauss_curve + gauss_slope,
         total(sum.curve) + 2.0f * gauss_curve
     };
-};
-auto cost_at_zero = [&]() {
-    float sum = 0.0f;
-    #pragma unroll 1
-    for (int c = lane; c < num_contacts; c += LANES) {
-        const Line row = read_contact(contact(c));
-        if (c == lane || LANES == 1) rows[LANES == 1 ? c : 0] = row;
-        sum += row.cost0;
-    }
-    #pragma unroll ALL
-    for (int m = 0; m < MINE; ++m) {
-        const float x = side[m] * qacc[m] - limit_aref[m];
-        if (x < 0.0f) sum += 0.5f * limit_d[m] * x * x;
-        if (HAS_LOSSES && loss[m] > 0.0f) sum += loss_at(loss_d[m], loss[m], qacc[m] - loss_aref[m], 0.0f).cost;
-    }
-    return total(sum);
 };
 // Newton steps from both ends of a bracket and its middle, until the slope is all but 0. False where the cap stopped it.
 auto search_line = [&](const Mine& mv, float search_dot, float scale, float& alpha, float& gained) {
@@ -395,18 +389,17 @@ auto search_line = [&](const Mine& mv, float search_dot, float scale, float& alp
     }
     gauss_slope = total(slope);
     gauss_curve = total(curve);
-    const float cost0 = cost_at_zero();
     const float flat = wp::max(least * ls_least * wp::sqrt(search_dot) / scale, 1e-6f);
     auto between = [](const Point& x, const Point& y) {
         return (x.slope < y.slope && y.slope < 0.0f) || (x.slope > y.slope && y.slope > 0.0f);
     };
     Point start, low, high, p0, p1;  // of a round: from the low end, from the high one, from the middle
     float low_alpha = 0.0f, high_alpha = 0.0f, at0 = 0.0f, at1 = 0.0f, at = 0.0f, accepted = 0.0f;
-    float best = 0.0f, best_alpha = 0.0f;
+    float best = 0.0f, best_alpha = 0.0f, cost0 = 0.0f;
     alpha = gained = 0.0f;
     #pragma unroll 1
     for (int round = -2, k = 0; round < problem.most_line_iterations;) {
-        Point p = line_at(at);
+        Point p = line_at(at, round == -2, cost0);
         if (round == -2) {
             const float size = wp::sqrt(2.0f * wp::max(cost0, 0.0f) * wp::max(p.curve - 2.0f * gauss_curve, 0.0f))
                 + wp::abs(gauss_slope);
