@@ -146,27 +146,42 @@ auto update_forces = [&]() {
     }
 };
 
-// Makes y the solution x of h x = y; of h each lane has its rows, which are spent: L D L^T, a column of all rows at a time.
+// Makes y the solution x of h x = y; of h each lane has its rows, which are spent: L D L^T, a column of all rows at a time. The
+// row that all need goes through shared memory, a number from each lane since h is symmetric.
 auto solve = [&](Rows& h, Mine& y) {
+    constexpr bool ONE = LANES == 1;  // which starts where there is work; loops of many must have bounds to be unrolled
     float inverse[MINE];
     #pragma unroll ALL
     for (int k = 0; k < NV; ++k) {
-        const float pivot = 1.0f / from(h[k / LANES][k], k % LANES), y_k = from(y[k / LANES], k % LANES);
+        float* row = part + k % 2 * LD;  // while slower lanes still read the former one
         #pragma unroll ALL
-        for (int m = LANES == 1 ? k : 0; m < MINE; ++m) {
+        for (int m = ONE ? k : 0; m < MINE; ++m) {
+            if (lane + m * LANES < NV) row[lane + m * LANES] = h[m][k];
+        }
+        sync();
+        const float pivot = 1.0f / row[k], y_k = from(y[k / LANES], k % LANES);
+        #pragma unroll ALL
+        for (int m = ONE ? k : 0; m < MINE; ++m) {
             const int i = lane + m * LANES;
             if (i == k) inverse[m] = pivot;
             const float below = i > k ? h[m][k] * pivot : 0.0f;
             y[m] -= below * y_k;
             #pragma unroll ALL
-            for (int j = k + 1; j < NV; ++j) h[m][j] -= below * from(h[k / LANES][j], k % LANES);
+            for (int j = ONE ? k / 4 * 4 : 0; j < NV; j += 4) {
+                if (j + 3 <= k) continue;
+                const Four four = *(const Four*)(row + j);
+                #pragma unroll
+                for (int n = 0; n < 4; ++n) {
+                    if (j + n > k && j + n < NV) h[m][j + n] -= below * four.of[n];
+                }
+            }
         }
     }
     #pragma unroll ALL
     for (int k = NV - 1; k >= 0; --k) {
         const float x = from(y[k / LANES] * inverse[k / LANES], k % LANES);
         #pragma unroll ALL
-        for (int m = 0; m < (LANES == 1 ? k + 1 : MINE); ++m) {
+        for (int m = 0; m < (ONE ? k + 1 : MINE); ++m) {
             const int i = lane + m * LANES;
             y[m] = i == k ? x : i < k ? y[m] - h[m][k] * x : y[m];
         }
