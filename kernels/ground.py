@@ -94,4 +94,3 @@ def make_ground(num_terrains: int, device: str) -> Ground:
     ground.friction = wp.ones((num_terrains, ROWS, COLS), dtype=float, device=device)
     ground.time_constant = wp.zeros((num_terrains, ROWS, COLS), dtype=float, device=device)
     return ground
-

@@ -1,4 +1,4 @@
-"""One robot's step: its contact problem is put together, solved and acted on by 32 threads of a GPU, or by one of a CPU.
+"""A robot's step: its contact problem is put together, solved and acted on by 32 threads of a GPU, or one of a CPU.
 
 mujoco_warp takes some ninety kernels a step for it, each over all robots, and hands rows of constraints, gradient,
 Hessian and search direction from one to the next through global memory. A walking robot has two contacts and mostly is

@@ -29,7 +29,7 @@ _CODES = {
 }
 
 
-def mix_surfaces(m: Any, geoms: NDArray[np.integer[Any]], ground: int) -> Surfaces:
+def mix_surfaces(m: Any, geoms: NDArray[Any], ground: int) -> Surfaces:
     """Surfaces of the solver's geoms ``geoms``, shape (num_shapes,), on that of the ground, as MuJoCo mixes two geoms.
 
     It is what mujoco_warp's ``contact_params`` makes of a pair.
@@ -192,7 +192,7 @@ _OF_PROBLEM = {
     "frictionloss": "dof_frictionloss", "body_root": "body_rootid", "body_weight": "body_invweight0",
     "is_ancestor": "body_isdofancestor", "inertia_row": "M_hinit_i", "inertia_col": "M_colind",
 }  # fmt: skip
-"""Arrays of mujoco_warp's model by their names in :class:`kernels.dynamics.Tree` and :class:`kernels.solver.Problem`."""
+"""Arrays of mujoco_warp's model by their names in :class:`Tree` and :class:`Problem`."""
 _NOT_OVER_WORLDS = ("body_isdofancestor", "actuator_forcerange")
 """Of arrays with several dimensions: what a drive writes anew in each step may come to differ."""
 
@@ -221,7 +221,7 @@ class TheirDynamics:
         ask_forces(self._theirs, self._contacts)
 
 
-def dynamics_of(m: Any, d: Any, contacts: Contacts, geoms: NDArray[np.integer[Any]], ground: int) -> Any:
+def dynamics_of(m: Any, d: Any, contacts: Contacts, geoms: NDArray[Any], ground: int) -> Any:
     """:class:`Dynamics` where the model lets it, else :class:`TheirDynamics`.
 
     ``geoms`` are the solver's of a robot's shapes, (num_shapes,), the same in all worlds, and that of the ground.

@@ -303,7 +303,11 @@ def test_every_quantity_of_a_step(device):
                 expected[name] = getattr(d, name).numpy().copy()
             com = d.subtree_com.numpy()[:, roots].copy()
             force, of_joint = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
-            limits = np.isin(force[:, 0], (-4.0, 5.0)), np.isin(of_joint, (-3.0, 2.0)), np.isclose(abs(force[:, 1]), 0.5)
+            limits = (
+                np.isin(force[:, 0], (-4.0, 5.0)),
+                np.isin(of_joint, (-3.0, 2.0)),
+                np.isclose(abs(force[:, 1]), 0.5),
+            )
             limited += np.sum(limits, axis=1)
 
             def find_ours(expected=expected, com=com):
