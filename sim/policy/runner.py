@@ -93,7 +93,9 @@ class Recurrent(torch.nn.Module):
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""
         state = self._state_of(len(rows))
-        action, after = self.step(with_rows_of_zeros(rows), state)
+        # cuDNN's recurrent kernels are made for sequences: a step of many robots takes them far longer than products.
+        with torch.backends.cudnn.flags(enabled=False):
+            action, after = self.step(with_rows_of_zeros(rows), state)
         for old, new in zip(state, after, strict=True):
             old.copy_(new)
         return action[: len(rows)]
