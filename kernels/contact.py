@@ -157,10 +157,13 @@ def _collide_strips_kernel(
     terrain: Terrain,
     probes: Probes,
     ground: Ground,
+    parked: wp.array[int],
     contacts_out: Contacts,
 ):
     """Grid (num_bundles, num_envs): the threads of a warp look at the same part of different robots."""
     bundle, env = wp.tid()
+    if parked[env] == 2:
+        return
     t = terrain_of_env[env]
     pose = body_q[env, probes.bundle_body[bundle]]
     ball = probes.bundle_ball[bundle]
@@ -174,18 +177,19 @@ def _collide_strips_kernel(
 
 
 def collide_strips(
-    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, contacts_out: Contacts
-) -> None:
+    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any,
+    contacts_out: Contacts,
+) -> None:  # fmt: skip
     """Find every robot's terrain contacts, all of ``contacts_out`` but the forces.
 
     ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
-    the same everywhere.
+    the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
     num_envs, device = body_q.shape[0], body_q.device
     if terrain_of_env.shape[0] != num_envs:
         raise ValueError(f"body_q must hold {terrain_of_env.shape[0]} robots, one a terrain_of_env, got {num_envs}")
     contacts_out.count.zero_()
-    inputs, size = [body_q, terrain_of_env, terrain, probes, ground], (probes.bundle_body.shape[0], num_envs)
+    inputs, size = [body_q, terrain_of_env, terrain, probes, ground, parked], (probes.bundle_body.shape[0], num_envs)
     wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=device)
 
 

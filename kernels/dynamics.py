@@ -79,6 +79,8 @@ class Tree:
 class Robots:
     """State of every world; from ``xpos`` on, what is found."""
 
+    parked: wp.array[int]
+    """Where it is 2 nothing is done."""
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
     control: wp.array2d[float]

@@ -259,11 +259,14 @@ def _park_ended_kernel(
     joint_q_out: wp.array2d[float],
     joint_qd_out: wp.array2d[float],
     targets_out: wp.array2d[float],
+    parked_out: wp.array[int],
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
     if outcome[env] == Outcome.RUNNING:
+        parked_out[env] = 0
         return
+    parked_out[env] = wp.min(parked_out[env] + 1, 2)
     for k in range(joint_qd_out.shape[1]):
         joint_qd_out[env, k] = 0.0
     for k in range(6):
@@ -275,12 +278,14 @@ def _park_ended_kernel(
         targets_out[env, 7 + j] = default_joint_pos[j]
 
 
-def park_ended(outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any) -> None:
+def park_ended(
+    outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any, parked_out: Any
+) -> None:
     """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
 
-    They would otherwise cost as much as the others, and more on their backs. Call it every control step: in between,
-    they fall by millimetres.
+    ``parked_out`` (num_envs,) says for how many control steps they have been there, 2 for more. From then on the
+    physics leaves them out. Call it every control step.
     """
     inputs = [outcome, default_joint_pos]
-    outputs = [joint_q_out, joint_qd_out, targets_out]
+    outputs = [joint_q_out, joint_qd_out, targets_out, parked_out]
     wp.launch(_park_ended_kernel, outcome.shape[0], inputs, outputs=outputs, device=outcome.device)

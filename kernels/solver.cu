@@ -1,3 +1,4 @@
+if (problem.parked.data[world] == 2) return;
 struct Point { float cost, slope, curve; };
 struct Spring { float stiffness, damping, impedance; };
 constexpr int NV = $dofs, DIM = $dimensions, MOST = $contacts, KEPT = $kept, LD = $stride, CHUNK = $chunk;

@@ -71,6 +71,8 @@ class Problem:
     """What a dof's force loses per speed of that dof."""
     cdof: wp.array2d[wp.spatial_vector]
     subtree_com: wp.array2d[wp.vec3]
+    parked: wp.array[int]
+    """Where it is 2 nothing is done."""
     contacts: Contacts
     others: wp.array2d[float]
     """Room for the contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.other_words`)."""

@@ -212,7 +212,9 @@ class Rollout:
     def _launch_control_step(self) -> None:
         sim, robot = self.sim, self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
-        park_ended(self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets)
+        park_ended(
+            self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
+        )
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()

@@ -34,6 +34,7 @@ class Simulation:
         joint_torque: Actuator torques of the last step [N m] in columns 6 and up, shape (num_envs, 6 + num_joints).
         overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
         contacts: Terrain contacts of the last step.
+        parked: 2 for robots that steps leave out, shape (num_envs,).
         body_q: Body poses at the beginning of the last step, or of the last :meth:`refresh`, world-local frame,
             transforms of shape (num_envs, bodies_per_env).
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
@@ -147,6 +148,7 @@ class Simulation:
         self.geom_of_shape = geom_of_shape[first : first + builder.shape_count]
         self.probes = make_probes(builder)
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
+        self.parked = wp.zeros(self.num_envs, dtype=int)
         # A mesh of several parts is several shapes of one name.
         names = self.robot.geom_names
         columns = [names.index(name) if name in names else -1 for name in builder.shape_label]
@@ -154,7 +156,7 @@ class Simulation:
         self.geom_role = wp.array([self.robot.role_of(name) for name in names], dtype=int)
         ground = int(geom_of_shape[np.flatnonzero(shape_body < 0)[0]])
         model, data = self.solver.mjw_model, self.solver.mjw_data
-        self._dynamics = dynamics_of(model, data, self.contacts, self.geom_of_shape, ground)
+        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, ground)
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
@@ -227,7 +229,9 @@ class Simulation:
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
         ground = self.bank.ground or Ground()
-        collide_strips(self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, ground, self.contacts)
+        collide_strips(
+            self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, ground, self.parked, self.contacts
+        )
 
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
@@ -255,14 +259,17 @@ class Simulation:
     def clear_solver(self, mask: Any) -> None:
         """Forget warm start, Jacobian and former targets in the environments where ``mask`` (num_envs,) is not 0.
 
+        None of them is parked any more.
+
         The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not
         finite would stay so, whatever state it is reset to.
         """
         data = self.solver.mjw_data
         clear_rows(mask, data.qacc_warmstart)
         clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
-        if self._delay is not None:
-            clear_rows(mask, self._delay.age.view(float))  # whose 0 has the same bits
+        ages = [self.parked.reshape((-1, 1))] + [self._delay.age] * (self._delay is not None)
+        for age in ages:
+            clear_rows(mask, age.view(float))  # whose 0 has the same bits
 
     def capture(self, launch_all: Callable[[], None]) -> Any:
         """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.

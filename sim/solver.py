@@ -131,8 +131,8 @@ class Dynamics:
     in all worlds alike, or were not the same in all; its arrays may not be replaced.
     """
 
-    def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces) -> None:
-        """For a model that :func:`fits`, and its contacts, whose forces are written."""
+    def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, parked: Any) -> None:
+        """For a model that :func:`fits`, and its contacts, whose forces are written; some worlds may be parked."""
         self._tree_sizes, self._sizes, self.surfaces = tree_sizes_of(m), sizes_of(m, contacts), surfaces
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
@@ -162,6 +162,7 @@ class Dynamics:
             setattr(problem, name, getattr(d, name))
         robots.control, robots.inertia, problem.inertia = d.ctrl, d.M, d.M
         problem.contacts, problem.surfaces = contacts, surfaces
+        problem.parked = robots.parked = parked
         problem.num_rows, problem.iterations = d.nefc, d.solver_niter
 
     def find(self) -> None:
@@ -221,12 +222,13 @@ class TheirDynamics:
         ask_forces(self._theirs, self._contacts)
 
 
-def dynamics_of(m: Any, d: Any, contacts: Contacts, geoms: NDArray[Any], ground: int) -> Any:
+def dynamics_of(m: Any, d: Any, contacts: Contacts, parked: Any, geoms: NDArray[Any], ground: int) -> Any:
     """:class:`Dynamics` where the model lets it, else :class:`TheirDynamics`.
 
-    ``geoms`` are the solver's of a robot's shapes, (num_shapes,), the same in all worlds, and that of the ground.
+    Worlds where ``parked``, int (num_worlds,), is 2 may be left out. ``geoms`` are the solver's of a robot's shapes,
+    (num_shapes,), the same in all worlds, and ``ground`` is that of the ground.
     """
     surfaces = mix_surfaces(m, geoms, ground)
     if fits(m, contacts):
-        return Dynamics(m, d, contacts, surfaces)
+        return Dynamics(m, d, contacts, surfaces, parked)
     return TheirDynamics(m, d, contacts, surfaces, ground)

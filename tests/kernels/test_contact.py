@@ -36,7 +36,7 @@ def make_probes(strips, spread=0.0, bundled=False):
     )  # fmt: skip
 
 
-def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundled=False):
+def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundled=False, parked=0):
     """Contacts of all robots as a dict of arrays, with ``env``, the probe's ``centre`` in its body, and ``touched``.
 
     The latter is on the ground. ``count`` is by robot; ``buffer`` has all.
@@ -46,7 +46,8 @@ def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundl
     buffer.count.fill_(5)  # of another step
     buffer.shape.fill_(UNTOUCHED)
     world, on = wp.array(poses, dtype=wp.transform), wp.array(terrain_of_env, dtype=int)
-    collide_strips(world, on, make_terrain(grids), make_probes(strips, spread, bundled), ground or Ground(), buffer)
+    parked, probes = wp.array(np.full(len(poses), parked), dtype=int), make_probes(strips, spread, bundled)
+    collide_strips(world, on, make_terrain(grids), probes, ground or Ground(), parked, buffer)
     count, room = buffer.count.numpy(), buffer.shape.shape[1]
     env, slot = np.nonzero(np.arange(room) < count[:, None])
     names = [name for name in Contacts.vars if name not in ("count", "force")]
@@ -156,15 +157,20 @@ def test_contacts_past_the_capacity_are_counted_but_not_written():
     buffer.shape.fill_(UNTOUCHED)
     world, on = wp.array(np.float32(poses), dtype=wp.transform), wp.zeros(2, dtype=int)
     flat = make_terrain(np.zeros((1, 161, 321)))
-    collide_strips(world, on, flat, make_probes([(np.zeros(3), 0.1)] * 3), Ground(), buffer)
+    probes, nobody = make_probes([(np.zeros(3), 0.1)] * 3), wp.zeros(2, dtype=int)
+    collide_strips(world, on, flat, probes, Ground(), nobody, buffer)
     shapes = buffer.shape.numpy()
     assert buffer.count.numpy().tolist() == [3, 1, 0]
     assert len(set(shapes[0])) == 2 and (shapes[0] >= 0).all()
     assert shapes[1:].tolist() == [[0, UNTOUCHED], [UNTOUCHED] * 2]
 
 
-def test_a_state_that_is_not_finite_touches_nothing():
+def test_a_state_that_is_not_finite_touches_nothing_nor_does_a_parked_robot():
     strip, flat = [(np.zeros(3), 0.1)], np.zeros((1, 161, 321))
+    low = np.tile([5, 4, 0.05, 0, 0, 0, 1], (2, 1))
+    for parked in range(3):
+        found = collide(low, np.zeros(2, int), flat, strip, parked=parked)
+        assert found["count"].tolist() == [int(parked < 2)] * 2
     assert not collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"].any()
     with pytest.raises(ValueError, match="body_q"):
         collide(np.zeros((3, 7)), np.zeros(4, int), flat, strip)

@@ -88,7 +88,9 @@ def build(xml, device, **parts):
 def ours_of(m, d, contacts):
     """Our dynamics of it, or theirs by our road, and whether it is the former."""
     m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
-    found = dynamics_of(m, d, contacts, 1 + np.arange(m.ngeom - 1), 0)
+    found = dynamics_of(
+        m, d, contacts, wp.zeros(WORLDS, dtype=int, device=d.qpos.device), 1 + np.arange(m.ngeom - 1), 0
+    )
     m.opt.run_collision_detection = True
     return found
 
