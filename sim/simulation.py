@@ -18,7 +18,7 @@ from sim.robots.compiled import robot_spec
 from sim.robots.model import builder_of
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.solver import dynamics_of
+from sim.solver import TheirDynamics, dynamics_of
 
 
 class Simulation:
@@ -257,19 +257,16 @@ class Simulation:
         sum_forces(self.contacts, self.column_of_shape, self.geom_force)
 
     def clear_solver(self, mask: Any) -> None:
-        """Forget warm start, Jacobian and former targets in the environments where ``mask`` (num_envs,) is not 0.
-
-        None of them is parked any more.
-
-        The solver multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not
-        finite would stay so, whatever state it is reset to.
-        """
+        """Forget warm start, former targets and parking in the environments where ``mask`` (num_envs,) is not 0."""
         data = self.solver.mjw_data
         clear_rows(mask, data.qacc_warmstart)
-        clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
-        ages = [self.parked.reshape((-1, 1))] + [self._delay.age] * (self._delay is not None)
-        for age in ages:
-            clear_rows(mask, age.view(float))  # whose 0 has the same bits
+        clear_rows(mask, self.parked.reshape((-1, 1)).view(float))  # whose 0 has the same bits
+        if self._delay is not None:
+            clear_rows(mask, self._delay.age.view(float))
+        if isinstance(self._dynamics, TheirDynamics):
+            # It multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not finite
+            # would stay so, whatever state it is reset to.
+            clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
 
     def capture(self, launch_all: Callable[[], None]) -> Any:
         """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.
