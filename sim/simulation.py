@@ -264,7 +264,7 @@ class Simulation:
         if self._delay is not None:
             clear_rows(mask, self._delay.age.view(float))
         if isinstance(self._dynamics, TheirDynamics):
-            # It multiplies whole tiles of the constraint Jacobian, unused rows by zero. A world that was once not finite
+            # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not finite
             # would stay so, whatever state it is reset to.
             clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
 
