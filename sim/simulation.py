@@ -264,8 +264,8 @@ class Simulation:
         if self._delay is not None:
             clear_rows(mask, self._delay.age.view(float))
         if isinstance(self._dynamics, TheirDynamics):
-            # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not finite
-            # would stay so, whatever state it is reset to.
+            # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not
+            # finite would stay so, whatever state it is reset to.
             clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))
 
     def capture(self, launch_all: Callable[[], None]) -> Any:
