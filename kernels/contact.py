@@ -44,7 +44,7 @@ class Contacts:
     """Terrain contacts of every robot, shape (num_envs, capacity) each."""
 
     count: wp.array[int]
-    """Of each robot, shape (num_envs,): it runs on past the capacity, the rest does not."""
+    """Of each robot, shape (num_envs,): of those beyond the capacity nothing else is kept."""
     shape: wp.array2d[int]
     """Collision shape, counted within one robot."""
     point: wp.array2d[wp.vec3]

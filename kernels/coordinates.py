@@ -219,7 +219,7 @@ def _tell_contacts_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: So
     factor = contacts.friction[env, c]
     friction[0] *= factor
     friction[1] *= factor
-    if contacts.time_constant[env, c] > solref[0] and solref[0] > 0.0:
+    if contacts.time_constant[env, c] > wp.max(solref[0], 0.0):
         solref = wp.vec2(contacts.time_constant[env, c], 1.0)
         solimp[0] = solimp[1]
     solver_out.slot[env, c] = slot

@@ -570,7 +570,7 @@ for (int c = lane; c < num_contacts; c += LANES) {
     const Vec5& friction = of_model(problem.surfaces.friction, shape);
     const float factor = wp::index(problem.contacts.friction, world, c);
     const float soft = wp::index(problem.contacts.time_constant, world, c);
-    if (soft > solref[0] && solref[0] > 0.0f) {  // of constant impedance
+    if (soft > wp::max(solref[0], 0.0f)) {  // of constant impedance
         solref = Vec2(soft, 1.0f);
         solimp[0] = solimp[1];
     }

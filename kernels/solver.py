@@ -9,7 +9,7 @@ Constraints, algorithm, tests of convergence and line search are those of MuJoCo
 analytically-invertible dynamics with contacts and constraints", ICRA 2014; primal form, elliptic cones), so that steps
 agree to rounding. Only the Hessian of a contact on the side of its cone is put together in another way: its C is
 positive semidefinite, so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu,
-``find_direction``).
+``add_contacts``).
 """
 
 from dataclasses import asdict, dataclass

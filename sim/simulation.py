@@ -1,4 +1,4 @@
-"""Parallel robots on height grids: one world each, terrain contact of our own, Newton's MuJoCo solver."""
+"""Parallel robots on height grids, one world each: Newton's MuJoCo model, terrain contact and steps of our own."""
 
 from collections.abc import Callable
 from typing import Any
@@ -236,8 +236,8 @@ class Simulation:
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
 
-        It is Newton's step without what these robots do not need: forces from outside (``body_f``, ``joint_f``),
-        targets of velocities, and poses of bodies after the step, which the next one finds again.
+        It leaves out what these robots do not need: forces from outside (``body_f``, ``joint_f``), targets of
+        velocities, and poses of bodies after the step, which the next one finds again.
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():

@@ -89,7 +89,7 @@ def fits(m: Any, contacts: Contacts) -> bool:
         m.opt.run_collision_detection or m.flg_surfacevel or any(vars(m.callback).values()) or m.nsensor,
         m.opt.integrator != types.IntegratorType.IMPLICITFAST or m.opt.disableflags & needed,
         m.opt.solver != types.SolverType.NEWTON or m.opt.cone != types.ConeType.ELLIPTIC,
-        m.opt.enableflags or m.is_sparse or m.opt.noslip_iterations or not m.opt.iterations or not m.nv,
+        m.opt.enableflags or m.opt.noslip_iterations or not m.opt.iterations or not m.nv,
         m.neq or m.ntendon or m.nflex or m.nmocap or m.nhistory or m.has_fluid or m.flg_adhesion,
         m.body_gravcomp.numpy().any() or m.body_freeadr.size,
         (joints == types.JointType.BALL).any() or (np.bincount(bodies, minlength=1)[bodies[free]] != 1).any(),

@@ -208,7 +208,7 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     model.geom_friction[geoms, 0] *= [patch.friction for patch in patches]
     model.geom_solref[geoms], model.geom_solimp[geoms] = model.geom_solref[first], model.geom_solimp[first]
     time_constant = np.array([patch.time_constant_s for patch in patches])
-    soft = time_constant > model.geom_solref[first, 0]
+    soft = time_constant > max(model.geom_solref[first, 0], 0.0)
     impedance = model.geom_solimp[first, 1]
     model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
     model.geom_solimp[geoms[soft]] = impedance, impedance, 0.001, 1.0, 0.5

@@ -105,10 +105,10 @@ def theirs():
 
 
 def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
-    # Shape 0 is firmer than all ground, but 0.02 s is not exceeded by 0.015 s: softer ground alone counts.
+    # Shape 0 has stiffness and damping, on firm ground too; 0.02 s is not exceeded by 0.015 s: softer ground counts.
     surfaces = filled(
         Surfaces, geom=[4, 7], body=[1, 2], condim=[3, 4], friction=[[[0.8, 0.8, 0.1, 0.2, 0.2]] * 2],
-        solref=[[[0.01, 1.5], [0.02, 1.5]]], solimp=[[[0.7, 0.9, 0.1, 0.5, 2.0]] * 2],
+        solref=[[[-500, -30], [0.02, 1.5]]], solimp=[[[0.7, 0.9, 0.1, 0.5, 2.0]] * 2],
     )  # fmt: skip
     tell_contacts(contacts, surfaces, theirs)
     found = {name: getattr(theirs, name).numpy() for name in SolverContacts.vars if name not in ("too_many", "ground")}
@@ -119,7 +119,7 @@ def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
         "worldid": [0, 1, 1], "geom": [[GROUND, 7], [GROUND, 4], [GROUND, 7]], "dist": [-0.01, -0.02, -0.03],
         "pos": [[1, 2, 3], [4, 5, 6], [7, 8, 9]], "dim": [4, 3, 4], "efc_address": [[-1] * 4] * 3,
         "friction": [[factor * 0.8, factor * 0.8, 0.1, 0.2, 0.2] for factor in (0.5, 1, 0.25)],
-        "solref": [[0.03, 1.0], [0.01, 1.5], [0.02, 1.5]],
+        "solref": [[0.03, 1.0], [-500, -30], [0.02, 1.5]],
         "solimp": [[0.9, 0.9, 0.1, 0.5, 2.0]] + [[0.7, 0.9, 0.1, 0.5, 2.0]] * 2,
     }  # fmt: skip
     for name, values in expected.items():

@@ -10,6 +10,7 @@ import warp as wp
 
 from kernels import solver
 from kernels.contact import make_contacts
+from kernels.ground import FIRM, make_ground
 from sim.solver import Dynamics, TheirDynamics, dynamics_of
 from tests.sim.scenes import put, standing
 
@@ -20,8 +21,9 @@ EVERYTHING = """
 <mujoco>
   <compiler angle="radian"/>
   <option cone="elliptic" iterations="30" ls_iterations="20" timestep="0.004" integrator="implicitfast" impratio="2"/>
+  <default><geom contype="1" conaffinity="0"/></default>
   <worldbody>
-    <geom type="plane" size="3 3 .1" condim="1" friction=".6 .02 .01" solmix="2"/>
+    <geom type="plane" size="3 3 .1" contype="0" conaffinity="1" condim="1" friction=".6 .02 .01" solmix="2"/>
     <body pos="0 0 .21"><freejoint/>
       <geom type="box" size=".2 .1 .1" condim="3" friction=".6 .02 .01" solref=".03 .8"/>
       <body pos=".25 0 0"><joint name="left" axis="0 1 0" frictionloss=".4" range="-.3 .3" limited="true" margin=".01"/>
@@ -30,11 +32,16 @@ EVERYTHING = """
       <body pos="-.25 0 0"><joint name="right" axis="0 1 0" frictionloss=".2" damping=".1"/>
         <geom type="sphere" size=".08" pos="-.1 0 -.1" condim="6" friction=".9 .05 .02" solref="-900 -30"/></body>
       <body pos="0 .3 .1"><joint name="third" axis="1 0 0"/>
-        <geom type="sphere" size=".05" condim="1" priority="1" solimp=".7 .7 .01 .5 1"/></body>
+        <geom type="sphere" size=".05" condim="1" priority="1" solimp=".7 .7 .01 .5 1"/></body>{inner}
     </body>
   </worldbody>
   <actuator><motor joint="third"/></actuator>
 </mujoco>
+"""
+# 31 of them make it one of 40 dofs, more than a warp has threads.
+ARM = """
+<body euler="0 0 {0}"><joint axis="0 1 0" range="-.1 .2" limited="true" frictionloss=".1" damping=".1" armature=".01"/>
+  <geom type="sphere" size=".03" pos=".3 0 .1" mass=".1" contype="{1}"/></body>
 """
 # A robot of several joints a body, an arm fixed to the world and a post that cannot move: what no shipped robot has.
 MODEL = """
@@ -170,20 +177,22 @@ def assert_steps_alike(m, d, contacts, ours, relative=2e-3, find=None):
     return iterations
 
 
-def everything(device):
-    m, d, contacts = build(EVERYTHING, device)
+def everything(device, arms=0):
+    arm = "".join(ARM.format(k, k % 2) for k in range(arms))
+    m, d, contacts = build(EVERYTHING, device, inner=arm)
     rng = np.random.default_rng(5)
     qpos = d.qpos.numpy()
     qpos[:, 2] += rng.uniform(-0.05, 0.05, WORLDS)
-    qpos[:, 3:] += rng.normal(0.0, 0.2, (WORLDS, 7))
+    qpos[:, 3:] += rng.normal(0.0, 0.2, (WORLDS, 7 + arms))
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     d.qpos.assign(qpos)
     d.qvel.assign(rng.normal(0.0, 1.0, d.qvel.shape))
     return m, d, contacts
 
 
-def test_every_kind_of_constraint(device):
-    m, d, contacts = everything(device)
+@pytest.mark.parametrize("arms", [0, 31])
+def test_every_kind_of_constraint(device, arms):
+    m, d, contacts = everything(device, arms)
     ours = ours_of(m, d, contacts)
     assert isinstance(ours, Dynamics)
     kinds, states, dims = set(), set(), set()
@@ -226,15 +235,22 @@ def test_contacts_beyond_shared_memory(device, monkeypatch):
         np.testing.assert_array_equal(kept, others)
 
 
-def test_robots_that_fall(eight):
-    """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's."""
+def test_robots_that_fall(eight, monkeypatch):
+    """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's.
+
+    The ground is slippery and soft in places.
+    """
+    ground, rng = make_ground(8, eight.device), np.random.default_rng(2)
+    ground.friction.assign(np.float32(rng.uniform(0.2, 1.0, ground.friction.shape)))
+    ground.time_constant.assign(np.float32(rng.choice([FIRM, 0.02, 0.06], ground.friction.shape)))
+    monkeypatch.setattr(eight.bank, "ground", ground)
     m, d = eight.solver.mjw_model, eight.solver.mjw_data
     ours = eight._dynamics
     assert isinstance(ours, Dynamics)
     theirs = TheirDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
     states, iterations = set(), []
     q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
-    put(eight, q, np.random.default_rng(2).normal(0.0, 0.7, eight.joint_qd.shape))
+    put(eight, q, rng.normal(0.0, 0.7, eight.joint_qd.shape))
     with wp.ScopedDevice(eight.device):
         eight.physics_step()
         for _ in range(120):
