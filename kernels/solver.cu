@@ -493,7 +493,7 @@ for (int m = lane; m < $inertia; m += LANES) {
     const int i = problem.inertia_row.data[m], j = problem.inertia_col.data[m];
     inertia[i * LD + j] = inertia[j * LD + i] = wp::index(problem.inertia, world, m);
 }
-float num_rows = 0.0f, trace = 0.0f, speed[MINE];
+float trace = 0.0f, speed[MINE];
 sync();
 #pragma unroll ALL
 for (int m = 0; m < MINE; ++m) {
@@ -517,7 +517,6 @@ for (int m = 0; m < MINE; ++m) {
             side[m] = low < high ? 1.0f : -1.0f;
             limit_d[m] = stiffness_of(weight, s.impedance);
             limit_aref[m] = -s.stiffness * s.impedance * beyond - s.damping * side[m] * speed[m];
-            num_rows += 1.0f;
         }
     }
     if (HAS_LOSSES && of_model(problem.frictionloss, i) > 0.0f) {
@@ -525,10 +524,8 @@ for (int m = 0; m < MINE; ++m) {
         loss[m] = of_model(problem.frictionloss, i);
         loss_d[m] = stiffness_of(weight, s.impedance);
         loss_aref[m] = -s.damping * speed[m];
-        num_rows += 1.0f;
     }
 }
-num_rows = total(num_rows);
 const float scale = 1.0f / wp::max(MINVAL, total(trace));
 #pragma unroll 1
 for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads a contact, all look at all
@@ -723,7 +720,6 @@ for (int j = lane; j < problem.joint_type.shape[0]; j += LANES) {
     for (int i = 0; i < 4; ++i) q[3 + i] = turned[i] / now;
 }
 if (lane == 0) {
-    problem.num_rows.data[world] = (int)num_rows + DIM * num_contacts;
     problem.iterations.data[world] = iteration;
     problem.overflow.data[world] = bits;
 }

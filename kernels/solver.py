@@ -79,7 +79,6 @@ class Problem:
     qacc_warmstart: wp.array2d[float]
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
-    num_rows: wp.array[int]
     iterations: wp.array[int]
     overflow: wp.array[int]
 
@@ -153,8 +152,8 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
 def step_robots(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
     """Moves every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
-    It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of rows, that of
-    iterations, and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are
+    It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of iterations,
+    and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are
     MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and the
     least divisor.
     """

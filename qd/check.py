@@ -28,7 +28,7 @@ from sim.terrain import NUM_COLS, NUM_ROWS
 
 _WALKS = 8  # episodes on flat ground in each simulator
 _APART = 0.05  # share by which speeds may differ
-_MOST_ROWS = 2_000  # a robot that needs more constraint rows is refused
+_MOST_CONTACTS = 1_000  # a robot that has more is refused
 _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
 
 
@@ -64,7 +64,7 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
 
 
 def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
-    """A user's robot with room in its buffers and the scales of its penalties.
+    """A user's robot with room for its contacts and the scales of its penalties.
 
     What is missing is measured with the controller of its first use, and written beside it. Scales of the robot before
     it changed are missing, too.
@@ -84,26 +84,25 @@ def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCf
 
 
 def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, Standing]:
-    """The robot with buffers in which the dropped ones fit, written into its settings where these are data."""
+    """The robot with room for the contacts of the dropped ones, written into its settings where these are data."""
     wanted = robot
     while (standing := stand(wanted, device=device, seconds=seconds)).overflowed:
-        if wanted.njmax >= _MOST_ROWS:
+        if wanted.nconmax >= _MOST_CONTACTS:
             raise ValueError(
-                f"robot '{robot.name}' needs more than {wanted.njmax} constraint rows, got no state without an "
-                "overflow: let fewer of its geoms touch the ground"
+                f"robot '{robot.name}' has more than {wanted.nconmax} contacts, expected fewer: let fewer of its geoms "
+                "touch the ground"
             )
-        wanted = replace(wanted, njmax=2 * wanted.njmax, nconmax=2 * wanted.nconmax)
+        wanted = replace(wanted, nconmax=2 * wanted.nconmax)
     if wanted == robot:
         return robot, standing
-    rows, contacts = 20 * -(-standing.rows // 16), max(robot.nconmax, int(np.ceil(1.5 * standing.contacts)))
-    wanted = replace(robot, njmax=max(robot.njmax, rows), nconmax=contacts)
-    print(f"Its buffers were too small: it needs njmax = {wanted.njmax} and nconmax = {wanted.nconmax}", end="")
+    wanted = replace(robot, nconmax=max(robot.nconmax, int(np.ceil(1.5 * standing.contacts))))
+    print(f"It had too little room for contacts: it needs nconmax = {wanted.nconmax}", end="")
     file = robot.settings_file
     if file is None or file.suffix != ".toml":
-        print(": write them into its settings.", flush=True)
+        print(": write it into its settings.", flush=True)
         return wanted, standing
-    text = re.sub(r"^(njmax|nconmax)\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
-    write_atomically(file, f"njmax = {wanted.njmax}\nnconmax = {wanted.nconmax}\n{text}".encode())
+    text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
+    write_atomically(file, f"nconmax = {wanted.nconmax}\n{text}".encode())
     print(f", as {file} says now.", flush=True)
     return wanted, standing
 

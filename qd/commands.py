@@ -234,9 +234,9 @@ class Check(ControllerFlags, WorkerFlags):
     """Look at a robot and its controller before anything is searched or trained.
 
     It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
-    contacts and constraint rows it needs when it lies on rough ground; whether it walks on flat ground, here and in
-    MuJoCo C; at which height of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1
-    if something must be mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
+    contacts it has when it lies on rough ground; whether it walks on flat ground, here and in MuJoCo C; at which height
+    of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1 if something must be
+    mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
     """
 
     anyway: bool = False

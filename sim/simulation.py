@@ -78,7 +78,7 @@ class Simulation:
             self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
             self._build_model(builder)
             self._randomise_model(friction, added_base_mass)
-            self._build_solver(cfg or SolverCfg(), impratio=float(of_file.opt.impratio))
+            self._build_solver(cfg or SolverCfg(), of_file)
             self._build_contact(builder)
             self._build_views()
 
@@ -113,12 +113,13 @@ class Simulation:
             model.body_mass.assign(mass)
             model.body_inv_mass.assign(1.0 / mass)
 
-    def _build_solver(self, cfg: SolverCfg, *, impratio: float) -> None:
+    def _build_solver(self, cfg: SolverCfg, of_file: Any) -> None:
+        impratio, dims = float(of_file.opt.impratio), int(of_file.geom_condim.max(initial=3))
         # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
-            njmax=self.robot.njmax,
+            njmax=of_file.neq + 2 * of_file.nv + dims * self.robot.nconmax,  # a limit and friction of every joint
             nconmax=self.robot.nconmax,
             iterations=cfg.iterations * (1 if impratio == 1.0 else 2),  # at 100, 8 are as good as any number
             ls_iterations=cfg.ls_iterations,

@@ -163,7 +163,7 @@ class Dynamics:
         robots.control, robots.inertia, problem.inertia = d.ctrl, d.M, d.M
         problem.contacts, problem.surfaces = contacts, surfaces
         problem.parked = robots.parked = parked
-        problem.num_rows, problem.iterations = d.nefc, d.solver_niter
+        problem.iterations = d.solver_niter
 
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""

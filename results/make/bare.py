@@ -158,7 +158,8 @@ def standing_rates(rollout: Rollout) -> dict[str, float] | None:
     start.ctrl[:] = np.array(robot.default_joint_pos)[model.actuator_trnid[:, 0] - 1]
     with wp.ScopedDevice(device):
         on_device = mujoco_warp.put_model(model)
-        data = mujoco_warp.put_data(model, start, nworld=sim.num_envs, njmax=robot.njmax, nconmax=robot.nconmax)
+        room = {"njmax": sim.solver.mjw_data.njmax, "nconmax": robot.nconmax}
+        data = mujoco_warp.put_data(model, start, nworld=sim.num_envs, **room)
         data.qpos.assign(sim.joint_q.numpy()[:, [0, 1, 2, 6, 3, 4, 5, *range(7, 7 + robot.num_joints)]])
 
         def control_step() -> None:

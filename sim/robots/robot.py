@@ -66,7 +66,7 @@ class RobotCfg:
     nconmax: PositiveInt = 40
     """Most contacts of a robot with the ground."""
     njmax: PositiveInt = 100
-    """Most constraint rows of a robot that takes mujoco_warp's own step, such as one with joints that follow others."""
+    """Has no effect: constraint rows have the room that so many contacts need. It stays for the hashes that have it."""
     stiffness: tuple[PositiveFloat, ...] | None = None
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
     damping: tuple[NonNegativeFloat, ...] | None = None

@@ -52,10 +52,8 @@ class Standing:
     """How much the forces on its feet change from one physics step to the next in that time, in weights."""
     contacts: int
     """Most contacts of a robot."""
-    rows: int
-    """Most constraint rows of a robot."""
     overflowed: bool
-    """Whether a buffer of the solver was too small, at any time."""
+    """Whether there was too little room for contacts, at any time."""
     finite: bool
     """Whether all states are numbers at the end."""
 
@@ -85,7 +83,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         reach + _ground(heights[k], x, y) for k, (x, y) in zip(1 + np.arange(drops) % _TERRAINS, q[1:, :2], strict=True)
     ]
     sim.joint_q.assign(q)
-    contacts, rows, overflowed, forces = _let_fall(sim, seconds)
+    contacts, overflowed, forces = _let_fall(sim, seconds)
     first = sim.joint_q.numpy()[0].astype(np.float64)
     weight = float(sim.model.body_mass.numpy()[: sim.body_q.shape[1]].sum()) * _GRAVITY
     up = 1.0 - 2.0 * (first[3] ** 2 + first[4] ** 2)
@@ -98,7 +96,6 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         carried={name: float(share) for name, share in carried if share > 1e-3},
         restless=float(np.abs(np.diff(on_feet, axis=0)).sum(axis=1).mean()),
         contacts=contacts,
-        rows=rows,
         overflowed=overflowed,
         finite=bool(np.isfinite(sim.joint_q.numpy()).all() and np.isfinite(sim.joint_qd.numpy()).all()),
     )
@@ -110,8 +107,8 @@ def _ground(heights: NDArray[np.float32], x: float, y: float) -> float:
     return float(heights[max(row - room, 0) : row + room + 1, max(column - room, 0) : column + room + 1].max())
 
 
-def _let_fall(sim: Simulation, seconds: float) -> tuple[int, int, bool, NDArray[np.float64]]:
-    """Most contacts and most rows of a robot, overflow, and the first robot's vertical forces in the last steps [N]."""
+def _let_fall(sim: Simulation, seconds: float) -> tuple[int, bool, NDArray[np.float64]]:
+    """Most contacts of a robot, overflow, and the first robot's vertical forces in the last steps [N]."""
     start = sim.joint_q.numpy().copy()
 
     def launch() -> None:
@@ -122,7 +119,7 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[int, int, bool, NDArray[
     sim.joint_q.assign(start)
     sim.joint_qd.zero_()
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    contacts, rows, overflowed, forces = 0, 0, False, []
+    contacts, overflowed, forces = 0, False, []
     steps = max(1, round(seconds / sim.robot.physics_dt))
     for step in range(steps):
         sim.launch(graph)
@@ -130,9 +127,8 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[int, int, bool, NDArray[
             forces.append(sim.geom_force.numpy()[0][:, 2].copy())
         if step % sim.robot.decimation == 0:
             contacts = max(contacts, int(sim.contacts.count.numpy().max()))
-            rows = max(rows, int(sim.solver.mjw_data.nefc.numpy().max()))
             overflowed |= bool((sim.overflow.numpy() & CAPACITY_OVERFLOWS).any())
-    return contacts, rows, overflowed, np.array(forces, dtype=np.float64)
+    return contacts, overflowed, np.array(forces, dtype=np.float64)
 
 
 def describe_model(robot: RobotCfg) -> str:
@@ -225,8 +221,7 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
          f"its feet bounce at rest: the force on them changes by {standing.restless:.0%} of its weight from step to "
          "step: give the joints armature (a rotor's inertia, .01 kg m^2 for a dog of 13 kg), or a longer "
          "contact_time_constant_s"),
-        (standing.overflowed,
-         "a buffer of the solver was too small: raise nconmax and njmax above the numbers above"),
+        (standing.overflowed, "there was too little room for contacts: raise nconmax above the number above"),
     ]  # fmt: skip
     mistakes = [f"To mend: {text}" for holds, text in findings if holds]
     carried = ", ".join(f"{name} {share:.0%}" for name, share in standing.carried.items()) or "nothing"
@@ -234,8 +229,7 @@ def describe_standing(robot: RobotCfg, standing: Standing) -> tuple[str, bool]:
     lines = [
         f"On flat ground: base from {first:.3f} to {last:.3f} m, tilt {standing.tilt_deg:.1f} degrees, joints at most "
         f"{standing.joint_error:.3f} rad off; its weight is on {carried}",
-        f"Dropped on rough ground: at most {standing.contacts} contacts of a robot (nconmax {robot.nconmax}) "
-        f"and {standing.rows} constraint rows (njmax {robot.njmax})",
+        f"Dropped on rough ground: at most {standing.contacts} contacts of a robot (nconmax {robot.nconmax})",
         *(mistakes or [falls] * (not standing.stands)),
         *["It stands."] * standing.stands,
     ]

@@ -17,11 +17,11 @@ from tests.sim.dogs import CONTROLLER, write_dog, write_toml
 
 def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mended(tmp_path, capsys):
     file = write_dog(tmp_path)
-    file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2, njmax=4, nconmax=2"))
+    file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2, nconmax=2"))
     assert run_command(Check, ["--robot", str(file), "--device", "cpu"], name="check") == 1
     text = capsys.readouterr().out
     assert "FL_hip" in text and "default_base_height" in text and "It stands" in text
-    assert "Its buffers were too small: it needs njmax = " in text and "Without a controller" in text
+    assert "it needs nconmax = " in text and "Without a controller" in text
 
 
 @pytest.mark.slow

