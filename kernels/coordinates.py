@@ -1,4 +1,4 @@
-"""What a physics step tells mujoco_warp of the robots and their drives, and what it reads back.
+"""What a physics step tells mujoco_warp of the robots, their drives and contacts, and what it reads back.
 
 The coordinates are those of :mod:`kernels.state` here. mujoco_warp has the base's quaternion as wxyz, its velocity at
 the base's origin, and its rotation rate in the base's frame. All other joints have one axis, and the same numbers in

@@ -130,8 +130,8 @@ class Simulation:
             kinematic_switchable_roots=False,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
-        # Of thousands of robots one always needs the last iteration. A loop that the device may leave early then only
-        # costs: 4 % of a step of 4,096 robots on an H200, 1 % of 32,768.
+        # For mujoco_warp's own step: of thousands of robots one always needs the last iteration. A loop that the device
+        # may leave early then only costs: 4 % of a step of 4,096 robots on an H200, 1 % of 32,768.
         self.solver.mjw_model.opt.graph_conditional = not self.model.device.is_cuda
         if cfg.time_constant_s is not None:
             self.solver.mjw_model.geom_solref.fill_(wp.vec2(cfg.time_constant_s, 1.0))

@@ -102,13 +102,6 @@ def ours_of(m, d, contacts):
     return found
 
 
-def assign(array, values):
-    """Writes the first columns of an array, (WORLDS, some)."""
-    whole = array.numpy().copy()
-    whole[:, : values.shape[1]] = values
-    array.assign(whole)
-
-
 def tell(d, contacts):
     """Hands ours the contacts that mujoco_warp has found, each with a geom of the ground first."""
     count = int(d.nacon.numpy()[0])
