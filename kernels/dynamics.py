@@ -1,8 +1,8 @@
-"""Poses, inertias and forces of a robot's bodies and joints, found from beginning to end by 32 threads of a GPU.
+"""Poses, inertias and forces of a robot's bodies and joints, found from beginning to end by 16 threads of a GPU.
 
 mujoco_warp finds them in some thirty kernels a step, each over all robots, through global memory: half of a step at
-20,000 robots. Here a warp takes one robot and keeps all in shared memory; on a CPU one thread does. The algorithms are
-mujoco_warp's, so that results agree to rounding: composite rigid bodies for the inertia, recursive Newton-Euler for
+20,000 robots. Here half a warp takes one robot and keeps all in shared memory; on a CPU one thread does. The algorithms
+are mujoco_warp's, so that results agree to rounding: composite rigid bodies for the inertia, recursive Newton-Euler for
 the bias forces (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, chapters 5 and 6), affine actuators.
 """
 
@@ -15,6 +15,7 @@ import warp as wp
 
 from kernels import lanes
 
+LANES = 16  # two robots a warp: few of their bodies are equally deep
 _BODY = Path(__file__).with_suffix(".cu")
 
 
@@ -116,7 +117,7 @@ class TreeSizes:
 
 @cache
 def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
-    snippet = lanes.snippet(_BODY, words=sizes.words, **asdict(sizes), **dict(codes))
+    snippet = lanes.snippet(_BODY, words=sizes.words, lanes=LANES, **asdict(sizes), **dict(codes))
 
     @wp.func_native(snippet=snippet)
     def find_one(tree: Tree, robots: Robots, thread: int): ...
@@ -132,9 +133,9 @@ def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
 def find_dynamics(tree: Tree, robots: Robots, sizes: TreeSizes, codes: dict[str, Any]) -> None:
     """Poses, inertias and all forces but those of constraints, of every world: the arrays from ``xpos`` on.
 
-    The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are the solver's numbers of the types of joints,
-    by their names in dynamics.cu.
+    The words of the sizes must :func:`kernels.lanes.fits` with ``LANES``. ``codes`` are the solver's numbers of the
+    types of joints, by their names in dynamics.cu.
     """
     kernel = _kernel(sizes, tuple(codes.items()))
     num_worlds = robots.qpos.shape[0]
-    lanes.launch(kernel, num_worlds, [tree, robots], words=sizes.words, device=robots.qpos.device)
+    lanes.launch(kernel, num_worlds, [tree, robots], lanes=LANES, device=robots.qpos.device)

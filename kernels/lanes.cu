@@ -1,13 +1,14 @@
-// One world is the work of LANES threads, in memory that they share: of a warp on a GPU, of a single thread on a CPU.
+// One world is the work of LANES threads, in memory that they share: of some of a warp on a GPU, of a single one on a CPU.
 #if defined(__CUDA_ARCH__)
-constexpr int LANES = $warp;
+constexpr int LANES = $lanes;
 const int lane = threadIdx.x % LANES;
+const unsigned us = (0xffffffffu >> (32 - LANES)) << (threadIdx.x - lane);
 __shared__ alignas(16) float pool[$worlds * $words];
 float* memory = pool + threadIdx.x / LANES * $words;
-auto sync = [] { __syncwarp(); };
-auto from = [](float x, int k) { return __shfl_sync(0xffffffffu, x, k); };  // that of lane k
-auto total = [](float x) {
-    for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(0xffffffffu, x, k);
+auto sync = [&] { __syncwarp(us); };
+auto from = [&](float x, int k) { return __shfl_sync(us, x, k, LANES); };  // that of lane k
+auto total = [&](float x) {
+    for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(us, x, k);
     return x;
 };
 #else

@@ -1,6 +1,7 @@
-"""What kernels share in which a warp of a GPU does all of one world's work, in shared memory; on a CPU one thread does.
+"""What kernels share in which some threads of a GPU's warp do all of one world's work; on a CPU one thread does.
 
-Their bodies are C++ (``.cu`` files), for a warp's shuffles and barriers, which Warp's language does not have.
+They share its memory. Their bodies are C++ (``.cu`` files), for shuffles and barriers, which Warp's language does not
+have. A block is one warp, so that a world whose work ends soon holds no place on a multiprocessor.
 """
 
 from pathlib import Path
@@ -11,30 +12,24 @@ import warp as wp
 
 _WARP = 32
 _BLOCK_WORDS = 12 * 1024  # what a block may have without asking: 48 KiB
-_MOST_WORLDS = 4  # of a block
 _PROLOGUE = Path(__file__).with_suffix(".cu")
 
 
-def fits(words: int) -> bool:
-    """Whether a world that needs so many words of memory finds room in a block's shared memory."""
-    return 0 < words <= _BLOCK_WORDS
+def fits(words: int, lanes: int) -> bool:
+    """Whether worlds of so many ``lanes`` that need so many words of memory each find room in a block's."""
+    return 0 < words * (_WARP // lanes) <= _BLOCK_WORDS
 
 
-def worlds_of_block(words: int) -> int:
-    """How many worlds, each of words that :func:`fits`, share a block of threads."""
-    return min(_MOST_WORLDS, _BLOCK_WORDS // words)
-
-
-def snippet(body: Path, *, words: int, **values: Any) -> str:
+def snippet(body: Path, *, words: int, lanes: int, **values: Any) -> str:
     """The body of a native function of an int ``thread`` from a C++ file, after what lanes.cu declares.
 
-    A world needs so many ``words`` of memory. ``values`` take the place of the ``$names`` in the file.
+    On a GPU a world has so many ``lanes``, a power of 2 up to 32, and ``words`` of memory. ``values`` take the place of
+    the ``$names`` in the file.
     """
     source = Template(_PROLOGUE.read_text() + body.read_text())
-    return source.substitute(values, words=words, worlds=worlds_of_block(words), warp=_WARP)
+    return source.substitute(values, words=words, lanes=lanes, worlds=_WARP // lanes)
 
 
-def launch(kernel: Any, num_worlds: int, inputs: list[Any], *, words: int, device: Any) -> None:
-    """Launches a kernel of a grid (num_worlds * lanes,) over worlds that each need so many words of memory."""
-    lanes = 1 if device.is_cpu else _WARP
-    wp.launch(kernel, num_worlds * lanes, inputs=inputs, block_dim=worlds_of_block(words) * _WARP, device=device)
+def launch(kernel: Any, num_worlds: int, inputs: list[Any], *, lanes: int, device: Any) -> None:
+    """Launches a kernel of a grid (num_worlds * lanes,) over worlds that have so many on a GPU."""
+    wp.launch(kernel, num_worlds * (1 if device.is_cpu else lanes), inputs=inputs, block_dim=_WARP, device=device)

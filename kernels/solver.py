@@ -22,6 +22,7 @@ import warp as wp
 from kernels import lanes
 from kernels.contact import Contacts, Surfaces
 
+LANES = 32
 _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
 _CHUNK = 4
 """Contacts whose part of the Hessian is summed at once."""
@@ -134,7 +135,7 @@ def _fours(words: int) -> int:
 @cache
 def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
     values = {"chunk": _CHUNK, "kept": sizes.kept, "stride": sizes.stride} | asdict(sizes) | dict(codes)
-    snippet = lanes.snippet(_BODY, words=sizes.words, **values | {"losses": str(sizes.losses).lower()})
+    snippet = lanes.snippet(_BODY, words=sizes.words, lanes=LANES, **values | {"losses": str(sizes.losses).lower()})
 
     @wp.func_native(snippet=snippet)
     def step_one(problem: Problem, thread: int): ...
@@ -153,9 +154,9 @@ def step_robots(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
     """Moves every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
     It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of iterations,
-    and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits`. ``codes`` are
-    MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and the
-    least divisor.
+    and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits` with ``LANES``. ``codes``
+    are MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and
+    the least divisor.
     """
     kernel, num_worlds = _kernel(sizes, tuple(codes.items())), problem.qvel.shape[0]
-    lanes.launch(kernel, num_worlds, [problem], words=sizes.words, device=problem.qvel.device)
+    lanes.launch(kernel, num_worlds, [problem], lanes=LANES, device=problem.qvel.device)

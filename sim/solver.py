@@ -11,7 +11,7 @@ import warp as wp
 from mujoco_warp._src import types
 from numpy.typing import NDArray
 
-from kernels import lanes
+from kernels import dynamics, lanes, solver
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, ask_forces, tell_contacts
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
@@ -100,8 +100,8 @@ def fits(m: Any, contacts: Contacts) -> bool:
         m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
         (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
     )
-    words = tree_sizes_of(m).words, sizes_of(m, contacts).words
-    return all(map(lanes.fits, words)) and not any(misfits)
+    room = lanes.fits(tree_sizes_of(m).words, dynamics.LANES) and lanes.fits(sizes_of(m, contacts).words, solver.LANES)
+    return room and not any(misfits)
 
 
 def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
