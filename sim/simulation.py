@@ -114,12 +114,15 @@ class Simulation:
             model.body_inv_mass.assign(1.0 / mass)
 
     def _build_solver(self, cfg: SolverCfg, of_file: Any) -> None:
-        impratio, dims = float(of_file.opt.impratio), int(of_file.geom_condim.max(initial=3))
+        impratio = float(of_file.opt.impratio)
+        # Rows for mujoco_warp's own step: a limit and friction of every joint, and contacts.
+        rows = of_file.neq + 2 * of_file.nv + int(of_file.geom_condim.max(initial=3)) * self.robot.nconmax
         # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
-            njmax=of_file.neq + 2 * of_file.nv + dims * self.robot.nconmax,  # a limit and friction of every joint
+            njmax=rows,
+            njmax_nnz=rows * of_file.nv,  # Newton counts no contacts, and rows that do not fit have no effect
             nconmax=self.robot.nconmax,
             iterations=cfg.iterations * (1 if impratio == 1.0 else 2),  # at 100, 8 are as good as any number
             ls_iterations=cfg.ls_iterations,
