@@ -27,6 +27,7 @@ _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
 _CHUNK = 4
 """Contacts whose part of the Hessian is summed at once."""
 _SHARED_WORDS = 1792  # of a robot, so that 32 find room; contacts beyond these are in global memory
+_LEAST_KEPT = 8  # contacts in shared memory, also of a large robot
 
 
 _BODY = Path(__file__).with_suffix(".cu")
@@ -115,7 +116,7 @@ class Sizes:
     @property
     def kept(self) -> int:
         """Contacts in shared memory."""
-        return min(self.contacts, max(1, (_SHARED_WORDS - self._other_words) // self._contact_words))
+        return min(self.contacts, max(_LEAST_KEPT, (_SHARED_WORDS - self._other_words) // self._contact_words))
 
     @property
     def words(self) -> int:

@@ -208,6 +208,7 @@ def test_contacts_beyond_shared_memory(device, monkeypatch):
     seen = []
     for words in (solver._SHARED_WORDS, 1):
         monkeypatch.setattr(solver, "_SHARED_WORDS", words)
+        monkeypatch.setattr(solver, "_LEAST_KEPT", 1)
         solver._kernel.cache_clear()
         m, d, contacts = everything(device)
         ours = ours_of(m, d, contacts)
