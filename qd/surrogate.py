@@ -174,6 +174,8 @@ class Surrogate:
     @torch.inference_mode()
     def predict(self, genes: Tensor) -> Prediction:
         """What each network says of terrains, of genes in [-1, 1] on the surrogate's device, (N, num_genes)."""
+        if self._stream is not None:  # for what was learned, if another one asks
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)
         parts = genes.split(_AT_ONCE[genes.device.type])
         columns = torch.cat([self._networks.judge(self._map_genes(part)) for part in parts])
         ratios, numbers, rates = self._split(columns.transpose(0, 1))

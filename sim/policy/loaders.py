@@ -65,18 +65,17 @@ class _TorchMemory:
 
 @contextmanager
 def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
-    """Let torch and Warp work on ``stream``, which waits for nothing; later work of the present one waits for it.
+    """Let torch and Warp work on ``stream``; neither it nor the present one waits for the other.
 
     Warp's arrays that are made meanwhile must not be used afterwards. None changes nothing.
     """
     if stream is None:
         yield
         return
-    before, on_warp = torch.cuda.current_stream(stream.device), wp.stream_from_torch(stream)
+    on_warp = wp.stream_from_torch(stream)
     memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
     with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
         yield
-    before.wait_stream(stream)
 
 
 def read_weights(path: Path) -> Any:
