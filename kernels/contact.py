@@ -14,7 +14,8 @@ from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 from kernels.state import make_zeros
 
-_vec5 = wp.types.vector(5, float)
+vec5 = wp.types.vector(5, float)
+"""MuJoCo's frictions of a contact, or an impedance."""
 
 
 @wp.struct
@@ -72,20 +73,22 @@ class Surfaces:
     """The solver's number."""
     body: wp.array[int]
     condim: wp.array[int]
-    friction: wp.array2d[_vec5]
+    friction: wp.array2d[vec5]
     solref: wp.array2d[wp.vec2]
-    solimp: wp.array2d[_vec5]
+    solimp: wp.array2d[vec5]
 
 
 @wp.func
 def _write_contact(
-    contacts: Contacts, slot: int, shape: int, terrain: Terrain, ground: Ground, t: int, env: int, centre: wp.vec3,
-    radius: float,
+    contacts: Contacts, slot: int, strip: int, probe: int, pose: wp.transform, terrain: Terrain, ground: Ground, t: int,
+    env: int, probes: Probes,
 ):  # fmt: skip
     if slot < contacts.shape.shape[1]:
+        radius = probes.strip_radius[strip]
+        centre = wp.transform_point(pose, probes.position[probe])
         point = nearest_surface_point(terrain, t, centre, radius)
         touched = centre - point.normal * point.distance
-        contacts.shape[env, slot] = shape
+        contacts.shape[env, slot] = probes.strip_shape[strip]
         contacts.point[env, slot] = 0.5 * (touched + centre - point.normal * radius)
         contacts.normal[env, slot] = point.normal
         contacts.distance[env, slot] = point.distance - radius
@@ -137,17 +140,13 @@ def _collide_strip(
     if first < 0:
         return
     slot = wp.atomic_add(contacts_out.count, env, 1 + int(first != deepest) + int(last != deepest))
-    shape = probes.strip_shape[strip]
-    centre = wp.transform_point(pose, probes.position[deepest])
-    _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
+    _write_contact(contacts_out, slot, strip, deepest, pose, terrain, ground, t, env, probes)
     if first != deepest:
         slot += 1
-        centre = wp.transform_point(pose, probes.position[first])
-        _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
+        _write_contact(contacts_out, slot, strip, first, pose, terrain, ground, t, env, probes)
     if last != deepest:
         slot += 1
-        centre = wp.transform_point(pose, probes.position[last])
-        _write_contact(contacts_out, slot, shape, terrain, ground, t, env, centre, radius)
+        _write_contact(contacts_out, slot, strip, last, pose, terrain, ground, t, env, probes)
 
 
 @wp.kernel

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.contact import Contacts, Surfaces
+from kernels.contact import Contacts, Surfaces, vec5
 from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 
@@ -171,9 +171,6 @@ def ask_poses(solver: SolverState, body_q_out: Any) -> None:
     wp.launch(_ask_poses_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
 
 
-_vec5 = wp.types.vector(5, float)
-
-
 @wp.struct
 class SolverContacts:
     """mujoco_warp's contacts, and the forces on its rows of constraints."""
@@ -186,9 +183,9 @@ class SolverContacts:
     frame: wp.array[wp.mat33]
     """Rows: normal (toward the second geom) and two tangents, world frame."""
     dim: wp.array[int]
-    friction: wp.array[_vec5]
+    friction: wp.array[vec5]
     solref: wp.array[wp.vec2]
-    solimp: wp.array[_vec5]
+    solimp: wp.array[vec5]
     efc_address: wp.array2d[int]
     """Rows of each contact; negative where the contact is inactive."""
     efc_force: wp.array2d[float]

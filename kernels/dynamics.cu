@@ -2,7 +2,6 @@
 // taken at the mass centre of the body's tree, in the world's axes. The world is body 0.
 struct Quat { float w, x, y, z; };
 struct Six { float v[6]; };
-if (robots.parked.data[world] == 2) return;
 constexpr int NB = $bodies, NV = $dofs, NJ = $joints, LEVELS = $levels;
 enum { FREE = $free, SLIDE = $slide, HINGE = $hinge };
 using Vec = wp::vec_t<3, float>;

@@ -2,7 +2,7 @@
 #if defined(__CUDA_ARCH__)
 constexpr int LANES = $lanes;
 const int lane = threadIdx.x % LANES;
-const unsigned us = (0xffffffffu >> (32 - LANES)) << (threadIdx.x - lane);
+const unsigned us = LANES == 32 ? 0xffffffffu : (0xffffffffu >> (32 - LANES)) << (threadIdx.x - lane);
 __shared__ alignas(16) float pool[$worlds * $words];
 float* memory = pool + threadIdx.x / LANES * $words;
 auto sync = [&] { __syncwarp(us); };
@@ -20,5 +20,6 @@ auto from = [](float x, int) { return x; };
 auto total = [](float x) { return x; };
 #endif
 const int world = thread / LANES;
+if (robots.parked.data[world] == 2) return;
 constexpr int ALL = LANES == 1 ? 1 : 64;  // loops over registers are unrolled, those of a CPU over memory are not
 auto of_model = [&](const auto& array, int k) -> const auto& { return wp::index(array, world % array.shape[0], k); };

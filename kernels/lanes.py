@@ -1,7 +1,8 @@
 """What kernels share in which some threads of a GPU's warp do all of one world's work; on a CPU one thread does.
 
-They share its memory. Their bodies are C++ (``.cu`` files), for shuffles and barriers, which Warp's language does not
-have. A block is one warp, so that a world whose work ends soon holds no place on a multiprocessor.
+They share its memory, and leave out worlds that are parked. Their bodies are C++ (``.cu`` files), for shuffles and
+barriers, which Warp's language does not have. A block is one warp, so that a world whose work ends soon holds no place
+on a multiprocessor.
 """
 
 from pathlib import Path
@@ -21,7 +22,7 @@ def fits(words: int, lanes: int) -> bool:
 
 
 def snippet(body: Path, *, words: int, lanes: int, **values: Any) -> str:
-    """The body of a native function of an int ``thread`` from a C++ file, after what lanes.cu declares.
+    """The body of a native function of ``robots`` and an int ``thread`` from a C++ file, after what lanes.cu declares.
 
     On a GPU a world has so many ``lanes``, a power of 2 up to 32, and ``words`` of memory. ``values`` take the place of
     the ``$names`` in the file.

@@ -1,4 +1,3 @@
-if (problem.parked.data[world] == 2) return;
 struct Point { float cost, slope, curve; };
 struct Spring { float stiffness, damping, impedance; };
 constexpr int NV = $dofs, DIM = $dimensions, MOST = $contacts, KEPT = $kept, LD = $stride, CHUNK = $chunk;
@@ -29,8 +28,8 @@ const float dt = wp::index(problem.timestep, world % problem.timestep.shape[0]);
 const float root_impratio = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
 const float least = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
 const float ls_least = wp::index(problem.ls_tolerance, world % problem.ls_tolerance.shape[0]);
-float* qvel = &wp::index(problem.qvel, world, 0);
-float* qpos = &wp::index(problem.qpos, world, 0);
+float* qvel = &wp::index(robots.qvel, world, 0);
+float* qpos = &wp::index(robots.qpos, world, 0);
 auto safe = [](float x, float y) { return x / (y != 0.0f ? y : MINVAL); };
 auto product = [](const float* x, const float* y) {
     float sum = 0.0f;
@@ -491,7 +490,7 @@ sync();
 #pragma unroll 1
 for (int m = lane; m < $inertia; m += LANES) {
     const int i = problem.inertia_row.data[m], j = problem.inertia_col.data[m];
-    inertia[i * LD + j] = inertia[j * LD + i] = wp::index(problem.inertia, world, m);
+    inertia[i * LD + j] = inertia[j * LD + i] = wp::index(robots.inertia, world, m);
 }
 float trace = 0.0f, speed[MINE];
 sync();
@@ -503,7 +502,7 @@ for (int m = 0; m < MINE; ++m) {
     if (i >= NV) continue;
     trace += inertia[i * LD + i];
     qacc[m] = wp::index(problem.qacc_warmstart, world, i);
-    smooth[m] = wp::index(problem.qfrc_smooth, world, i);
+    smooth[m] = wp::index(robots.qfrc_smooth, world, i);
     speed[m] = qvel[i];
     const int joint = problem.dof_joint.data[i];
     const float weight = of_model(problem.dof_weight, i);
@@ -533,7 +532,7 @@ for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads 
     const int body = problem.surfaces.body.data[shape], condim = problem.surfaces.condim.data[shape];
     const Vec normal = wp::index(problem.contacts.normal, world, own);
     const Vec place = wp::index(problem.contacts.point, world, own)
-        - wp::index(problem.subtree_com, world, problem.body_root.data[body]);
+        - wp::index(robots.subtree_com, world, problem.body_root.data[body]);
     auto of_lane = [&](const Vec& v, int s) { return Vec(from(v[0], s), from(v[1], s), from(v[2], s)); };
     #pragma unroll 1
     for (int s = 0; s < wp::min(LANES, num_contacts - begin); ++s) {
@@ -546,7 +545,7 @@ for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads 
         for (int i = lane; i < LD; i += LANES) {
             Vec turned, moved;
             if (i < NV && wp::index(problem.is_ancestor, touching, i)) {
-                const auto& motion = wp::index(problem.cdof, world, i);
+                const auto& motion = wp::index(robots.cdof, world, i);
                 turned = Vec(motion[0], motion[1], motion[2]);
                 moved = Vec(motion[3], motion[4], motion[5]) + wp::cross(turned, offset);
             }
@@ -619,7 +618,7 @@ while (true) {
         const int i = lane + m * LANES;
         float more = 0.0f;
         if (done) {
-            more = i < NV ? dt * wp::index(problem.slope, world, i) : 0.0f;
+            more = i < NV ? dt * wp::index(robots.slope, world, i) : 0.0f;
         } else {
             if (side[m] * qacc[m] < limit_aref[m]) more = limit_d[m];
             if (HAS_LOSSES && wp::abs(loss_d[m] * (qacc[m] - loss_aref[m])) < loss[m]) more += loss_d[m];

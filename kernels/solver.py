@@ -20,7 +20,8 @@ from typing import Any
 import warp as wp
 
 from kernels import lanes
-from kernels.contact import Contacts, Surfaces
+from kernels.contact import Contacts, Surfaces, vec5
+from kernels.dynamics import Robots
 
 LANES = 32
 _REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
@@ -31,12 +32,11 @@ _LEAST_KEPT = 8  # contacts in shared memory, also of a large robot
 
 
 _BODY = Path(__file__).with_suffix(".cu")
-_vec5 = wp.types.vector(5, float)
 
 
 @wp.struct
 class Problem:
-    """Model, state and contacts of every robot. Arrays of a model of shape (1, ...) hold for all, else for one each."""
+    """Model and contacts of every robot. Arrays of a model of shape (1, ...) hold for all, else for one each."""
 
     most_iterations: int
     most_line_iterations: int
@@ -51,13 +51,13 @@ class Problem:
     joint_range: wp.array2d[wp.vec2]
     joint_margin: wp.array2d[float]
     joint_solref: wp.array2d[wp.vec2]
-    joint_solimp: wp.array2d[_vec5]
+    joint_solimp: wp.array2d[vec5]
     dof_joint: wp.array[int]
     dof_weight: wp.array2d[float]
     """MuJoCo's ``invweight0``, of dofs and below of bodies."""
     dof_solref: wp.array2d[wp.vec2]
     """Of friction in the joints."""
-    dof_solimp: wp.array2d[_vec5]
+    dof_solimp: wp.array2d[vec5]
     frictionloss: wp.array2d[float]
     body_root: wp.array[int]
     body_weight: wp.array2d[wp.vec2]
@@ -67,20 +67,10 @@ class Problem:
     inertia_row: wp.array[int]
     """Rows, then columns, of the numbers kept of the inertia."""
     inertia_col: wp.array[int]
-    inertia: wp.array2d[float]
-    qfrc_smooth: wp.array2d[float]
-    slope: wp.array2d[float]
-    """What a dof's force loses per speed of that dof."""
-    cdof: wp.array2d[wp.spatial_vector]
-    subtree_com: wp.array2d[wp.vec3]
-    parked: wp.array[int]
-    """Where it is 2 nothing is done."""
     contacts: Contacts
     others: wp.array2d[float]
     """Room for the contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.other_words`)."""
     qacc_warmstart: wp.array2d[float]
-    qpos: wp.array2d[float]
-    qvel: wp.array2d[float]
     iterations: wp.array[int]
     overflow: wp.array[int]
 
@@ -139,19 +129,19 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
     snippet = lanes.snippet(_BODY, words=sizes.words, lanes=LANES, **values | {"losses": str(sizes.losses).lower()})
 
     @wp.func_native(snippet=snippet)
-    def step_one(problem: Problem, thread: int): ...
+    def step_one(robots: Robots, problem: Problem, thread: int): ...
 
     options = {"fast_math": True}  # approximate division and roots; slopes below rounding end a line search anyway
 
     @wp.kernel(module="unique", enable_backward=False, module_options=options, cuda_max_registers=_REGISTERS)
-    def step_all(problem: Problem):
+    def step_all(robots: Robots, problem: Problem):
         """Grid (num_worlds * lanes,)."""
-        step_one(problem, wp.tid())
+        step_one(robots, problem, wp.tid())
 
     return step_all
 
 
-def step_robots(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
+def step_robots(robots: Robots, problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
     """Moves every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
     It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of iterations,
@@ -159,5 +149,5 @@ def step_robots(problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
     are MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and
     the least divisor.
     """
-    kernel, num_worlds = _kernel(sizes, tuple(codes.items())), problem.qvel.shape[0]
-    lanes.launch(kernel, num_worlds, [problem], lanes=LANES, device=problem.qvel.device)
+    kernel, num_worlds = _kernel(sizes, tuple(codes.items())), robots.qvel.shape[0]
+    lanes.launch(kernel, num_worlds, [robots, problem], lanes=LANES, device=robots.qvel.device)

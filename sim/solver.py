@@ -144,7 +144,7 @@ class Dynamics:
             tree.roots = wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int)
             tree.biased = wp.array(m.actuator_biastype.numpy() == types.BiasType.AFFINE, dtype=bool)
             problem.joint_limited = wp.array(limited, dtype=bool)
-            problem.slope = robots.slope = wp.zeros((d.nworld, m.nv), dtype=float)
+            robots.slope = wp.zeros((d.nworld, m.nv), dtype=float)
             problem.others = wp.zeros((d.nworld, max(1, self._sizes.other_words)), dtype=float)
         for struct, names in ((tree, _OF_TREE), (problem, _OF_PROBLEM)):
             for name, of_model in names.items():
@@ -158,12 +158,9 @@ class Dynamics:
             setattr(problem, name, getattr(m.opt, name))
         for name in ("qpos", "qvel", "xpos", "xquat", "subtree_com", "cdof", "qfrc_actuator", "qfrc_smooth"):
             setattr(robots, name, getattr(d, name))
-        for name in ("qpos", "qvel", "subtree_com", "cdof", "qfrc_smooth", "qacc_warmstart", "overflow"):
-            setattr(problem, name, getattr(d, name))
-        robots.control, robots.inertia, problem.inertia = d.ctrl, d.M, d.M
+        robots.control, robots.inertia, robots.parked = d.ctrl, d.M, parked
         problem.contacts, problem.surfaces = contacts, surfaces
-        problem.parked = robots.parked = parked
-        problem.iterations = d.solver_niter
+        problem.qacc_warmstart, problem.iterations, problem.overflow = d.qacc_warmstart, d.solver_niter, d.overflow
 
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
@@ -171,7 +168,7 @@ class Dynamics:
 
     def step(self) -> None:
         """Constraints, contacts among them, and the move to the next state."""
-        step_robots(self._problem, self._sizes, _CODES)
+        step_robots(self._robots, self._problem, self._sizes, _CODES)
 
 
 _OF_TREE = {
