@@ -27,10 +27,6 @@ from sim.spaces.base import TerrainSpace
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
 
-_LOOKS_AHEAD = 2
-"""Once a result is taken, a GPU gets this many looks' worth of steps to do while the host is busy with it."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RolloutResult:
     """What came of every episode; arrays lead with (num_terrains, num_replicas)."""
@@ -381,8 +377,7 @@ class Rollout:
         self._lots.popleft()
         going = any(self._num_ended(other) < other.num_episodes for other in self._lots)
         if going and not self._num_unreleased and watcher is None:
-            for _ in range(_LOOKS_AHEAD):
-                self._advance()
+            self._advance()
         return result
 
     def _num_ended(self, lot: _Lot) -> int:
