@@ -65,8 +65,7 @@ class Networks(nn.Module):
         """
         if not maps.is_cuda:
             return self(maps.expand(MEMBERS, -1, -1, -1, -1))
-        with torch.autocast("cuda", torch.float16):
-            return self._through(maps, *self._layers(MEMBERS)).float()
+        return self._through(maps.half(), *self._layers(MEMBERS))
 
     def _layers(self, count: int) -> list[_Layers]:
         """Weights and biases of each layer, of ``count`` networks after the other."""
@@ -79,14 +78,23 @@ class Networks(nn.Module):
         for (size, strides, _), (weight, bias) in zip(_CONVOLUTIONS, layers, strict=False):
             alike = rows.shape[1] == weight.shape[2]  # all networks see the same
             weight = weight.flatten(0, 1) if alike else _block_diagonal(weight)
-            rows = nn.functional.conv2d(rows, weight, bias.flatten(), strides, size // 2).relu()
+            rows = _activated(rows, weight.to(rows.dtype), bias.flatten().to(rows.dtype), strides, size // 2)
         (weight, bias), (last_weight, last_bias) = layers[-2:]
         weight, of_places = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
         places = of_places.flatten(2) @ self.get_buffer("_places") + bias[..., None]  # the same in every row
-        rows = nn.functional.conv2d(rows, _block_diagonal(weight), padding=(0, 1))
-        rows = (rows.reshape(len(rows), *places.shape) + places).relu()
-        pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2)
+        rows = nn.functional.conv2d(rows, _block_diagonal(weight).to(rows.dtype), padding=(0, 1))
+        rows = (rows.reshape(len(rows), *places.shape) + places.to(rows.dtype)).relu()
+        pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2).float()
         return torch.einsum("bni,noi->bno", pooled, last_weight.flatten(2)) + last_bias
+
+
+def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, int], padding: int) -> Tensor:
+    """A convolution and what is positive of it; in half precision one kernel of cuDNN does both, and nothing learns."""
+    if rows.dtype != torch.half:
+        return nn.functional.conv2d(rows, weight, bias, strides, padding).relu()
+    if missing := -rows.shape[1] % 8:  # Tensor Cores take eight channels at once
+        rows, weight = (nn.functional.pad(part.movedim(1, -1), (0, missing)).movedim(-1, 1) for part in (rows, weight))
+    return torch.cudnn_convolution_relu(rows, weight, bias, strides, (padding, padding), (1, 1), 1)
 
 
 def _block_diagonal(weight: Tensor) -> Tensor:

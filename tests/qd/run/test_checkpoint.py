@@ -1,16 +1,14 @@
 import hashlib
 import pickle
-import zlib
 
 import pytest
 
-from qd.run import checkpoint
 from qd.run.checkpoint import load_checkpoint
 
 
 def wrap(payload: bytes) -> bytes:
     """A file with a right magic and hash around any payload, as an attacker would make it."""
-    return b"faultline search checkpoint 1\n" + hashlib.sha256(payload).digest() + payload
+    return b"faultline search checkpoint 2\n" + hashlib.sha256(payload).digest() + payload
 
 
 @pytest.mark.parametrize(
@@ -22,20 +20,12 @@ def wrap(payload: bytes) -> bytes:
 )  # fmt: skip
 def test_what_is_no_part_of_a_search_is_never_looked_up(tmp_path, name):
     names = b"".join(b"\x8c" + bytes([len(part)]) + part.encode() for part in name.split())
-    (tmp_path / "checkpoint.bin").write_bytes(wrap(zlib.compress(b"\x80\x04" + names + b"\x93.")))
+    (tmp_path / "checkpoint.bin").write_bytes(wrap(b"\x80\x04" + names + b"\x93."))
     with pytest.raises(ValueError, match="is no part of a search"):
         load_checkpoint(tmp_path / "checkpoint.bin")
 
 
-def test_a_bomb_of_zeros_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "_MAX_STATE_BYTES", 1 << 20)
-    path = tmp_path / "checkpoint.bin"
-    path.write_bytes(wrap(zlib.compress(bytes(8 << 20))))
-    with pytest.raises(ValueError, match="larger than 1 MB"):
-        load_checkpoint(path)
-
-
-@pytest.mark.parametrize("content", [b"", wrap(b"junk"), wrap(zlib.compress(pickle.dumps([1, 2])))])
+@pytest.mark.parametrize("content", [b"", wrap(b"junk"), wrap(pickle.dumps([1, 2]))])
 def test_foreign_files(tmp_path, content):
     path = tmp_path / "checkpoint.bin"
     path.write_bytes(content)
