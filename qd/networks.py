@@ -92,29 +92,9 @@ def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, i
     """A convolution and what is positive of it; in half precision one kernel of cuDNN does both, and nothing learns."""
     if rows.dtype != torch.half:
         return nn.functional.conv2d(rows, weight, bias, strides, padding).relu()
-    if rows.shape[1] < 8:
-        rows, weight = in_blocks(rows, weight, strides[0], padding)
-        strides, padding = (1, 1), 0
+    if missing := -rows.shape[1] % 8:  # Tensor Cores take eight channels at once
+        rows, weight = (nn.functional.pad(part.movedim(1, -1), (0, missing)).movedim(-1, 1) for part in (rows, weight))
     return torch.cudnn_convolution_relu(rows, weight, bias, strides, (padding, padding), (1, 1), 1)
-
-
-def in_blocks(maps: Tensor, weight: Tensor, stride: int, padding: int) -> tuple[Tensor, Tensor]:
-    """What to convolve with what, by a stride of 1 and unpadded, for the same: a block of nodes is one of channels.
-
-    Tensor Cores take eight channels at once, and ``maps`` have fewer, shape (batch, maps, rows, cols). A block has
-    ``stride`` nodes on each side.
-    """
-    size = weight.shape[-1]
-    sides = -(-size // stride)  # blocks that the weights cover
-    ends = [stride * ((nodes + 2 * padding - size) // stride + sides) - nodes - padding for nodes in maps.shape[2:]]
-    lack = stride * sides - size
-    parts = []
-    for part, edges in ((maps, (padding, ends[1], padding, ends[0])), (weight, (0, lack, 0, lack))):
-        blocks = nn.functional.pixel_unshuffle(nn.functional.pad(part, edges), stride)
-        of_eight = blocks.new_zeros(len(part), *blocks.shape[2:], blocks.shape[1] + -blocks.shape[1] % 8).movedim(-1, 1)
-        of_eight[:, : blocks.shape[1]] = blocks
-        parts.append(of_eight)
-    return parts[0], parts[1]
 
 
 def _block_diagonal(weight: Tensor) -> Tensor:

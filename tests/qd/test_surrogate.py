@@ -9,7 +9,7 @@ import torch
 from qd import surrogate as module
 from qd.descriptors import Cells
 from qd.fitness import Evaluation, FitnessCfg, evaluation_of
-from qd.networks import MEMBERS, Networks, Training, in_blocks
+from qd.networks import MEMBERS, Networks, Training
 from qd.run.presets import SchedulerCfg
 from qd.surrogate import Surrogate, vary_elites
 from sim.corridor import SHAPE, corridor_heights
@@ -90,15 +90,6 @@ def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
     training = Training(networks, lambda outputs, targets: ((outputs - targets) ** 2).sum(), "cpu")
     training.run(maps, targets, drawn, torch.full_like(drawn, turned, dtype=torch.bool))
     return list(networks.parameters())
-
-
-@pytest.mark.parametrize("num_maps", [1, 2, 9])
-def test_a_convolution_in_blocks_is_the_same(num_maps):
-    maps, weight = torch.randn(3, num_maps, *SHAPE).double(), torch.randn(8, num_maps, 5, 5).double()
-    expected = torch.nn.functional.conv2d(maps, weight, stride=3, padding=2)
-    blocks, of_blocks = in_blocks(maps, weight, 3, 2)
-    assert blocks.shape[1] % 8 == 0 and blocks.is_contiguous(memory_format=torch.channels_last)
-    assert torch.allclose(torch.nn.functional.conv2d(blocks, of_blocks), expected, rtol=0.0, atol=1e-12)
 
 
 def test_mirrored_terrains_are_seen_as_if_they_lay_so():
