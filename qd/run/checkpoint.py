@@ -62,7 +62,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {_REMEDY}") from None
     header = len(_MAGIC) + _HASH_BYTES
     if not data.startswith(_MAGIC):
-        raise ValueError(f"{path} must start as a search checkpoint, got {data[: len(_MAGIC)]!r}: it is another file; {_REMEDY}")
+        raise ValueError(
+            f"{path} must start with {_MAGIC!r}, got {data[: len(_MAGIC)]!r}: it is another file or version's; {_REMEDY}"
+        )
     payload = data[header:]
     if hashlib.sha256(payload).digest() != data[len(_MAGIC) : header]:
         raise ValueError(

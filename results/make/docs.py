@@ -294,6 +294,7 @@ def speed() -> str:
         "its physics steps/s [million]": shown("world_steps_per_s", **million),
         "... as a share of contacts and solver alone": shown("bare_physics_ratio", ".2f"),
         "an iteration of preset wide [s]": inside("wide", "surrogate", "iteration_s_median", form=".1f"),
+        "... its crossings alone [s]": inside("wide", "surrogate", "crossings_s_median", form=".1f"),
         "... minutes for the paper's episodes": inside("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
         f"... by `{mixed}` [s]": inside("wide", mixed, "iteration_s_median", form=".1f"),
         f"... minutes by `{mixed}`": inside("wide", mixed, "minutes_per_4m_episodes", form=".1f"),

@@ -12,20 +12,23 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import SearchCfg, preset
+from qd.scheduler import Scheduler
 from qd.search import search
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import EvaluatorCfg, build_rollout, open_evaluator
+from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator
 from results.make.agreement import compare, cross_in_all_ways
 from results.make.bare import bare_rates, kernel_shares, standing_rates
 from results.make.common import Script, is_current, parse
@@ -95,15 +98,53 @@ def time_wide(script: Script) -> dict[str, Any]:
     numbers = {}
     for method in WIDE:
         cfg = script.search_cfg(method=method)
-        metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
+        with remembering() as asked:
+            metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
         seconds = float(np.median([row["wall_s"] for row in metrics]))
         numbers[method] = {
             "iteration_s_median": seconds,
+            "crossings_s_median": float(np.median(cross_again(script, cfg, asked[: -2 * cfg.scheduler.num_groups]))),
             "minutes_per_4m_episodes": PAPER_EPISODES / cfg.episodes_per_iteration * seconds / 60,
             "idle_share": float(np.median([row["idle_share"] for row in metrics])),
             "search_share": float(np.median([row["search_s"] / row["wall_s"] for row in metrics])),
         }
     return {"wide": numbers}
+
+
+@contextmanager
+def remembering() -> Iterator[list[NDArray[np.float32]]]:
+    """The terrains that searches ask for, lot by lot; at the end those of two iterations that are not crossed."""
+    asked, ask = [], Scheduler.ask
+
+    def remember(self: Scheduler, group: int = 0) -> NDArray[np.float32]:
+        asked.append(ask(self, group))
+        return asked[-1]
+
+    with patch.object(Scheduler, "ask", remember):
+        yield asked
+
+
+def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]]) -> list[float]:
+    """Seconds of each iteration after the first two, of a search's crossings without the search."""
+    lots_under_way, at_once = cfg.scheduler.num_groups, cfg.scheduler.num_terrains
+    iterations = len(lots) // lots_under_way
+    seeds = np.concatenate([episode_seeds(cfg.seed, 1 + iteration, at_once) for iteration in range(iterations)])
+    behind = list(zip(lots, np.split(seeds, np.cumsum([len(lot) for lot in lots])[:-1]), strict=True))
+    ended = []
+    evaluator = EvaluatorCfg(
+        robot=script.robot, policy=script.policy, num_terrains=at_once, num_replicas=cfg.replicas,
+        lots=lots_under_way, device=script.device, workers="1",
+    )  # fmt: skip
+    with open_evaluator(evaluator) as pipeline:
+        for _ in range(lots_under_way):
+            pipeline.put(*behind.pop(0))
+        for _ in range(iterations):
+            for _ in range(lots_under_way):
+                pipeline.take()
+                if behind:
+                    pipeline.put(*behind.pop(0))
+            ended.append(time.perf_counter())
+    return np.diff(ended)[WARM_UP - 1 :].tolist()
 
 
 def time_curve(script: Script) -> dict[str, Any]:
