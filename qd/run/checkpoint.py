@@ -63,7 +63,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     header = len(_MAGIC) + _HASH_BYTES
     if not data.startswith(_MAGIC):
         raise ValueError(
-            f"{path} must start with {_MAGIC!r}, got {data[: len(_MAGIC)]!r}: it is another file or version's; {_REMEDY}"
+            f"{path} must start with {_MAGIC!r}, got {data[: len(_MAGIC)]!r}: another file's or version's; {_REMEDY}"
         )
     payload = data[header:]
     if hashlib.sha256(payload).digest() != data[len(_MAGIC) : header]:
