@@ -62,12 +62,6 @@ class FaultCounts:
     certifier_resolved_outcomes: NDArray[np.int64]
     """By them with contact resolved, shape (N, C, 4)."""
 
-    @classmethod
-    def none_of(cls, num_elites: int) -> "FaultCounts":
-        """Of elites that nobody has crossed yet."""
-        none, nobody = np.zeros((num_elites, 4), np.int64), np.zeros((num_elites, 0, 4), np.int64)
-        return cls(resolved_outcomes=none, certifier_outcomes=nobody, certifier_resolved_outcomes=nobody)
-
     def certificates(self) -> NDArray[np.bool_]:
         """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
         both = (self.certifier_outcomes, self.certifier_resolved_outcomes)
@@ -162,6 +156,14 @@ class Archive(Evaluation):
         return self.collision_rate > 0.0
 
     @property
+    def counts(self) -> FaultCounts:
+        """``faults``, or counts of 0 where nobody has crossed the elites under other conditions."""
+        none, nobody = np.zeros((len(self), 4), np.int64), np.zeros((len(self), 0, 4), np.int64)
+        return self.faults or FaultCounts(
+            resolved_outcomes=none, certifier_outcomes=nobody, certifier_resolved_outcomes=nobody
+        )
+
+    @property
     def failing(self) -> NDArray[np.bool_]:
         """Whether fresh episodes say that the controller fails an elite, shape (N,)."""
         fresh = self.fresh
@@ -170,14 +172,12 @@ class Archive(Evaluation):
     @property
     def confirmed(self) -> NDArray[np.bool_]:
         """Whether it fails an elite with contact resolved too, shape (N,)."""
-        if self.faults is None:
-            return np.zeros(len(self), bool)
-        return self.failing & (goal_rates(self.faults.resolved_outcomes) < FAILING_GOAL_RATE)
+        return self.failing & (goal_rates(self.counts.resolved_outcomes) < FAILING_GOAL_RATE)
 
     @property
     def certified(self) -> NDArray[np.bool_]:
         """Whether it fails an elite that another controller crosses, shape (N,)."""
-        return np.zeros(len(self), bool) if self.faults is None else self.failing & self.faults.certificates().any(1)
+        return self.failing & self.counts.certificates().any(axis=1)
 
     def has_elites_of(self, other: "Archive") -> bool:
         """Whether the elites and all that was found of them are another's too, in whatever order."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import OUTCOMES, Archive, FaultCounts, FreshValues, goal_rates
+from qd.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.fitness import FITNESS_FLOOR
 from sim.files.intervals import bootstrap_interval, rate_words, wilson_interval
 
@@ -49,8 +49,8 @@ def fault_numbers(
 
     ``families`` has shape (N,); ``seen``, of shape (N, C), says whether a certifier has trained on kin of an elite.
     """
-    faults, failing, confirmed = archive.faults, archive.failing, archive.confirmed
-    names = () if faults is None else faults.certifiers
+    faults, failing, confirmed = archive.counts, archive.failing, archive.confirmed
+    names = faults.certifiers
     counts = ("confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
@@ -58,7 +58,7 @@ def fault_numbers(
         "families": None if families is None else len(np.unique(families)),
         "certifiers": list(names),
     }
-    if faults is None or not failing.any():
+    if archive.faults is None or not failing.any():
         return numbers
     resolved = failing & faults.resolved_outcomes.any(axis=1)
     certificates = faults.certificates() & failing[:, None]
@@ -96,9 +96,9 @@ def count_faults(archive: Archive) -> int | None:
 
 def certifier_of(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
     """Name of the certifier that crosses an elite most often, of all or of some; None if none has a certificate."""
-    faults = archive.faults
-    if faults is None or not archive.certified[number]:
+    if not archive.certified[number]:
         return None
+    faults = archive.counts
     rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
     rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
     names = [name for name, rate in rate_of.items() if rate > 0.0 and (among is None or name in among)]
@@ -110,18 +110,20 @@ def any_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
+def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
+    """Further episodes on an elite that reached the goal, and valid ones, by who crossed it how, in words."""
+    faults = archive.counts
+    counts = {"With contact resolved (steps of 1 ms)": faults.resolved_outcomes[number]}
+    for column, name in enumerate(faults.certifiers):
+        counts[name] = faults.certifier_outcomes[number, column]
+        counts[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, column]
+    return {who: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for who, ends in counts.items() if ends.any()}
+
+
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
-    faults = archive.faults or FaultCounts.none_of(len(archive))
-    kinds = [("With contact resolved (steps of 1 ms)", faults.resolved_outcomes[number])]
-    for column, name in enumerate(faults.certifiers):
-        kinds.append((name, faults.certifier_outcomes[number, column]))
-        kinds.append((f"{name} with contact resolved", faults.certifier_resolved_outcomes[number, column]))
-    sentences = [
-        f"{kind}: {rate_words(int(counts[0]), int(counts.sum() - counts[_INVALID]))} reach the goal."
-        for kind, counts in kinds
-        if counts.any()
-    ]
+    faults, rates = archive.counts, further_rates(archive, number)
+    sentences = [f"{who}: {rate_words(*rate)} reach the goal." for who, rate in rates.items()]
     if not sentences:
         return []
     crossers = [*compress(faults.certifiers, faults.certificates()[number].tolist())]
@@ -141,8 +143,7 @@ def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:
     """The fresh episodes of an elite by :data:`qd.archive.OUTCOMES`, shape (4,)."""
     fresh = archive.fresh
     assert fresh is not None
-    invalid = int(fresh.invalid_episodes[number])
-    valid = int(fresh.episodes[number]) - invalid
+    valid, invalid = int(fresh.counted[number]), int(fresh.invalid_episodes[number])
     goal, collided = (round(float(rate[number]) * valid) for rate in (fresh.goal_rate, fresh.collision_rate))
     return np.array([goal, collided, valid - goal - collided, invalid])
 
@@ -161,7 +162,7 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
         ``resolved``: rate of the controller with contact resolved; ``certificates``: of each controller that certifies
         it name, hash, and rates at the ``searched`` settings and with contact ``resolved``.
     """
-    faults = archive.faults or FaultCounts.none_of(len(archive))
+    faults = archive.counts
     resolved = faults.resolved_outcomes[number]
     kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
     return {

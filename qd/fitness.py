@@ -72,6 +72,11 @@ class Evaluation:
     """Episodes run, the invalid ones included, shape (T,)."""
 
     @property
+    def counted(self) -> NDArray[np.int64]:
+        """Valid episodes, shape (T,)."""
+        return self.episodes - self.invalid_episodes
+
+    @property
     def valid(self) -> NDArray[np.bool_]:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes

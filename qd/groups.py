@@ -15,7 +15,7 @@ from kernels.episode import Outcome
 from qd.archive import Archive
 from qd.causes import HALF_WIDTH, UNCLEAR, causes_at, commonest_words
 from qd.faults import count_faults
-from qd.fitness import FAILING_GOAL_RATE
+from qd.fitness import FAILING_GOAL_RATE, Evaluation
 from qd.minima import MinimalTerrains
 from sim.bank import heights_of
 from sim.crossing import CrossingCfg
@@ -69,7 +69,7 @@ def way_to_end(outcome: int, fallen: bool) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Elites:
+class Elites(Evaluation):
     """N elites by what fresh episodes say of each where it has valid ones, else as they were found.
 
     Lower numbers have a higher fitness.
@@ -79,18 +79,6 @@ class Elites:
     """Number of each elite in the archive, shape (N,), ascending."""
     fresh: NDArray[np.bool_]
     """Whether the values are of fresh episodes, shape (N,)."""
-    fitness: NDArray[np.float64]
-    """Shape (N,)."""
-    counted: NDArray[np.int64]
-    """Valid episodes, shape (N,)."""
-    goal_rate: NDArray[np.float64]
-    """Share of them that reached the goal, shape (N,)."""
-    collision_rate: NDArray[np.float64]
-    """Share that ended in a base collision, shape (N,)."""
-    fallen_rate: NDArray[np.float64]
-    """Share that ended tilted by more than 60 degrees, shape (N,)."""
-    end_position: NDArray[np.float32]
-    """Where the typical episode ended [m], shape (N, 2); NaN where that is not known."""
     verdict: NDArray[np.int64]
     """Place in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found it say whether it fails."""
 
@@ -139,20 +127,14 @@ class Elites:
 
 def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
     """The elites of an archive, in its order; ``judged`` leaves out those whose fresh episodes are invalid."""
-    names = ("fitness", "episodes", "invalid_episodes", "goal_rate", "collision_rate", "fallen_rate", "end_position")
-    values = {name: np.asarray(getattr(archive, name)) for name in names}
+    values = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(Evaluation)}
     is_fresh = np.zeros(len(archive), bool)
     if (fresh := archive.fresh) is not None:
         is_fresh = fresh.valid
         for name, value in values.items():
             values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
-    elites = Elites(
-        numbers=np.arange(len(archive)),
-        fresh=is_fresh,
-        counted=values.pop("episodes") - values.pop("invalid_episodes"),
-        verdict=np.maximum(verdicts_of(archive), values["goal_rate"] < FAILING_GOAL_RATE),
-        **values,
-    )
+    verdict = np.maximum(verdicts_of(archive), values["goal_rate"] < FAILING_GOAL_RATE)
+    elites = Elites(numbers=np.arange(len(archive)), fresh=is_fresh, verdict=verdict, **values)
     return elites.rows(np.flatnonzero(is_fresh)) if judged and fresh is not None else elites
 
 
@@ -289,7 +271,7 @@ def summary_of(ranking: Ranking, archive: Archive) -> str:
     commonest = next(iter(by_cause), UNCLEAR)
     if commonest != UNCLEAR:
         words.append(commonest_words(commonest) if failing > 1 else f"cause: {commonest}")
-    if failing and archive.faults is not None and archive.faults.certifiers:
+    if failing and archive.counts.certifiers:
         faults, crosses = count_faults(archive), "another controller of this robot crosses"
         if faults is None:
             words.append(f"{crosses} {archive.certified.sum() or 'none'} of them")

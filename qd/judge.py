@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import ARCHIVE_FILE, Archive, FaultCounts, FreshValues, goal_rates, read_archive, write_archive
+from qd.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
@@ -160,7 +160,7 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
 
 def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
     """The archive, which has fresh values, after its controller has crossed some elites with contact resolved."""
-    faults = archive.faults or FaultCounts.none_of(len(archive))
+    faults = archive.counts
     counts = _cross(archive, rows, search, crossings, search.policy, "resolved", _CONFIRM_STREAM, "contact resolved")
     return replace(archive, faults=replace(faults, resolved_outcomes=_put(faults.resolved_outcomes, rows, counts)))
 
@@ -174,7 +174,7 @@ def certify(
     resolved, since it cannot get a certificate. Counts of a certifier that is not asked stay, those of another
     controller of the same name go.
     """
-    faults = archive.faults or FaultCounts.none_of(len(archive))
+    faults = archive.counts
     searched = dict(zip(faults.certifiers, faults.certifier_outcomes.swapaxes(0, 1), strict=True))
     resolved = dict(zip(faults.certifiers, faults.certifier_resolved_outcomes.swapaxes(0, 1), strict=True))
     hashes = dict(zip(faults.certifiers, faults.certifier_sha256, strict=True))
@@ -223,9 +223,8 @@ def seen_by(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[s
 
     None if the training record of one of them is not at hand.
     """
-    assert archive.faults is not None
     marks, columns = np.array(marks_of(archive.genes)), []
-    for name in archive.faults.certifiers:
+    for name in archive.counts.certifiers:
         if (policy := certifiers.get(name)) is None:
             return None
         trained_on, files = recorded_marks(policy), ControllerSpec.parse(policy).files

@@ -16,8 +16,7 @@ from qd.judge import CROSSINGS_FOLDER, certifiers_of, certify, check_certifiers,
 from qd.minima import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
 from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
 from qd.run.directory import claimed
-from qd.show.figures import save_figure
-from qd.show.minimal_figure import draw_minimal
+from qd.show.figures import draw_minimal, save_figure
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, check_policy, origin_of
 from sim.bank import heights_of

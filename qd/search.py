@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
+from qd.faults import fault_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.groups import rank, summary_of
 from qd.minima import read_minimal
@@ -15,7 +16,7 @@ from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import SearchBar, clock, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
-from qd.show.figures import summary, write_figures
+from qd.show.figures import write_figures
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds, origin_of
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
@@ -30,6 +31,10 @@ from sim.spaces.registry import get_space, is_own
 _SAME = ("robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
          "collision_bit")  # fmt: skip
 _BATCH = ("fitness", "collision_rate", "goal_rate")
+_BY_FRESH_EPISODES = (
+    "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
+    "corrected_elites", "mean_fitness_corrected", "mean_std", "mean_std_interval",
+)  # fmt: skip
 
 
 def search(
@@ -117,7 +122,7 @@ def _run_iterations(
         goes_ahead = iteration < cfg.iterations
         results, evaluations, search_s = [], [], 0.0
         for group in range(num_groups):
-            result = pipeline.take(bar.within(iteration, group, num_groups))
+            result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
             refuse_all_invalid(result)
             evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
             emitters_began = time.perf_counter()
@@ -201,7 +206,7 @@ def say_what_stops_the_robot(
     say("Next: ", (view, "cyan"), ", ", (report, "cyan"), " or ", (replay, "cyan"))
     if archive.fresh is None:
         say((command_line("judge", **flags, policy=policy), "cyan"), " says which of them are faults.")
-    elif not (archive.faults and archive.faults.certifiers):
+    elif not archive.counts.certifiers:
         train = command_line("finetune", robot=robot, specialist=run, policy=policy, space=space)
         say((train, "cyan"), " trains a controller to cross them: without another one no fault is known.")
 
@@ -222,8 +227,28 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
     origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)
     figures = write_figures(run.path, archive, metrics)
-    gpus = 0 if origin["device"].startswith("CPU") else max((row.get("workers", 1) for row in metrics), default=1)
-    numbers = summary(archive, metrics, gpus=gpus, origin=origin)
+    with_collision = int(archive.collided.sum())
+    numbers = {
+        **origin,
+        **archive.named(),
+        "space": archive.space,
+        "space_sha256": archive.space_sha256,
+        "iterations": archive.iterations,
+        "terrains_evaluated": sum(row["terrains"] for row in metrics),
+        "episodes": sum(row["episodes"] for row in metrics),
+        "elites": len(archive),
+        "reachable_cells": archive.cells.num_cells,
+        "reachable_coverage": archive.reachable_coverage,
+        "qd_score": archive.qd_score,
+        "mean_fitness": archive.mean_fitness,
+        **dict.fromkeys(_BY_FRESH_EPISODES),
+        **fault_numbers(archive),
+        "with_collision": with_collision,
+        "without_collision": len(archive) - with_collision,
+        "wall_s": sum(row["wall_s"] for row in metrics),
+        "gpus": 0 if origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
+        "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
+    }
     write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
     say(
         f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "

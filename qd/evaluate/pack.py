@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, FaultCounts
+from qd.archive import Archive
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
 from qd.evaluate.measures import interval_of, mean_of, terrain_rates
 from qd.evaluate.sets import TerrainSet, set_rng
@@ -159,7 +159,7 @@ def make_pack(
         controllers = {"searched": searched, **controllers}
     for other in controllers.values():
         check_policy(other, body, compute.device)
-    faults = archive.faults or FaultCounts.none_of(len(archive))
+    faults = archive.counts
     crossed = faults.resolved_outcomes.any(axis=1) & faults.certifier_outcomes.any(axis=(1, 2))
     if archive.fresh is None or (archive.failing & ~crossed).any():
         raise ValueError(

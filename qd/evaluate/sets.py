@@ -81,8 +81,7 @@ class TerrainSet:
     @property
     def certified(self) -> NDArray[np.bool_] | None:
         """Whether anybody crosses each elite that its search's controller fails, shape (T,); None if none was asked."""
-        faults = None if self.elites is None else self.elites.faults
-        return None if self.elites is None or faults is None or not faults.certifiers else self.elites.certified
+        return self.elites.certified if self.elites is not None and self.elites.counts.certifiers else None
 
     def rows(self, places: NDArray[np.int64]) -> "TerrainSet":
         """The terrains in some places."""

@@ -130,8 +130,9 @@ def _about_certified(
 ) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
-        if terrains.certified is None or terrains.elites is None or (faults := terrains.elites.faults) is None:
+        if terrains.certified is None or terrains.elites is None:
             continue
+        faults = terrains.elites.counts
         given = faults.certificates() & terrains.elites.failing[:, None]
         counts = dict(zip(faults.certifiers, given.sum(axis=0).tolist(), strict=True))
         roles: dict[str | None, str] = {terrains.elites.policy_sha256: "searched"}

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
@@ -70,6 +69,10 @@ class Bar:
             self._written = self._moved
             print(self._line().plain, file=sys.stderr, flush=True)
 
+    def within(self, begin: float, size: float) -> Callable[[float], None]:
+        """A function that moves to a share of a part of the work, which begins at a position and has a size."""
+        return lambda share: self.move_to(begin + share * size)
+
     def _line(self) -> Text:
         """Time left, share, bar and text; what does not fit is cut off at the end."""
         share, left = self._position / self._total, "..."
@@ -84,22 +87,11 @@ class Bar:
         )  # fmt: skip
 
 
-@contextmanager
-def share_bar(text: str) -> Iterator[Callable[[float], None]]:
-    """A bar over one piece of work; yields a function that moves it to the share that is done."""
-    with Bar(text) as bar:
-        yield bar.move_to
-
-
 class SearchBar(Bar):
-    """A bar over the iterations of a search, some of them done before, that moves within them."""
+    """A bar over the iterations of a search, some of them done before."""
 
     def __init__(self, iterations: int, done: int) -> None:
         super().__init__(f"iteration {done + 1}/{iterations}: compiling and evaluating", iterations, done)
-
-    def within(self, iteration: int, part: int = 0, parts: int = 1) -> Callable[[float], None]:
-        """A function that moves the bar to a share of an iteration, counted from 1, or of one of its equal parts."""
-        return lambda share: self.move_to(iteration - 1 + (part + share) / parts)
 
     def show(self, row: dict[str, Any], workers: object = None) -> None:
         """Shows where the search stands after an iteration, and how its workers fare if there are any."""

@@ -16,7 +16,8 @@ from qd.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy
-from sim.files.command import chosen_elites
+from sim.files.command import chosen_elites, command_line
+from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
 from sim.robots.robot import RobotCfg
@@ -57,6 +58,10 @@ class OpenedRun:
     def space(self) -> TerrainSpace:
         """What the genes mean."""
         return get_space(self.archive.space, self.archive.space_sha256)
+
+    def command(self, word: str, **flags: object) -> str:
+        """A command about this run as a user types it."""
+        return without_machine(command_line(word, robot=self.robot.spec, run=self.path, **flags))
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config."""
@@ -100,9 +105,7 @@ class OpenedRun:
 
         They are of the robot's panel, of the run, or beside a published run.
         """
-        faults, folder = self.archive.faults, self.folder
-        if faults is None:
-            return {}
+        faults, folder = self.archive.counts, self.folder
         names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
         own = [*controllers_in(folder / CERTIFIERS_FOLDER).values(), str(folder.parent / f"{folder.name}.pt")]
         files = [*controllers_in(self.robot.panel).values(), *own]

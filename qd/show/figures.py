@@ -1,6 +1,7 @@
-"""What a search leaves to look at: its curves, its archive, and its numbers."""
+"""What a search leaves to look at: its curves, its archive, and minimal terrains."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,20 +12,21 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.faults import FRESH_EPISODES, fault_numbers, fresh_numbers
+from qd.faults import FRESH_EPISODES
+from sim.bank import terrains_of
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
+from sim.files.intervals import value_words
 from sim.ground import GroundMaps
-from sim.maps.picture import LENGTH, height_colors, tinted
-
-CURVES_FILE = "curves.png"
-ARCHIVE_FIGURE_FILE = "archive.png"
+from sim.maps.picture import LENGTH, WIDTH, height_colors, tinted
+from sim.spaces.base import TerrainSpace
 
 _BLUE = "#0072b2"
 _SUN = (-0.45, 0.35)  # where the light of a relief comes from: how much slopes along x and y gain by it
 _MARK_M = 0.3  # half side of the marks of start and goal
 _START, _GOAL = (240, 200, 60), (0, 158, 115)
+_SHOWN, _COLUMNS = 12, 3  # minimal terrains that are shown, and how many side by side
 
 
 class PenaltyLook(NamedTuple):
@@ -77,7 +79,7 @@ def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> N
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:
     """Draws the figures of a search: its curves, and its archive on parallel axes."""
-    figures = {CURVES_FILE: draw_curves(archive, metrics), ARCHIVE_FIGURE_FILE: draw_archive(archive)}
+    figures = {"curves.png": draw_curves(archive, metrics), "archive.png": draw_archive(archive)}
     for name, figure in figures.items():
         save_figure(folder / name, figure)
     return [folder / name for name in figures]
@@ -147,37 +149,38 @@ def draw_archive(archive: Archive) -> Figure:
     return figure
 
 
-_CORRECTED = (
-    "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
-    "corrected_elites", "mean_fitness_corrected",
-    "mean_std", "mean_std_interval",
-)  # fmt: skip
+def draw_minimal(
+    robot: str, numbers: dict[str, Any], genes: Mapping[int, NDArray[np.float32]], space: TerrainSpace
+) -> Figure:
+    """How many minimal terrains there are of each cause, and some from above, one of each cause first.
 
-
-def summary(
-    archive: Archive, metrics: Sequence[dict[str, Any]], *, gpus: int, origin: dict[str, Any]
-) -> dict[str, Any]:
-    """The numbers of a search, as ``archive.json`` has them."""
-    corrected = {} if archive.fresh is None else fresh_numbers(archive, archive.fresh)
-    with_collision = int(archive.collided.sum())
-    return {
-        **origin,
-        **archive.named(),
-        "space": archive.space,
-        "space_sha256": archive.space_sha256,
-        "iterations": archive.iterations,
-        "terrains_evaluated": sum(row["terrains"] for row in metrics),
-        "episodes": sum(row["episodes"] for row in metrics),
-        "elites": len(archive),
-        "reachable_cells": archive.cells.num_cells,
-        "reachable_coverage": archive.reachable_coverage,
-        "qd_score": archive.qd_score,
-        "mean_fitness": archive.mean_fitness,
-        **{name: corrected.get(name) for name in _CORRECTED},
-        **fault_numbers(archive),
-        "with_collision": with_collision,
-        "without_collision": len(archive) - with_collision,
-        "wall_s": sum(row["wall_s"] for row in metrics),
-        "gpus": gpus,
-        "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
-    }
+    ``numbers`` has at least one terrain, as ``minimal.json`` has them; ``genes`` of each, shape (num_genes,), by the
+    number of the elite.
+    """
+    entries = numbers["elites"]
+    causes = [entry["cause"]["kind"] if entry["cause"] else "unclear" for entry in entries]
+    turns = [causes[:place].count(cause) for place, cause in enumerate(causes)]
+    shown = np.argsort(turns, kind="stable")[:_SHOWN].tolist()
+    rows, counts = -(-len(shown) // _COLUMNS), Counter(causes).most_common()
+    figure = new_figure(13.0, 1.0 + 0.25 * len(counts) + 2.1 * rows)
+    figure.suptitle(f"{robot}: {len(entries):,} minimal terrains; start yellow, goal green, blue low, brown high")
+    parts_of_figure: Any = figure.subfigures(2, 1, height_ratios=(1.0 + 0.25 * len(counts), 2.1 * rows))
+    bars, gallery = parts_of_figure
+    axes = bars.subplots()
+    drawn = axes.barh([cause for cause, _ in counts], [count for _, count in counts], color="#d55e00")
+    axes.bar_label(drawn, padding=3)
+    axes.invert_yaxis()
+    axes.margins(x=0.08)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("terrains by their cause")
+    panels = gallery.subplots(rows, _COLUMNS, squeeze=False).ravel()
+    grids, grounds = terrains_of(np.array([genes[entries[place]["elite"]] for place in shown]), space)
+    for panel in panels[len(shown) :]:
+        panel.set_axis_off()
+    for k, (panel, place) in enumerate(zip(panels, shown, strict=False)):
+        ground, entry = None if grounds is None else grounds[k : k + 1], entries[place]
+        panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
+        parts = f"{len(entry['bumps'])} of {entry['of']} parts"
+        arrive = value_words(entry["goal_rate"], None, ".0%")
+        panel.set_title(f"elite {entry['elite']}: {causes[place]}, {parts}, {arrive} arrive", fontsize=9)
+    return figure

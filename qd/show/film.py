@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter1d
 from kernels.episode import Outcome
 from qd.groups import way_to_end
 from qd.judge import controllers_in
-from qd.run.progress import share_bar
+from qd.run.progress import Bar
 from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
 from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
@@ -290,7 +290,7 @@ def film_source(
     if beside is not None:
         others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]
     for recording, other, file in zip(recordings, others, files, strict=True):
-        with share_bar(f"filming {recording.labels[0]}") as progress:
-            about: Any = {"episode": episode, "by": source.by, "beside": other, "progress": progress}
+        with Bar(f"filming {recording.labels[0]}") as bar:
+            about: Any = {"episode": episode, "by": source.by, "beside": other, "progress": bar.move_to}
             film(recording, robot, source.scales, file, **about, **look)
     return files

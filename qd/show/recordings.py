@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.run.directory import RUNS
-from qd.run.progress import share_bar
+from qd.run.progress import Bar
 from qd.workers.cross import Cache
 from qd.workers.evaluator import episode_seeds
 from sim.files.records import code_fingerprint, robot_identity
@@ -164,17 +164,14 @@ class Recordings:
             return [*recordings.values()]
         words = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {wanted[missing[0]].replicas} times each"
         done = 0
-        with share_bar(f"crossing {words}") as progress:
+        with Bar(f"crossing {words}", len(missing)) as bar:
             for batch in self._batches(wanted, missing):
-
-                def report(share: float, done: int = done, size: int = len(batch)) -> None:
-                    progress((done + share * size) / len(missing))
-
-                for k, recording in zip(batch, self._cross([wanted[k] for k in batch], report), strict=True):
+                crossed = self._cross([wanted[k] for k in batch], bar.within(done, len(batch)))
+                for k, recording in zip(batch, crossed, strict=True):
                     self.keep(wanted[k], recording)
                     recordings[k] = recording
                 done += len(batch)
-                report(1.0)
+                bar.move_to(done)
         return [recordings[k] for k in range(len(wanted))]
 
     def _batches(self, wanted: Sequence[Wanted], missing: Sequence[int]) -> Iterator[list[int]]:

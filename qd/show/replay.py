@@ -203,7 +203,7 @@ def describe(source: Source, k: int, recording: Recording) -> str:
         columns[:0] = [(f"{whole}{label}", values, n) for label, values in stored.items() if values is not None]
     rows = {"": [label for label, _, _ in columns]}
     rows["episodes"] = [str(values.episodes[row]) for _, values, row in columns]
-    valid = [int(v.episodes[row] - v.invalid_episodes[row]) if v.valid[row] else 0 for _, v, row in columns]
+    valid = [int(v.counted[row]) if v.valid[row] else 0 for _, v, row in columns]
     for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
         shares = [getattr(values, rate)[row] for _, values, row in columns]
         counted = zip(shares, valid, strict=True)

@@ -17,7 +17,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.run.progress import share_bar
+from qd.run.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import join_results
@@ -271,8 +271,8 @@ class Crossings:
         lot = _lot_size(replace(cfg, num_terrains=count))
         try:
             pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
-            with share_bar(label) as progress:
-                for part, result in pipeline.in_lots(terrains[missing], seeds[missing], lot, progress):
+            with Bar(label) as bar:
+                for part, result in pipeline.in_lots(terrains[missing], seeds[missing], lot, bar.move_to):
                     yield missing[part], result
         except BaseException:
             self.close()  # what failed is not used again
@@ -294,13 +294,13 @@ class Crossings:
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
         processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, RolloutResult]]()
-        with share_bar(label) as progress:
+        with Bar(label, len(missing)) as bar:
             crossings = cross_terrains(
                 self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
                 num_episodes=cfg.num_replicas, device=cfg.device, processes=processes, resolved=True,
             )  # fmt: skip
             for count, crossed in enumerate(crossings, 1):
-                progress(count / len(missing))
+                bar.move_to(count)
                 done.append(crossed)
                 if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
                     numbers, episodes = zip(*done, strict=True)

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 
 from kernels.super_gaussian import LOWER, UPPER
-from qd.archive import FaultCounts
 from qd.groups import KIN_M, ORDERS, elites_of, families_of, rank, summary_of
 from qd.minimise import MinimalTerrains
 from sim.bank import heights_of
@@ -64,7 +63,7 @@ def ranked(ends=(np.nan, np.nan)):
         end_position=np.full((6, 2), ends, np.float32),
     )
     fresh = fresh_values(archive)
-    faults = FaultCounts.none_of(6)
+    faults = archive.counts
     crossed = np.array([[0, 20, 0, 0], [20, 0, 0, 0]])[[0, 0, 1, 0, 0, 0]][:, None]
     faults = dataclasses.replace(
         faults, resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",), certifier_sha256=("a" * 64,),

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from qd import judge as judging
 from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
 from qd.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
+from qd.run.progress import Bar
 from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -114,7 +114,7 @@ def numbers_in(path):
 
 def test_bars_say_how_many_are_to_come(path, monkeypatch):
     bars = []
-    monkeypatch.setattr("qd.workers.cross.share_bar", lambda text: nullcontext(bars.append(text)))
+    monkeypatch.setattr("qd.workers.cross.Bar", lambda text: bars.append(text) or Bar(text))
     judged(path)
     assert bars == ["1 of 3: contact resolved", "2 of 3: C-G", "3 of 3: C-G, contact resolved"]
 

@@ -42,7 +42,11 @@ def test_files_agree_with_each_other(tmp_path, monkeypatch):
     assert numbers["terrains_evaluated"] == 4 * 12
     assert numbers["episodes"] == 4 * 12 * 4
     assert numbers["reachable_cells"] == 4795
-    assert numbers["gpus"] == 0
+    assert numbers["gpus"] == numbers["invalid_episodes"] == 0
+    assert numbers["wall_s"] == pytest.approx(sum(row["wall_s"] for row in rows_of(path, timed=True)))
+    assert numbers["with_collision"] == (archive.collision_rate > 0.0).sum()
+    assert numbers["with_collision"] + numbers["without_collision"] == numbers["elites"]
+    assert numbers["elites_reproduced"] is numbers["failing"] is numbers["faults"] is None
     assert set(numbers) >= {"command", "commit", "device", "versions", "seed", "date", "wall_s", "invalid_episodes"}
     assert stored.qd_score == pytest.approx(numbers["qd_score"])
 

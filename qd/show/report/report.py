@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from qd.archive import ARCHIVE_FILE, Archive
+from qd.archive import ARCHIVE_FILE
 from qd.evaluate.tables import read_tables
 from qd.groups import elites_of, rank
 from qd.minimise import read_minimal
-from qd.run.directory import CONFIG_FILE, METRICS_FILE, ROUNDS_FILE, Metrics, RunDirectory, folder_for
-from qd.run.settings import find_policy
+from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, folder_for
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Cross, Recordings
 from qd.show.report.cases import cross_cases
@@ -15,10 +14,10 @@ from qd.show.report.evaluation import compared_of
 from qd.show.report.page import check_page, publish_page
 from qd.show.report.pictures import why_no_pictures
 from qd.show.report.rounds import write_rounds
-from qd.show.report.search import Material, content_of
+from qd.show.report.search import content_of
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.records import without_machine
-from sim.policy.spec import SHIPPED, spec_of
+from sim.policy.spec import spec_of
 
 _OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown
 
@@ -45,30 +44,34 @@ def write_report(
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
     opened_run = _opened(robot, run, space)
-    suffix = "" if policy is None else opened_run.suffix(spec_of(policy, opened_run.robot))
+    archive, minima = opened_run.archive, read_minimal(opened_run.folder, opened_run.archive)
+    crosser = spec_of(policy or opened_run.as_searched()[0], opened_run.robot)
+    suffix = "" if policy is None else opened_run.suffix(crosser)
     out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)
     compared = None
     if tables is not None:
-        about = {"file": without_machine(str(tables)), "searched": opened_run.archive.policy_sha256}
+        about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
         compared = compared_of({**read_tables(tables, opened_run.robot)}, **about)
-    material = _material(opened_run, policy)
-    ranking, missing = material.ranking, list[str]()
+    ranking, missing = rank(archive, opened_run.space, minima, judged=True), list[str]()
+    content = content_of(opened_run, ranking, minima, crosser, is_searched=policy is None)
     heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
     heads = heads or ranking.worst(num_elites)
     causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}
     firsts = [int(ranking.elites.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
     others, cases = firsts[:_OTHER_CAUSES], {}
-    if reason := _why_not_crossed(material, device):
+    if reason := _why_not_crossed(opened_run, policy, device):
         missing.append(reason)
     else:
         no_pictures = why_no_pictures()
         recordings = Recordings(opened_run.robot, device=resolve_device(device), cross=cross)
-        cases = cross_cases(material, heads, others, recordings, episodes=episodes, pictured=not no_pictures)
+        cases = cross_cases(
+            opened_run, ranking, crosser, heads, others, recordings, episodes=episodes, pictured=not no_pictures
+        )
         missing += [no_pictures] if no_pictures else []
         missing += [f"All crossings of elite {n} were invalid this time." for n in (*heads, *others) if n not in cases]
     return publish_page(
-        out, "search.html", **content_of(material), missing=missing, compared=compared,
+        out, "search.html", **content, missing=missing, compared=compared,
         heads=[cases[number] for number in heads if number in cases],
         others=[cases[number] for number in others if number in cases],
     )  # fmt: skip
@@ -84,47 +87,12 @@ def _opened(robot: str | None, run: Path | None, space: str | None) -> OpenedRun
     return opened_run
 
 
-def _material(opened_run: OpenedRun, policy: str | None) -> Material:
-    """Reads what there is beside the archive."""
-    archive, folder, search = opened_run.archive, RunDirectory(opened_run.folder), opened_run.search()
-    minima = read_minimal(opened_run.folder, archive)
-    gpus = folder.read_summary().get("gpus")
-    searched = SHIPPED if search is None else search.policy
-    return Material(
-        opened_run=opened_run,
-        ranking=rank(archive, opened_run.space, minima, judged=True),
-        minima=minima,
-        metrics=_metrics_of(folder, archive),
-        search=search,
-        origin={} if search is None else folder.read_config(),
-        gpus=gpus if type(gpus) is int else 0,
-        policy=spec_of(policy or searched, opened_run.robot),
-        named_policy=policy,
-    )
-
-
-def _metrics_of(folder: RunDirectory, archive: Archive) -> Metrics | None:
-    """The rows up to the archive's iteration; a run that goes on meanwhile may have some more."""
-    if not (folder.path / METRICS_FILE).exists():
-        return None
-    rows = folder.read_metrics()[: archive.iterations]
-    if len(rows) < archive.iterations:
-        raise ValueError(
-            f"{folder.path / METRICS_FILE} must have a row for each of {archive.iterations} iterations, got "
-            f"{len(rows)}: resume the search, which writes it again"
-        )
-    return rows
-
-
-def _why_not_crossed(material: Material, device: str | None) -> str:
+def _why_not_crossed(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
     """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
-    opened_run = material.opened_run
     try:
-        if material.named_policy is None and material.search is not None:
-            find_policy(opened_run.path, material.search, opened_run.robot)
-        check_policy(material.policy, opened_run.robot, resolve_device(device))
+        check_policy(opened_run.policy(policy), opened_run.robot, resolve_device(device))
     except ValueError as error:
-        if material.named_policy is not None:
+        if policy is not None:
             raise
         return f"No terrain is crossed, since the search's controller cannot be loaded: {error}. Name it with --policy."
     return ""

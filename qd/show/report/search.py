@@ -1,7 +1,6 @@
 """The page about a search, in data: how the controller fails, on which terrains, and where the numbers come from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,12 @@ from qd.archive import Archive
 from qd.faults import any_of, fault_numbers
 from qd.groups import VERDICTS, Ranking, summary_of
 from qd.minimise import MinimalTerrains
-from qd.run.directory import Metrics
-from qd.run.settings import SearchCfg
+from qd.run.directory import METRICS_FILE, Metrics, RunDirectory
 from qd.show.crossed import Rate
 from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
-from sim.files.command import command_line
 from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec
@@ -29,47 +26,22 @@ _MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
-@dataclass(frozen=True, kw_only=True)
-class Material:
-    """Everything that was read."""
-
-    opened_run: OpenedRun
-    ranking: Ranking
-    minima: MinimalTerrains | None
-    metrics: Metrics | None
-    """One row an iteration, up to those of the archive; None where there are none."""
-    search: SearchCfg | None
-    """None where the archive lies without its config."""
-    origin: Mapping[str, Any]
-    """Command, commit, device, versions, seed and date of the search, as far as they are known."""
-    gpus: int
-    """That the search took; 0 where that is not on record."""
-    policy: str
-    """Controller that crosses."""
-    named_policy: str | None
-    """The same where it is not the search's."""
-
-    @property
-    def archive(self) -> Archive:
-        """The elites."""
-        return self.opened_run.archive
-
-    def command(self, word: str, **flags: object) -> str:
-        """A command about this run as a user types it."""
-        robot = self.opened_run.robot.spec
-        return without_machine(command_line(word, robot=robot, run=self.opened_run.path, **flags))
-
-
-def content_of(material: Material) -> dict[str, Any]:
-    """What the template takes, beside the terrains that were crossed for the page."""
-    archive, ranking, minima, metrics = material.archive, material.ranking, material.minima, material.metrics
-    elites, space, (searched, _) = ranking.elites, material.opened_run.space, material.opened_run.as_searched()
-    certifiers = () if archive.faults is None else archive.faults.certifiers
+def content_of(
+    opened_run: OpenedRun, ranking: Ranking, minima: MinimalTerrains | None, policy: str, *, is_searched: bool
+) -> dict[str, Any]:
+    """What the template takes, beside the terrains that a controller crossed for the page."""
+    archive, search, run = opened_run.archive, opened_run.search(), RunDirectory(opened_run.folder)
+    elites, space, (searched, _) = ranking.elites, opened_run.space, opened_run.as_searched()
+    metrics, certifiers = _metrics_of(run, archive), archive.counts.certifiers
     return {
-        "material": material,
+        "archive": archive,
+        "run": opened_run.command,
+        "search": search,
+        "metrics": metrics,
+        "gpus": run.read_summary().get("gpus"),
         "controller": "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label,
-        "crosser": ControllerSpec.parse(material.policy).label,
-        "place": without_machine(str(material.opened_run.path)),
+        "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
+        "place": without_machine(str(opened_run.path)),
         "summary": summary_of(ranking, archive),
         "failing": int(elites.failing.sum()),
         "certifiers": any_of(certifiers) if certifiers else "",
@@ -83,8 +55,21 @@ def content_of(material: Material) -> dict[str, Any]:
         "minimal": None if minima is None else _listed_minima(minima),
         "curves": figure_source(draw_curves(archive, metrics)) if metrics else "",
         "parallel": figure_source(draw_archive(archive)),
-        "origin": origin_rows(material.origin),
+        "origin": origin_rows({} if search is None else run.read_config()),
     }
+
+
+def _metrics_of(run: RunDirectory, archive: Archive) -> Metrics:
+    """The rows up to the archive's iteration, if there are some; a run that goes on meanwhile may have some more."""
+    if not (run.path / METRICS_FILE).exists():
+        return []
+    rows = run.read_metrics()[: archive.iterations]
+    if len(rows) < archive.iterations:
+        raise ValueError(
+            f"{run.path / METRICS_FILE} must have a row for each of {archive.iterations} iterations, got {len(rows)}: "
+            "resume the search, which writes it again"
+        )
+    return rows
 
 
 def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:

@@ -24,7 +24,7 @@ def test_elsewhere_a_plain_line_every_half_minute(monkeypatch, capsys):
     monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with SearchBar(iterations=4, done=2) as bar:
         for now[0], share in ((10, 0.2), (60, 0.5), (80, 0.9)):
-            bar.within(3)(share)
+            bar.within(2, 1)(share)
     # Half an iteration took a minute: one and a half take three.
     assert capsys.readouterr().err == " 3 min left  62% ━━━━━━──── iteration 3/4: compiling and evaluating\n"
     with Bar("quick") as bar:

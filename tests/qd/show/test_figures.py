@@ -1,4 +1,4 @@
-"""Figures and numbers of a search, by hand."""
+"""Figures of a search, by hand."""
 
 import dataclasses
 
@@ -6,11 +6,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from qd.faults import fresh_numbers
-from qd.show.figures import draw_archive, draw_curves, relief, summary, write_figures
+from qd.show.figures import draw_archive, draw_curves, relief, write_figures
 from tests.builders import fresh_values, small_archive
 
-ROW = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5, "reachable_coverage": 0.1}
+ROW = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5}
 
 
 def rows(count: int) -> list[dict]:
@@ -50,21 +49,6 @@ def test_archive_figure_has_a_line_an_elite_and_the_worst_on_top():
 def test_figures_are_files_for_archives_of_any_size(tmp_path, num_elites):
     for file in write_figures(tmp_path, small_archive(num_elites), rows(1)):
         assert matplotlib.image.imread(file).std() > 0.01  # something is drawn
-
-
-def test_summary_by_hand():
-    archive = dataclasses.replace(small_archive(), fitness=np.array([5.0, 1.0, -3.0]))
-    expected = {
-        "seed": 9, "robot": "anymal", "iterations": 7, "terrains_evaluated": 40, "episodes": 160, "elites": 3,
-        "elites_reproduced": None, "reachable_cells": 10, "reachable_coverage": 0.3, "qd_score": 63.0,
-        "mean_fitness": 1.0, "corrected_elites": None, "mean_std": None, "failing": None, "faults": None,
-        "with_collision": 3, "without_collision": 0, "wall_s": 10.0, "gpus": 1, "invalid_episodes": 4,
-    }  # fmt: skip
-    numbers = summary(archive, rows(4), gpus=1, origin={"seed": 9})
-    assert {name: numbers[name] for name in expected} == expected
-    fresh = dataclasses.replace(fresh_values(archive), collision_rate=np.zeros(3))
-    numbers = summary(dataclasses.replace(archive, fresh=fresh), rows(4), gpus=1, origin={})
-    assert fresh_numbers(archive, fresh).items() <= numbers.items() and numbers["with_collision"] == 3  # as found
 
 
 @pytest.mark.parametrize("every", [1, 2])
