@@ -27,8 +27,8 @@ class GroundMaps:
     """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
 
     def __post_init__(self) -> None:
-        check_friction(self.friction)
-        check_time_constant(self.time_constant_s)
+        check_map("friction", self.friction)
+        check_map("softness", self.time_constant_s)
         if len(self.friction) != len(self.time_constant_s):
             raise ValueError(
                 f"maps must be of as many terrains, got {len(self.friction)} of friction and "
@@ -36,11 +36,9 @@ class GroundMaps:
             )
 
     def __len__(self) -> int:
-        """T."""
         return len(self.friction)
 
     def __getitem__(self, rows: slice) -> "GroundMaps":
-        """Those of some terrains."""
         return GroundMaps(friction=self.friction[rows], time_constant_s=self.time_constant_s[rows])
 
     @classmethod
@@ -65,25 +63,18 @@ def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64
     return np.clip(np.asarray(places) * count // length, 0, count - 1).astype(np.int64)
 
 
-def check_friction(friction: NDArray[np.floating]) -> None:
-    """That values are frictions of the patches of terrains."""
-    _check_map("friction", friction, (friction >= LEAST_FRICTION - 1e-6) & (friction <= 1.0), f"{LEAST_FRICTION} to 1")
-
-
-def check_time_constant(time_constant_s: NDArray[np.floating]) -> None:
-    """That values are contact time constants [s] of the patches of terrains."""
-    low, high = LEAST_TIME_CONSTANT_S - 1e-6, MOST_TIME_CONSTANT_S + 1e-6
-    allowed = (time_constant_s == FIRM) | ((time_constant_s >= low) & (time_constant_s <= high))
-    words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"
-    _check_map("softness", time_constant_s, allowed, words)
-
-
-def _check_map(name: str, values: NDArray[np.floating], allowed: NDArray[np.bool_], words: str) -> None:
+def check_map(kind: str, values: NDArray[np.floating]) -> None:
+    """That values are frictions or, of ``softness``, contact time constants [s] of the patches of terrains."""
     if values.ndim != 3 or values.shape[1:] != PATCHES:
-        rows, cols = PATCHES
-        raise ValueError(f"a map of {name} must have shape (terrains, {rows}, {cols}), got {values.shape}")
+        raise ValueError(f"a map of {kind} must have shape (terrains, {PATCHES[0]}, {PATCHES[1]}), got {values.shape}")
+    if kind == "friction":
+        allowed, words = (values >= LEAST_FRICTION - 1e-6) & (values <= 1.0), f"{LEAST_FRICTION} to 1"
+    else:
+        soft = (values >= LEAST_TIME_CONSTANT_S - 1e-6) & (values <= MOST_TIME_CONSTANT_S + 1e-6)
+        allowed = soft | (values == FIRM)
+        words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"
     if not allowed.all():
-        raise ValueError(f"{name} must be {words}, got {values[~allowed][0]:g} in one of the patches")
+        raise ValueError(f"{kind} must be {words}, got {values[~allowed][0]:g} in one of the patches")
 
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:

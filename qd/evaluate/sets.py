@@ -25,7 +25,7 @@ from qd.run.directory import read_archive_of, search_seed
 from sim.bank import heights_of
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import get_space, share_of_height
+from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 
@@ -179,7 +179,7 @@ def plain_set(
     types = levels = None
     if name == "hand_crafted":
         terrains, types, levels = hand_crafted_crossings(count, rng)
-        terrains *= np.float32(share_of_height(space))
+        terrains *= np.float32(space.height_share)
     elif name == "hard_random":
         terrains = space.hard_random(count, rng)
     else:

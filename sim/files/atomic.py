@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 _TEMPORARY = ".tmp"
 _PROBE = ".write-test"
 
@@ -80,18 +82,11 @@ def to_json(content: dict[str, Any]) -> bytes:
 def read_json(path: Path) -> dict[str, Any]:
     """The dictionary in a JSON file; FileNotFoundError if there is no file, ValueError if it holds something else."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path} must be a JSON file, got: {error}: put a copy of it back") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(content).__name__}: put a copy of it back")
-    return content
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name}, which is no number")
+        raise ValueError(f"{path} must be a JSON file of an object, got: {error}: put a copy of it back") from None
 
 
 def check_zip(path: Path) -> None:

@@ -1,7 +1,8 @@
 """What every terrain space has."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,56 +10,30 @@ from numpy.typing import ArrayLike, NDArray
 from kernels.ground import Ground
 from sim.terrain import Seed
 
-DEFAULT_SIGMA0 = 2.0
-"""So wide a start asks for terrains at the genes' limits, which are the hard ones of most spaces."""
-
-
 MOST_HEIGHT = 0.25
 """Heights of the shipped spaces are for robots half a metre high: Table I's w [m]."""
 
 
-def name_at(base: str, height: float) -> str:
-    """How a space of another height is called: ``course@0.06``."""
-    return base if height == MOST_HEIGHT else f"{base}@{height:g}"
+class TerrainSpace:
+    """What a search needs of its terrains; what a space does not say itself, it has as it stands here."""
 
-
-class TerrainSpace(Protocol):
-    """What a search needs of its terrains."""
-
-    @property
-    def name(self) -> str:
-        """What files and command lines call the space."""
-        ...
-
-    @property
-    def num_genes(self) -> int:
-        """Length of one row of genes."""
-        ...
-
-    @property
-    def sha256(self) -> str | None:
-        """Hash of the code of a space of a user's own, which records name beside it; None of a shipped one."""
-        return None
-
-    @property
-    def sigma0(self) -> float:
-        """First step size of a search whose command line names none."""
-        return DEFAULT_SIGMA0
-
-    @property
-    def any_spacing(self) -> bool:
-        """Whether it can be rasterised on nodes of any distance and number, and not only on those of a simulation."""
-        return False
-
-    @property
-    def genes_per_part(self) -> int | None:
-        """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
-        return None
-
-    @property
-    def ground(self) -> tuple[str, ...]:
-        """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
-        return ()
+    name: str
+    """What files and command lines call the space."""
+    num_genes: int
+    """Length of one row of genes."""
+    sha256: str | None = None
+    """Hash of the code of a space of a user's own, which records name beside it; None of a shipped one."""
+    sigma0: float = 2.0
+    """First step size of a search whose command line names none. So wide a start asks for terrains at the genes'
+    limits, which are the hard ones of most spaces."""
+    any_spacing: bool = False
+    """Whether it can be rasterised on nodes of any distance and number, and not only on those of a simulation."""
+    genes_per_part: int | None = None
+    """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
+    ground: tuple[str, ...] = ()
+    """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
+    height_share: float = 1.0
+    """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
@@ -70,7 +45,6 @@ class TerrainSpace(Protocol):
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
-        return None
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
@@ -116,6 +90,26 @@ class TerrainSpace(Protocol):
         if not finite.all():
             raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")
         return array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShippedSpace(TerrainSpace):
+    """A space whose heights are for robots half a metre high, and can be lowered for others."""
+
+    base_name: ClassVar[str]
+    """Its name at its usual height."""
+    height: float = MOST_HEIGHT
+    """Largest height [m]: a smaller one lowers all terrains alike."""
+
+    @property
+    def name(self) -> str:
+        """``course``, with another height ``course@0.06``."""
+        return self.base_name if self.height == MOST_HEIGHT else f"{self.base_name}@{self.height:g}"
+
+    @property
+    def height_share(self) -> float:
+        """Heights over the usual ones."""
+        return self.height / MOST_HEIGHT
 
 
 def clipped(genes: ArrayLike) -> NDArray[np.float32]:

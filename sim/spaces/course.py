@@ -11,36 +11,30 @@ from numpy.typing import ArrayLike, NDArray
 from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, PARAMETERS, SPACING, Kind
 from sim.device import host_device
-from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
+from sim.spaces.base import Seed, ShippedSpace, clipped
 
 _KIND, _LENGTH = GENES.index("kind"), GENES.index("length")
 _SIZE = _FIRST_PARAMETER = GENES.index("size")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Course(TerrainSpace):
+class Course(ShippedSpace):
     """Kerbs, steps, stairs, ramps, ditches and the like between x = 4 m and x = 12 m, over the full width.
 
     An element has six genes (:data:`kernels.course.GENES`): its kind, the flat ground before it, and four parameters
     (:data:`kernels.course.PARAMETERS`). docs/terrains.md says which standards their ranges come from.
     """
 
-    height: float = MOST_HEIGHT
-    """Of what the elements' sizes are meant for [m]: half of it halves all heights."""
+    base_name: ClassVar[str] = "course"
     num_genes: ClassVar[int] = MAX_ELEMENTS * GENES_PER_ELEMENT
     """Six genes an element, in the order of :data:`kernels.course.GENES`, element after element."""
     sigma0: ClassVar[float] = 0.5
     """A quarter of the genes' range: a wider start asks for the first and the last kind alone."""
     genes_per_part: ClassVar[int] = GENES_PER_ELEMENT
 
-    @property
-    def name(self) -> str:
-        """``course``, with another height ``course@0.06``."""
-        return name_at("course", self.height)
-
     def rasterise(self, genes: Any, spacing: float, heights_out: Any) -> None:
         """Turns genes into heights on the device (:func:`kernels.course.rasterise`)."""
-        course.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT)
+        course.rasterise(genes, spacing, heights_out, self.height_share)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Kinds drawn evenly, every parameter that makes an element hard at its hard end, the others uniform."""
@@ -69,7 +63,7 @@ class Course(TerrainSpace):
     def _scaled_elements(self, genes: ArrayLike) -> NDArray[Any]:
         """The elements of one row of genes with their heights as they are, also of ramps, whose size is the slope."""
         (elements,) = self.elements(np.asarray(genes)[None])
-        elements["size"] *= self.height / MOST_HEIGHT
+        elements["size"] *= self.height_share
         return elements
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:

@@ -1,7 +1,6 @@
 """Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ _BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the ri
 _MOST_FRICTION = 0.995  # rounded, what is above is 1.00
 
 
-@dataclass(frozen=True, kw_only=True)
 class OnGround(TerrainSpace):
     """The terrains of a space on ground whose patches differ.
 
@@ -25,41 +23,15 @@ class OnGround(TerrainSpace):
     part; one that changes nothing counts as absent.
     """
 
-    inner: TerrainSpace
-    """Whose heights it has."""
-    ground: tuple[str, ...] = ()
-    """What its terrains have maps of: some of :data:`sim.ground.GROUND_KINDS`, in their order."""
-
-    @property
-    def name(self) -> str:
-        """What files and command lines call the space: ``course+friction+softness``."""
-        return joined_name(self.inner.name, self.ground)
-
-    @property
-    def num_genes(self) -> int:
-        """Those of the space, and 32 a map."""
-        return self.inner.num_genes + NUM_PATCHES * len(self.ground)
-
-    @property
-    def sha256(self) -> str | None:
-        """Hash of the code of the heights."""
-        return self.inner.sha256
-
-    @property
-    def sigma0(self) -> float:
-        """That of the space."""
-        return self.inner.sigma0
-
-    @property
-    def any_spacing(self) -> bool:
-        """As of the space."""
-        return self.inner.any_spacing
-
-    @property
-    def genes_per_part(self) -> int | None:
-        """That of the space, where maps divide by it too: eight patches are a row along the way."""
-        per_part = self.inner.genes_per_part
-        return per_part if per_part and NUM_PATCHES % per_part == 0 else None
+    def __init__(self, inner: TerrainSpace, ground: tuple[str, ...]) -> None:
+        """Heights are those of ``inner``; ``ground`` are some of :data:`sim.ground.GROUND_KINDS`, in their order."""
+        self.inner, self.ground, self.name = inner, ground, joined_name(inner.name, ground)
+        self.num_genes = inner.num_genes + NUM_PATCHES * len(ground)
+        for name in ("sha256", "sigma0", "any_spacing", "height_share"):
+            setattr(self, name, getattr(inner, name))
+        # Where maps divide by the parts of the space too: eight patches are a row along the way.
+        per_part = inner.genes_per_part
+        self.genes_per_part = per_part if per_part and NUM_PATCHES % per_part == 0 else None
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes into heights on the device, by the space."""

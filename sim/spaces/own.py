@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import PATCH, Ground, make_ground
 from sim.device import host_device
-from sim.ground import GROUND_KINDS, check_friction, check_time_constant
+from sim.ground import GROUND_KINDS, check_map
 from sim.policy.spec import ControllerSpec, controller_hash, find_named, in_one_line
-from sim.spaces.base import DEFAULT_SIGMA0, Seed, TerrainSpace, clipped
+from sim.spaces.base import Seed, TerrainSpace, clipped
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 
@@ -28,17 +28,10 @@ class OwnSpace(TerrainSpace):
             ``sigma0``.
     """
 
-    name: str = ""
-    num_genes: int = 0
-    sha256: str | None = None
-    sigma0: float = DEFAULT_SIGMA0
-    genes_per_part: int | None = None
-    ground: tuple[str, ...] = ()
-
     def __init__(self, spec: str, code: Any) -> None:
         self.name, self._code, self.sha256 = spec, code, controller_hash(spec)
         self.num_genes = self._setting("num_genes", 0, lambda value: isinstance(value, int) and value > 0)
-        self.sigma0 = float(self._setting("sigma0", DEFAULT_SIGMA0, lambda value: 0.0 < value < np.inf))
+        self.sigma0 = float(self._setting("sigma0", self.sigma0, lambda value: 0.0 < value < np.inf))
         self.genes_per_part = self._setting(
             "genes_per_part", None, lambda value: value is None or (value > 0 and self.num_genes % value == 0)
         )
@@ -62,15 +55,11 @@ class OwnSpace(TerrainSpace):
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps, as tensors on the device that the arrays are on."""
-        if "friction" in self.ground:
-            self._fill("friction", genes, PATCH, 0.5, ground_out.friction, check_friction)
-        if "softness" in self.ground:
-            self._fill("softness", genes, PATCH, 0.5, ground_out.time_constant, check_time_constant)
+        maps = {"friction": ground_out.friction, "softness": ground_out.time_constant}
+        for kind in self.ground:
+            self._fill(kind, genes, PATCH, 0.5, maps[kind])
 
-    def _fill(
-        self, method: str, genes: Any, step: float, first: float, values_out: Any,
-        check: Callable[[NDArray[Any]], None] | None = None,
-    ) -> None:  # fmt: skip
+    def _fill(self, method: str, genes: Any, step: float, first: float, values_out: Any) -> None:
         """Fills a Warp array (num_terrains, y, x) by a method of the user's; places are ``step * (first + index)``."""
         rows, out = wp.to_torch(genes).clamp(-1.0, 1.0), wp.to_torch(values_out)
         stream: Any = None if rows.device.type == "cpu" else wp.stream_to_torch(wp.get_stream(genes.device))
@@ -88,9 +77,9 @@ class OwnSpace(TerrainSpace):
                 )
             if not bool(torch.isfinite(values).all()):
                 raise self._wrong(method, "must return finite values, got NaN or infinity")
-            if check is not None:
+            if method in GROUND_KINDS:
                 try:
-                    check(values.cpu().numpy())
+                    check_map(method, values.cpu().numpy())
                 except ValueError as error:
                     raise self._wrong(method, f"must return a map: {error}") from None
             out.copy_(values)

@@ -8,13 +8,13 @@ from sim.ground import joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import MOST_HEIGHT, TerrainSpace
-from sim.spaces.course import COURSE, Course
+from sim.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace
+from sim.spaces.course import COURSE
 from sim.spaces.ground import OnGround
 from sim.spaces.own import load_own
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN, SuperGaussian
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
-SPACES: dict[str, TerrainSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
+SPACES: dict[str, ShippedSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
 """Every shipped space by its name. Another one is one more class, and its place here."""
 _HEIGHT = re.compile(r"0?\.\d+")
 _loaded: list[TerrainSpace] = []
@@ -58,14 +58,14 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     space = at_height(SPACES[root], float(height)) if lower else SPACES.get(base) or _find_loaded(base, sha256)
     if kinds and space.ground:
         raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
-    return OnGround(inner=space, ground=kinds) if kinds else space
+    return OnGround(space, kinds) if kinds else space
 
 
 def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:
     """A space at a height [m], or, without one, at the height that fits the robot; says so if that is not its own."""
     if height is not None:
         return at_height(space, height)
-    fits = MOST_HEIGHT * share_of_height(get_space(fitting_space(robot) or SUPER_GAUSSIAN.name))
+    fits = MOST_HEIGHT * get_space(fitting_space(robot) or SUPER_GAUSSIAN.name).height_share
     if fits == MOST_HEIGHT or "@" in space.name or is_own(space.name):
         return space
     print(
@@ -78,18 +78,12 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
 def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     """A shipped space whose heights are those of a robot for which the highest bump is ``height`` [m]."""
     if isinstance(space, OnGround):
-        return replace(space, inner=at_height(space.inner, height))
-    if not isinstance(space, SuperGaussian | Course):
+        return OnGround(at_height(space.inner, height), space.ground)
+    if not isinstance(space, ShippedSpace):
         raise ValueError(f"height is for shipped spaces, got {space.name}: a space of your own has its own heights")
     if not 0.0 < height <= MOST_HEIGHT:
         raise ValueError(f"height must lie above 0 and at most at {MOST_HEIGHT:g} m, got {height:g}")
     return replace(space, height=height)
-
-
-def share_of_height(space: TerrainSpace) -> float:
-    """Its highest bump over that of the shipped heights; 1 of a space of one's own."""
-    space = space.inner if isinstance(space, OnGround) else space
-    return space.height / MOST_HEIGHT if isinstance(space, SuperGaussian | Course) else 1.0
 
 
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:

@@ -9,38 +9,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels import super_gaussian
 from kernels.super_gaussian import GENES_PER_BUMP, LOWER, PARAMETERS, UPPER
-from sim.spaces.base import MOST_HEIGHT, Seed, TerrainSpace, clipped, name_at
+from sim.spaces.base import Seed, ShippedSpace, clipped
 
 _HEIGHT = PARAMETERS.index("w")
 
 
 @dataclass(frozen=True, kw_only=True)
-class SuperGaussian(TerrainSpace):
-    """Eq. 1, with genes rescaled by Table I."""
+class SuperGaussian(ShippedSpace):
+    """Eq. 1, with genes rescaled by Table I: eight bumps of eight genes, :data:`kernels.super_gaussian.PARAMETERS`."""
 
+    base_name: ClassVar[str] = "super_gaussian"
+    num_genes: ClassVar[int] = 8 * GENES_PER_BUMP
     any_spacing: ClassVar[bool] = True
     genes_per_part: ClassVar[int] = GENES_PER_BUMP
-    height: float = MOST_HEIGHT
-    """Largest height of a bump [m]: Table I's w; a smaller one lowers all terrains alike."""
-    num_bumps: int = 8
-
-    def __post_init__(self) -> None:
-        if self.num_bumps < 1:
-            raise ValueError(f"num_bumps must be at least 1, got {self.num_bumps}")
-
-    @property
-    def name(self) -> str:
-        """``super_gaussian``, with another height ``super_gaussian@0.06``."""
-        return name_at("super_gaussian", self.height)
-
-    @property
-    def num_genes(self) -> int:
-        """Eight genes a bump, in the order of :data:`kernels.super_gaussian.PARAMETERS`, bump after bump."""
-        return self.num_bumps * GENES_PER_BUMP
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes into heights on the device (:func:`kernels.super_gaussian.rasterise`)."""
-        super_gaussian.rasterise(genes, spacing, heights_out, self.height / MOST_HEIGHT, *origin)
+        super_gaussian.rasterise(genes, spacing, heights_out, self.height_share, *origin)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Uniform genes, but every bump at its lowest or highest height: the paper's hard-random terrains."""
@@ -51,9 +36,9 @@ class SuperGaussian(TerrainSpace):
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each bump in words."""
-        bumps = clipped(genes).reshape(self.num_bumps, GENES_PER_BUMP)
+        bumps = clipped(genes).reshape(-1, GENES_PER_BUMP)
         values = LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)
-        values[:, _HEIGHT] *= self.height / MOST_HEIGHT
+        values[:, _HEIGHT] *= self.height_share
         return tuple(map(_in_words, values))
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:

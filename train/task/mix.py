@@ -10,7 +10,6 @@ from sim.bank import terrains_of
 from sim.ground import GroundMaps
 from sim.robots.training import Draw
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import share_of_height
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from train.task.curriculum import Tiles
@@ -79,7 +78,7 @@ class Mix:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
         rng = self._rng(0)
         heights, numbers, _ = hand_crafted_crossings(self.num_hand_crafted, rng)
-        heights *= np.float32(min(map(share_of_height, self.spaces)))
+        heights *= np.float32(min(space.height_share for space in self.spaces))
         types = tuple(CROSSING_TYPES[number] for number in numbers)
         if self.kind == "hand-crafted":
             return Tiles(heights=heights, type_of_column=types)

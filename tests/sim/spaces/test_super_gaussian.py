@@ -6,7 +6,9 @@ import pytest
 from sim.bank import heights_of
 from sim.spaces.base import clipped
 from sim.spaces.registry import SPACES, get_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN, SuperGaussian
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.kernels import oracle
+from tests.sim.scenes import NODE_X, NODE_Y
 
 
 def test_a_space_is_found_by_its_name():
@@ -23,20 +25,18 @@ def test_uniform_random_genes_fill_the_range():
 
 
 def test_hard_random_genes_have_every_bump_at_full_height():
-    space = SuperGaussian(num_bumps=3)
-    genes = space.hard_random(500, 0)
-    bumps = genes.reshape(500, 3, 8)
+    genes = SUPER_GAUSSIAN.hard_random(200, 0)
+    bumps = genes.reshape(200, 8, 8)
     assert genes.dtype == np.float32
     assert set(np.unique(bumps[..., 7])) == {-1.0, 1.0}
-    assert abs(bumps[..., 7].mean()) < 0.1  # both signs equally often: standard error 1 / sqrt(1500) = 0.026
-    np.testing.assert_array_equal(bumps[..., :7], space.uniform_random(500, 0).reshape(500, 3, 8)[..., :7])
+    assert abs(bumps[..., 7].mean()) < 0.1  # both signs equally often: standard error 1 / sqrt(1600) = 0.025
+    np.testing.assert_array_equal(bumps[..., :7], SUPER_GAUSSIAN.uniform_random(200, 0).reshape(200, 8, 8)[..., :7])
 
 
 @pytest.mark.parametrize(
     ("call", "field"),
     [
         (lambda: SUPER_GAUSSIAN.uniform_random(-1, 0), "count"),
-        (lambda: SuperGaussian(num_bumps=0), "num_bumps"),
         (lambda: SUPER_GAUSSIAN.validate(np.zeros(64)), "genes"),
         (lambda: SUPER_GAUSSIAN.validate([[0.0] * 64, [np.nan] * 64]), "row 1"),
         (lambda: get_space("blocks"), "blocks"),
@@ -49,22 +49,21 @@ def test_what_is_no_space_and_no_genes_is_refused(call, field):
 
 def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
     genes = SUPER_GAUSSIAN.hard_random(2, 5)
-    five = SuperGaussian(num_bumps=5)
     without = SUPER_GAUSSIAN.without(genes, [0, 3, 7])
     others = genes.reshape(2, 8, 8)[:, [1, 2, 4, 5, 6]].reshape(2, 40)
-    np.testing.assert_array_equal(heights_of(without), heights_of(others, five))
+    expected = [oracle.mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in others]
+    np.testing.assert_allclose(heights_of(without), expected, atol=1e-5)
     assert not heights_of(SUPER_GAUSSIAN.without(genes, range(8))).any()
     np.testing.assert_array_equal(SUPER_GAUSSIAN.without(genes, []), genes)
 
 
 def test_a_bump_in_words():
     # Table I: mu_x 6 to 10 m, mu_y 2 to 6 m, sigma 0.5 to 3 m, theta -180 to 180 degrees, w -0.25 to 0.25 m.
-    genes = np.array([0.5, 0.0, -1.0, 1.0, 0.0, 0.0, 0.5, -1.0])
-    words = SuperGaussian(num_bumps=1).describe(genes)
-    assert words == "hollow of 0.25 m at (9.0, 4.0) m, half widths 0.5 m and 3.0 m, turned by 90 degrees"
-    genes[6] = -1.0  # half a turn changes nothing
-    assert SuperGaussian(num_bumps=1).describe(genes).endswith("turned by 0 degrees")
-    assert len(SUPER_GAUSSIAN.parts(np.tile(genes, 8))) == 8
+    genes = np.tile([0.5, 0.0, -1.0, 1.0, 0.0, 0.0, 0.5, -1.0], 8)
+    genes[8 + 6] = -1.0  # half a turn of the second changes nothing
+    first, second, *others = SUPER_GAUSSIAN.describe(genes).splitlines()
+    assert first == "hollow of 0.25 m at (9.0, 4.0) m, half widths 0.5 m and 3.0 m, turned by 90 degrees"
+    assert second.endswith("turned by 0 degrees") and others == [first] * 6
 
 
 def test_scaled_bumps_are_lower_everywhere():
