@@ -1,12 +1,21 @@
-"""The tables of an evaluation, in data."""
+"""Tables in data for a page: of an evaluation, and of the rounds of a hardening."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from qd.evaluate import labels
-from qd.show.report.page import Table, percent
+from qd.evaluate.labels import FATES, SETS
+from qd.evaluate.tables import as_tables
+from qd.run.directory import ROUNDS_FILE
+from qd.show.report.page import Table, check_page, origin_rows, percent, publish_page
+from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.intervals import value_words
+from sim.files.records import without_machine
+from sim.robots.find import get_robot
 
+_COUNTS = ("elites", "failing", "confirmed", "certified", "faults")
 MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward")}
 """Measures shown, in words; the first two are fractions."""
 
@@ -38,7 +47,7 @@ def _value(measure: str, value: float | None, limits: Sequence[float] | None) ->
 
 
 def _head(names: Iterable[str], terrains: Mapping[str, int]) -> list[str]:
-    return ["controller", *(f"{labels.SETS.get(name, name)} ({terrains[name]:,})" for name in names)]
+    return ["controller", *(f"{SETS.get(name, name)} ({terrains[name]:,})" for name in names)]
 
 
 def _measure_table(tables: Mapping[str, Any], measure: str) -> Table:
@@ -78,8 +87,54 @@ def _changes_table(tables: Mapping[str, Any]) -> Table:
     pairs = [(pair, name, change) for name, pairs in tables["differences"].items() for pair, change in pairs.items()]
     pairs.sort(key=lambda row: not row[0].startswith(f"{first} -> "))
     rows = [
-        [f"{labels.SETS.get(name, name)}: {pair}", *(f"{change[fate]['count']}" for fate in labels.FATES),
+        [f"{SETS.get(name, name)}: {pair}", *(f"{change[fate]['count']}" for fate in FATES),
          f"{change['compared']}"]
         for pair, name, change in pairs
     ]  # fmt: skip
-    return Table(head=["terrains", *labels.FATES.values(), "compared"], rows=rows)
+    return Table(head=["terrains", *FATES.values(), "compared"], rows=rows)
+
+
+def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
+    """Writes the page; returns its file."""
+    content = _read_rounds(run, robot)
+    out = out or run / "report.html"
+    check_page(out)
+    rounds = content["rounds"]
+    rows = [
+        [row["controller"], *(value_words(row.get(key), None, ",") for key in ("episodes", *_COUNTS)),
+         ", ".join(row["certifiers"]) or "nobody"] for row in rounds
+    ]  # fmt: skip
+    return publish_page(
+        out,
+        "rounds.html",
+        robot=content["robot"],
+        run=without_machine(str(run)),
+        rounds=rounds,
+        counts=Table(head=["controller searched", "episodes", *_COUNTS, "crossed by"], rows=rows),
+        goals={
+            SETS.get(name, f"{name}, held out"): {who: 100.0 * rate for who, rate in rates.items() if rate is not None}
+            for name, rates in content["tables"]["goal"].items()
+        },
+        compared=compared_of(content["tables"]),
+        choices=content.get("choices", {}),
+        origin=origin_rows(content),
+        reports=[without_machine(command_line("report", run=run / row["search"])) for row in rounds],
+    )
+
+
+def _read_rounds(run: Path, robot: str | None) -> dict[str, Any]:
+    file = run / ROUNDS_FILE
+    content = read_json(file)
+    if not content.get("rounds"):
+        raise ValueError(f"{file} must have a search that is over, got none: let the hardening go on")
+    try:
+        content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
+        if not all({"controller", "search", "certifiers", "faults"} <= set(row) for row in content["rounds"]):
+            raise ValueError("a round lacks a name")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
+    if robot is not None and get_robot(robot).name != content["robot"]:
+        raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
+    for row in content["rounds"]:  # without a specialist the faults are those that the panel shows
+        row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
+    return content

@@ -1,23 +1,27 @@
-"""One page about a run."""
+"""One page about a run: what is known of it, and robots that cross its worst terrains for the page."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from qd.archive import ARCHIVE_FILE
+from qd.archive import Archive
 from qd.evaluate.tables import read_tables
-from qd.groups import elites_of, rank
+from qd.faults import further_rates
+from qd.groups import VERDICTS, Ranking, rank
 from qd.minimise import read_minimal
-from qd.run.directory import CONFIG_FILE, ROUNDS_FILE, folder_for
+from qd.run.directory import ROUNDS_FILE, folder_for
+from qd.run.progress import Bar
+from qd.show.crossed import ARRIVED, Rate, draw_crossing, rates_of
 from qd.show.elites import OpenedRun, open_run
-from qd.show.recordings import Cross, Recordings
-from qd.show.report.cases import cross_cases
-from qd.show.report.evaluation import compared_of
-from qd.show.report.page import check_page, publish_page
-from qd.show.report.pictures import why_no_pictures
-from qd.show.report.rounds import write_rounds
+from qd.show.recordings import Cross, Recordings, on_elite
+from qd.show.report.evaluation import compared_of, write_rounds
+from qd.show.report.page import Table, check_page, figure_source, publish_page
+from qd.show.report.pictures import close_pictures, failure_of, same_moment, why_no_pictures
 from qd.show.report.search import content_of
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.files.records import without_machine
 from sim.policy.spec import spec_of
+from sim.recording.recorder import Recording
 
 _OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown
 
@@ -43,8 +47,11 @@ def write_report(
     """
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
-    opened_run = _opened(robot, run, space)
+    opened_run = open_run(robot, run, space=space)
     archive, minima = opened_run.archive, read_minimal(opened_run.folder, opened_run.archive)
+    ranking, missing = rank(archive, opened_run.space, minima, judged=True), list[str]()
+    if not len(ranking.elites):
+        raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
     crosser = spec_of(policy or opened_run.as_searched()[0], opened_run.robot)
     suffix = "" if policy is None else opened_run.suffix(crosser)
     out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
@@ -52,8 +59,7 @@ def write_report(
     compared = None
     if tables is not None:
         about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
-        compared = compared_of({**read_tables(tables, opened_run.robot)}, **about)
-    ranking, missing = rank(archive, opened_run.space, minima, judged=True), list[str]()
+        compared = compared_of(read_tables(tables, opened_run.robot), **about)
     content = content_of(opened_run, ranking, minima, crosser, is_searched=policy is None)
     heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
     heads = heads or ranking.worst(num_elites)
@@ -77,16 +83,6 @@ def write_report(
     )  # fmt: skip
 
 
-def _opened(robot: str | None, run: Path | None, space: str | None) -> OpenedRun:
-    """The run, which must have elites to report on."""
-    if run is not None and (run / CONFIG_FILE).exists() and not (run / ARCHIVE_FILE).exists():
-        raise ValueError(f"{run} must hold a search that has ended an iteration, got no {ARCHIVE_FILE}: let it go on")
-    opened_run = open_run(robot, run, space=space)
-    if not len(elites_of(opened_run.archive, judged=True)):
-        raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
-    return opened_run
-
-
 def _why_not_crossed(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
     """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
     try:
@@ -96,3 +92,81 @@ def _why_not_crossed(opened_run: OpenedRun, policy: str | None, device: str | No
             raise
         return f"No terrain is crossed, since the search's controller cannot be loaded: {error}. Name it with --policy."
     return ""
+
+
+def cross_cases(
+    opened_run: OpenedRun,
+    ranking: Ranking,
+    policy: str,
+    heads: Sequence[int],
+    others: Sequence[int],
+    recordings: Recordings,
+    *,
+    episodes: int,
+    pictured: bool,
+) -> dict[int, dict[str, Any]]:
+    """Lets a controller cross elites and takes their pictures, by number; one without a valid episode is left out.
+
+    ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short. What the
+    template takes of each: its number, name and verdict, the ``source`` of the picture at the moment of failure
+    ``time_s`` [s], empty without pictures, who crosses ``beside`` it, if anybody, the source of the ``figure`` with
+    paths and profile, empty in short, the table of its ``rates``, and the command that films it.
+    """
+    files, cases = opened_run.certifiers(), dict[int, dict[str, Any]]()
+    names = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
+    crossings = [(number, policy) for number in (*heads, *others)]
+    crossings += [(number, files[name]) for number, name in names.items()]
+    wanted = [on_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
+    recorded = dict(zip(crossings, recordings.all_of(wanted), strict=True))
+    with Bar("drawing", len(heads) + len(others)) as bar:
+        for number in (*heads, *others):
+            name = names.get(number)
+            other = None if name is None else (name, recorded[number, files[name]])
+            case = _case(opened_run, ranking, number, recorded[number, policy], other, number in heads, pictured)
+            cases |= {number: case} if case else {}
+            bar.move_to(len(cases))
+    return cases
+
+
+def _case(
+    opened_run: OpenedRun,
+    ranking: Ranking,
+    number: int,
+    recording: Recording,
+    other: tuple[str, Recording] | None,
+    whole: bool,
+    pictured: bool,
+) -> dict[str, Any] | None:
+    archive = opened_run.archive
+    scales = dict(zip(archive.penalties, archive.scales, strict=True))
+    if (failure := failure_of(recording, scales)) is None:
+        return None
+    moments = [failure] if other is None else [failure, same_moment(failure, other[1], scales)]
+    sources = close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
+    beside = None
+    if other is not None:
+        rate = rates_of(other[1])[ARRIVED]
+        beside = {"name": other[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
+    arrived, row = rates_of(recording)[ARRIVED], ranking.elites.place_of(number)
+    title = f"{archive.robot}, elite {number} of {len(archive):,}: {arrived.count} crossings"
+    return {
+        "number": number,
+        "name": ranking.name(row),
+        "verdict": VERDICTS[int(ranking.elites.verdict[row])],
+        "source": sources[0],
+        "time_s": failure.time_s,
+        "beside": beside,
+        "figure": figure_source(draw_crossing(recording, title)) if whole else "",
+        "rates": _rates(ranking, archive, row, arrived),
+        "film": opened_run.command("film", elite=number),
+    }
+
+
+def _rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
+    """Who reaches the goal how often: here, when the elite was found or judged, and under other conditions."""
+    elites, number = ranking.elites, int(ranking.elites.numbers[row])
+    tries = "fresh tries" if elites.fresh[row] else "tries of the search"
+    rates = {"for this page": arrived, tries: Rate(elites.hits("goal_rate", row), int(elites.counted[row]))}
+    rates |= {who: Rate(*rate) for who, rate in further_rates(archive, number).items()}
+    rows = [[name, f"{rate.hits} of {rate.count}", rate.limits] for name, rate in rates.items()]
+    return Table(head=["goal reached", "", "95 % interval"], rows=rows)
