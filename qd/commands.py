@@ -8,10 +8,12 @@ from typing import Annotated, Any, Literal, Self
 import tyro
 from msgspec import Meta
 
-from qd.evaluate.labels import SetsCfg
+from qd.evaluate.labels import COMPARED, SetsCfg
 from qd.run.presets import PRESETS, SchedulerCfg, preset_of
-from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_words
 from sim.files.settings import NonNegativeInt, PositiveInt
+from sim.policy.spec import controllers_of
+from sim.robots.find import get_robot, robot_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,6 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.run.settings import preset
         from qd.search import say_what_stops_the_robot, search
         from qd.workers.evaluator import Compute
-        from sim.robots.find import get_robot
         from sim.spaces.registry import at_height, load_space, space_at
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
@@ -139,8 +140,6 @@ class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
         """The run, and what the command line names beside it."""
         from qd.run.directory import find_run
         from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
         robot = get_robot(self.robot)
         return find_run(robot, self.run, published="never"), {
@@ -246,7 +245,6 @@ class Check(ControllerFlags, WorkerFlags):
         """Prints what was found; returns 1 if something has to be mended."""
         from qd.check import check
         from qd.workers.evaluator import Compute
-        from sim.robots.find import get_robot
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         return 0 if check(get_robot(self.robot), self.policy, compute=compute, anyway=self.anyway) else 1
@@ -285,13 +283,9 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
         """Evaluates; returns 1 if a controller is too bad."""
         from qd.check import made_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
-        from qd.evaluate.labels import COMPARED
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
         from qd.evaluate.tables import is_regression
         from qd.workers.evaluator import Compute
-        from sim.files.command import split_words
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot, robot_of
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
@@ -364,8 +358,6 @@ class Dose(RobotFlag, WorkerFlags):
         """Measures."""
         from qd.evaluate.dose import measure_dose
         from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
         from sim.spaces.dose import parse_doses
 
         robot = get_robot(self.robot)

@@ -6,7 +6,7 @@ are follows from the run's seed and from what names an elite, its cell and the i
 kept in the run, so that a judging that was stopped finds them when it is run again.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from qd.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
-from qd.fitness import FAILING_GOAL_RATE, Evaluation, FitnessCfg, evaluation_of
+from qd.fitness import FAILING_GOAL_RATE, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, RunDirectory, check_space, claimed
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
@@ -40,7 +40,8 @@ CERTIFIERS_FOLDER = "certifiers"
 """Folder of a run that holds its own certifiers, such as its specialist, ``<name>.pt``."""
 
 _BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
-_FRESH_STREAM = 1
+FRESH_STREAM = 1
+"""Of the seeds of fresh episodes."""
 _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM = 5, 6, 7
 
 
@@ -54,27 +55,9 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
     return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
 
 
-def fresh_values(
-    archive: Archive,
-    evaluate: Callable[[NDArray, NDArray], RolloutResult],
-    fitness: FitnessCfg,
-    *,
-    num_replicas: int,
-    seed: int,
-) -> FreshValues:
-    """Evaluates every elite again with 40 fresh episodes, drawn apart from the search's own.
-
-    ``evaluate`` gives a terrain ``num_replicas`` episodes; terrains are crossed as often as makes 40.
-    """
-    if not len(archive):
-        empty = {name: getattr(archive, name) for name in Evaluation.__dataclass_fields__}
-        return FreshValues(**empty, reproduced=np.zeros(0, bool))
-    times = -(-FRESH_EPISODES // num_replicas)
-    seeds = elite_seeds(archive, seed, times, stream=_FRESH_STREAM)
-    result = evaluate(archive.genes.repeat(times, axis=0), seeds)
-    arrays = {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
-    grouped = {name: v.reshape(-1, times * v.shape[1], *v.shape[2:])[:, :FRESH_EPISODES] for name, v in arrays.items()}
-    result, cells = replace(result, **grouped), archive.cells
+def fresh_values(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> FreshValues:
+    """What 40 fresh episodes on every elite of an archive say, which are drawn apart from the search's own."""
+    cells = archive.cells
     fresh = evaluation_of(result, cells, fitness)
     collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
     cell = cells.cell_of(fresh.ratios, collided)
@@ -256,12 +239,6 @@ def judge(
         check_certifiers(certifiers, search, compute.device)
     calls = sum(2 * len(certifiers) if stage == "others" else 1 for stage in stages)
     with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crossings:
-
-        def cross_fresh(terrains: NDArray, seeds: NDArray) -> RolloutResult:
-            return crossings.cross(
-                search.policy, terrains, seeds, replicas=FRESH_EPISODES, space=search.space, label="fresh episodes"
-            )
-
         archive = search.read_archive()
         if archive.fresh is None and "fresh" not in stages:
             raise ValueError(f"{run} must have fresh episodes of its elites, got none: begin with the stage fresh")
@@ -269,9 +246,12 @@ def judge(
         for stage in stages:
             failing = np.flatnonzero(archive.failing)
             if stage == "fresh":
-                cfg, kinds = search.cfg, {"num_replicas": FRESH_EPISODES, "seed": search.cfg.seed}
-                found = archive
-                archive = archive.corrected_by(fresh_values(archive, cross_fresh, cfg.fitness, **kinds))
+                found, seeds = archive, elite_seeds(archive, search.cfg.seed, stream=FRESH_STREAM)
+                result = crossings.cross(
+                    search.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=search.space,
+                    label="fresh episodes",
+                )  # fmt: skip
+                archive = archive.corrected_by(fresh_values(archive, result, search.cfg.fitness))
                 if len(found) and not np.array_equal(found.cell, archive.cell):
                     print(f"Elites of {run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)
             elif stage == "others":

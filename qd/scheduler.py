@@ -26,7 +26,7 @@ _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not a
 
 
 class RandomEmitter:
-    """Asks for terrains drawn anew each time by ``uniform_random`` or ``hard_random``, whatever it is told."""
+    """Asks for terrains drawn anew each time by ``uniform_random`` or ``hard_random``."""
 
     def __init__(
         self, archive: GridArchive, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence
@@ -41,18 +41,12 @@ class RandomEmitter:
         draw = space.uniform_random if self.method == "uniform_random" else space.hard_random
         return draw(self.batch_size, self._rng)
 
-    def tell(self, **results: Any) -> None:
-        """Learns nothing."""
-
 
 class SurrogateEmitter:
     """Asks for what a surrogate proposes: one surrogate for all such emitters of a search."""
 
     def __init__(self, archive: GridArchive, surrogate: Surrogate, batch_size: int) -> None:
         self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
-
-    def tell(self, **results: Any) -> None:
-        """Learns nothing by itself: the surrogate learns from the terrains of all emitters."""
 
 
 Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter | SurrogateEmitter
@@ -174,12 +168,13 @@ class Scheduler:
         first = 0
         for emitter in self.emitters[self._emitters_of(group)]:
             batch = slice(first, first + int(emitter.batch_size))
-            add_info = added_to_result if emitter.archive is self.result else added
-            emitter.tell(
-                **{name: values[batch] for name, values in rows.items()},
-                add_info={name: values[batch] for name, values in add_info.items()},
-            )
             first = batch.stop
+            if isinstance(emitter, EvolutionStrategyEmitter):  # no other learns by itself
+                add_info = added_to_result if emitter.archive is self.result else added
+                emitter.tell(
+                    **{name: values[batch] for name, values in rows.items()},
+                    add_info={name: values[batch] for name, values in add_info.items()},
+                )
 
     def _add_to_result(self, rows: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
         """Fills ``result``; status and value of each terrain as pyribs gives them to its emitters."""

@@ -11,8 +11,6 @@ INDEPENDENT = "generated_independent"
 """Set of elites of another search."""
 COMPARED = "elites"
 """Set of elites that neither of two controllers was trained on, ``old`` and ``new``, which are compared on it."""
-FROM_ARCHIVE = (*HELD_OUT, INDEPENDENT)
-"""Sets made of elites."""
 SETS = {
     "hand_crafted": "hand-crafted",
     "hard_random": "hard-random",

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.evaluate.labels import FROM_ARCHIVE, HELD_OUT, INDEPENDENT, SETS
+from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.evaluate.marks import marks_of
 from qd.groups import families_of, rms_distances
 from qd.run.directory import read_archive_of, search_seed
@@ -264,9 +264,7 @@ def make_sets(
         raise ValueError(f"sets must be some of {', '.join(SETS)}, got {', '.join(unknown)}")
     if missing := [name for name in names if name in lacking]:
         raise ValueError(f"sets {', '.join(missing)} are made of elites: give --archive or --independent")
-    if independent is not None and part == "validation":
-        raise ValueError("independent elites are to be reported: leave --independent out with part validation")
-    sets = {name: plain_set(name, count, seed, space, part) for name in names if name not in FROM_ARCHIVE}
+    sets = {name: plain_set(name, count, seed, space, part) for name in names if name not in (*HELD_OUT, INDEPENDENT)}
     if archive is not None and not set(HELD_OUT).isdisjoint(names):
         sets["generated"] = whole = generated_set(archive, count, seed, part)
         if "generated_far" in names:

@@ -15,9 +15,6 @@ from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 
-Settings = dict[str, Any]
-"""The settings that make a run what it is, as JSON values."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class SearchCfg:
@@ -88,19 +85,19 @@ def preset(
     )
 
 
-def as_settings(cfg: SearchCfg) -> Settings:
+def as_settings(cfg: SearchCfg) -> dict[str, Any]:
     """What makes a run what it is: all fields but ``iterations``, as JSON values."""
     settings = json.loads(json.dumps(asdict(cfg)))
     del settings["iterations"]
     return settings
 
 
-def from_settings(settings: Settings, iterations: int) -> SearchCfg:
+def from_settings(settings: dict[str, Any], iterations: int) -> SearchCfg:
     """The search that :func:`as_settings` was of; other settings are a ValueError."""
     return from_builtins(SearchCfg, {**settings, "iterations": iterations}, "a search")
 
 
-def differences(stored: Settings, settings: Settings, prefix: str = "") -> list[str]:
+def differences(stored: dict[str, Any], settings: dict[str, Any], prefix: str = "") -> list[str]:
     """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
     lines = []
     for name in sorted(stored.keys() | settings.keys()):

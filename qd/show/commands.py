@@ -6,8 +6,10 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags
+from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_words
 from sim.files.settings import NonNegativeInt, PositiveInt
+from sim.policy.spec import controllers_of
+from sim.robots.find import get_robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +56,6 @@ class Replay(ControllerFlags, DeviceFlag, EliteFlags):
     def _source(self) -> Any:
         from qd.show.elites import open_run
         from qd.show.replay import source_of_map, source_of_run
-        from sim.robots.find import get_robot
 
         crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
@@ -153,8 +154,6 @@ class Export(ControllerFlags, EliteFlags):
         """Writes the files."""
         from qd.show.elites import open_run
         from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
-        from sim.files.command import split_words
-        from sim.robots.find import get_robot
 
         if sum([self.pack, self.from_pack is not None, self.onnx is not None]) > 1:
             raise ValueError("give one of --pack, --from-pack and --onnx")
@@ -177,8 +176,6 @@ class Export(ControllerFlags, EliteFlags):
         from qd.evaluate.pack import make_pack
         from qd.run.directory import find_run
         from qd.workers.evaluator import Compute
-        from sim.policy.spec import controllers_of
-        from sim.robots.find import get_robot
 
         making, robot = self.making, get_robot(self.robot or "anymal")
         make_pack(

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from qd.archive import Archive
-from qd.faults import fresh_numbers
-from qd.judge import fresh_values
+from qd.faults import FRESH_EPISODES, fresh_numbers
+from qd.judge import FRESH_STREAM, elite_seeds, fresh_values
 from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.workers.cross import Crossings
@@ -26,12 +26,14 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossin
     """What fresh episodes say of some of the elites that a search has found so far."""
     rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(STREAM,)))
     some = archive.rows(np.sort(rng.choice(len(archive), min(len(archive), MOST_ELITES), replace=False)))
-
-    def cross(terrains: Any, seeds: Any) -> Any:
-        return crossings.cross(policy, terrains, seeds, replicas=cfg.replicas, space=cfg.space, label="fresh episodes")
-
-    fresh = fresh_values(some, cross, cfg.fitness, num_replicas=cfg.replicas, seed=cfg.seed)
-    return fresh_numbers(some, fresh) | {"elites": len(archive)}
+    times = -(-FRESH_EPISODES // cfg.replicas)
+    genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=FRESH_STREAM)
+    label = "fresh episodes"
+    result = crossings.cross(policy, genes, seeds, replicas=cfg.replicas, space=cfg.space, label=label)
+    arrays = {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
+    by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in arrays.items()}
+    result = replace(result, **{name: value[:, :FRESH_EPISODES] for name, value in by_elite.items()})
+    return fresh_numbers(some, fresh_values(some, result, cfg.fitness)) | {"elites": len(archive)}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

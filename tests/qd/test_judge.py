@@ -33,17 +33,11 @@ def archive_of(ratios, *, collided=None):
     return dataclasses.replace(archive, cell=archive.cells.cell_of(columns, collided))
 
 
-def fresh_of(archive, penalties, num_replicas=40, **kwargs):
-    """Fresh values of episodes that give each elite these penalties."""
-    fitness = FitnessCfg(penalties=archive.penalties, scales=archive.scales)
-    evaluate = lambda genes, seeds: make_result(penalties, **kwargs)  # noqa: E731
-    return fresh_values(archive, evaluate, fitness, num_replicas=num_replicas, seed=0)
-
-
 def fresh_at(archive, ratios, **kwargs):
     """Fresh values of 40 episodes of each elite, all at its ratio."""
     columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
-    return fresh_of(archive, np.repeat(columns[:, None], 40, axis=1), **kwargs)
+    result = make_result(np.repeat(columns[:, None], 40, axis=1), **kwargs)
+    return fresh_values(archive, result, FitnessCfg(penalties=archive.penalties, scales=archive.scales))
 
 
 def test_an_elite_is_reproduced_in_its_cell_and_in_neighbours_if_it_is_valid():
@@ -60,13 +54,6 @@ def test_the_collision_bit_is_taken_over_the_first_twenty():
     for collided, expected in ((False, [True, False, True]), (True, [False, True, False])):
         archive = archive_of([0.35] * 3, collided=[collided] * 3)
         assert fresh_at(archive, [0.35] * 3, base_collision=collides).reproduced.tolist() == expected
-
-
-def test_few_replicas_several_times_make_forty_episodes():
-    marks = np.arange(8 * 12, dtype=float).reshape(8, 12)  # 2 elites x 4 times 12 episodes, of which 40 count
-    fresh = fresh_of(archive_of([0.25, 0.35]), np.stack([marks, marks + 1.0], axis=2), num_replicas=12)
-    assert fresh.episodes.tolist() == [40, 40] and fresh.penalty_mean[:, 0].tolist() == [19.5, 48 + 19.5]
-    assert len(fresh_of(small_archive(0), None).reproduced) == 0
 
 
 def test_seeds_follow_from_what_names_an_elite():
