@@ -115,7 +115,7 @@ def walk(crossings: Crossings, policy: str, seed: int = 0) -> dict[str, dict[str
     """
     flat, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([seed], np.uint32)
     here = crossings.cross(policy, flat, seeds, replicas=_WALKS, label="flat ground", invalid_ok=True)
-    ((_, there),) = cross_terrains(
+    (there,) = cross_terrains(
         crossings.robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
     )
     return {"searched": _walked(here), "mujoco_c": _walked(there)}

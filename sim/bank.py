@@ -20,6 +20,11 @@ class TerrainBank:
     """Height grids on the device; an environment stands on the grid its terrain index names.
 
     Terrains are replaced in place, so that captured graphs go on reading them.
+
+    Attributes:
+        heights: Node heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
+        terrain: The same with their ceilings, as contacts take them.
+        ground: Friction and softness; None where no terrain has any.
     """
 
     def __init__(self, num_terrains: int, *, device: str, with_ground: bool = False) -> None:
@@ -28,21 +33,11 @@ class TerrainBank:
             raise ValueError(f"a bank needs at least 1 terrain, got {num_terrains}")
         shape = num_terrains, NUM_ROWS, NUM_COLS
         self.terrain = Terrain()
-        self.terrain.heights = wp.zeros(shape, dtype=float, device=device)
+        self.terrain.heights = self.heights = wp.zeros(shape, dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
         self.terrain.spacing = SPACING
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
-        self.device = device
-
-    @property
-    def num_terrains(self) -> int:
-        """Number of grids."""
-        return self.terrain.heights.shape[0]
-
-    @property
-    def heights(self) -> wp.array:
-        """Node heights [m] on the device, shape (num_terrains, NUM_ROWS, NUM_COLS)."""
-        return self.terrain.heights
+        self.device, self.num_terrains = device, num_terrains
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
         """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol).
@@ -93,9 +88,8 @@ class TerrainBank:
         """The maps of all terrains on the host; None of a bank without any."""
         if self.ground is None:
             return None
-        return GroundMaps(
-            friction=np.array(self.ground.friction.numpy()), time_constant_s=np.array(self.ground.time_constant.numpy())
-        )
+        friction, time_constant_s = self.ground.friction.numpy(), self.ground.time_constant.numpy()
+        return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy())
 
 
 def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:

@@ -28,7 +28,6 @@ from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import SHIPPED, label_suffix, spec_of
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Ghost, Renderer, open_context
-from sim.recording.scene import OTHER_CONTROLLER
 from sim.robots.robot import RobotCfg
 
 FPS, GIF_FPS = 25, 12.5
@@ -135,7 +134,7 @@ def pictures_of(
     recording, dt = shot.recording, shot.recording.dt
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
     poses, chart = recording.qpos(0, shot.episode), map_of(shot, size[0] // 5)
-    others = [(other.qpos(0, shot.episode), name) for name, other in filter(None, [shot.beside])]
+    name, beside = ("", None) if shot.beside is None else (shot.beside[0], shot.beside[1].qpos(0, shot.episode))
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
     width, height = (side * (1 if size[0] > GIF_SIZE[0] else _FINER) for side in size)
@@ -144,9 +143,9 @@ def pictures_of(
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
             frame = min(time_s / dt, float(len(poses) - 1))
             pose, here = pose_at(poses, frame), (0, shot.episode, int(frame + 0.5))
-            ghosts = [Ghost(pose_at(other, time_s / dt), OTHER_CONTROLLER, name) for other, name in others]
+            ghost = None if beside is None else Ghost(pose_at(beside, time_s / dt), name)
             touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
-            picture = Image.fromarray(renderer.render(pose, camera, ghosts=ghosts, **touch))
+            picture = Image.fromarray(renderer.render(pose, camera, ghost=ghost, **touch))
             picture = picture.resize(size, Image.Resampling.BOX)
             _letter(picture, shot, time_s, slowness[number])
             inset = chart.copy()

@@ -293,7 +293,7 @@ class Crossings:
     def _cross_in_mujoco_c(
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        processes, done = parse_workers(cfg.workers).num_processes, list[tuple[int, RolloutResult]]()
+        processes, done = parse_workers(cfg.workers).num_processes, list[RolloutResult]()
         with Bar(label, len(missing)) as bar:
             crossings = cross_terrains(
                 self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
@@ -303,8 +303,7 @@ class Crossings:
                 bar.move_to(count)
                 done.append(crossed)
                 if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
-                    numbers, episodes = zip(*done, strict=True)
-                    yield missing[list(numbers)], join_results(episodes, join=1)
+                    yield missing[count - len(done) : count], join_results(done, join=1)
                     done.clear()
 
 

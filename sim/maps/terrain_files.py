@@ -187,10 +187,9 @@ def write_terrain(
 ) -> list[Path]:
     """Writes a terrain as ``<name>.<format>``, and as ``<name>.json`` what the files mean; each atomically.
 
-    The folder exists; formats are some of :data:`FORMATS`, of which the npz holds genes and ground too; ``about`` are
-    further keys of the JSON.
+    The folder exists; :func:`check_formats` takes the formats, of which the npz holds genes and ground too; ``about``
+    are further keys of the JSON.
     """
-    check_formats(formats)
     if terrain.ground is not None and "npz" not in formats:
         raise ValueError(f"formats must have npz, which alone holds friction and softness, got {', '.join(formats)}")
     scale, offset = terrain.gray_scale

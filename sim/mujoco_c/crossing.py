@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from copy import copy
@@ -62,9 +62,7 @@ def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def draw_starts(
-    robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str, cfg: CrossingCfg | None = None
-) -> Starts:
+def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str) -> Starts:
     """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
     ``heights`` [m] have the shape (nrow, ncol); ``device`` is a Warp device.
@@ -82,7 +80,7 @@ def draw_starts(
         make_ready(count, queue)
         turn_over(episodes.outcome, Rewards(), episodes, wp.zeros((count, 0), dtype=float), terrain_of_env, queue)
         restart_episodes(
-            queue.begins, terrain_of_env, bank.terrain, make_start_ranges(cfg or CrossingCfg(), robot), sensors,
+            queue.begins, terrain_of_env, bank.terrain, make_start_ranges(CrossingCfg(), robot), sensors,
             joint_q, joint_qd, wp.zeros((count, robot.num_joints), dtype=float), episodes, Rewards(),
         )  # fmt: skip
     order = np.argsort(queue.episode_of_env.numpy())  # on a GPU robots take them in any order
@@ -127,10 +125,9 @@ class Episodes:
         self._targets[running] = targets
 
 
-def _judge(
-    robot: RobotCfg, episodes: Episodes, running: NDArray[np.intp], base: NDArray[np.bool_], cfg: CrossingCfg
-) -> Array:
+def _judge(robot: RobotCfg, episodes: Episodes, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
     """Outcome of each running episode after a physics step, the gravest of several."""
+    cfg = CrossingCfg
     qpos, qvel = episodes.qpos[running], episodes.qvel[running]
     x, y = qpos[:, 0], qpos[:, 1]
     outcome = np.full(len(running), Outcome.RUNNING)
@@ -150,7 +147,6 @@ def cross(
     policy: Policy,
     heights: NDArray[np.float32],
     starts: Starts,
-    cfg: CrossingCfg | None = None,
     *,
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
@@ -160,7 +156,6 @@ def cross(
     It does not tell why an episode is invalid. Heights are those of one terrain [m], shape (nrow, ncol), and so is its
     ground; the contact time constant is that of the robot's file if None.
     """
-    cfg = cfg or CrossingCfg()
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     episodes = Episodes(robot, model, starts)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
@@ -179,7 +174,7 @@ def cross(
         if step % robot.decimation == 0:
             qpos, qvel = episodes.qpos[running], episodes.qvel[running]
             command = np.zeros((count, 3))
-            command[running] = goal_commands(qpos, cfg, robot.speed)
+            command[running] = goal_commands(qpos, robot.speed)
             rows[running] = observations(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )
@@ -191,7 +186,7 @@ def cross(
             last_action[running] = action
             episodes.hold(running, default + robot.action_scale * action)
         episodes.step(running)
-        judged = _judge(robot, episodes, running, base, cfg)
+        judged = _judge(robot, episodes, running, base)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1
@@ -247,7 +242,7 @@ def cross_terrains(
     processes: int,
     resolved: bool,
     device: str = "cpu",
-) -> Iterator[tuple[int, RolloutResult]]:
+) -> Iterator[RolloutResult]:
     """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
 
     Args:
@@ -262,25 +257,23 @@ def cross_terrains(
         device: Warp device that makes the terrains and draws the starts.
 
     Yields:
-        The number of each terrain with its crossings, as they are done.
+        The crossings of each terrain, in order.
     """
     if terrains.ndim == 2 and "softness" in space.ground:  # before any work
         raise ValueError(NO_SOFTNESS)
     robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
     heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
     with _process_pool(robot, policy, processes) as pool:
-        chunks: list[list[Future[RolloutResult]]] = []
+        crossings = []
         for number, (grid, seed) in enumerate(zip(heights, seeds, strict=True)):
             starts = draw_starts(robot, grid, int(seed), num_episodes, device)
             patches = None if ground is None else ground[number : number + 1]
-            parts = [starts[first : first + _CHUNK] for first in range(0, num_episodes, _CHUNK)]
-            chunks.append([pool.submit(_cross_chunk, grid, patches, part, solver.time_constant_s) for part in parts])
-        terrain_of = {chunk: number for number, parts in enumerate(chunks) for chunk in parts}
-        for chunk in as_completed(list(terrain_of)):
-            chunk.result()  # raises what it raised
-            number = terrain_of.pop(chunk)
-            if number not in terrain_of.values():
-                yield number, _join([part.result() for part in chunks[number]])
+            chunks = [starts[first : first + _CHUNK] for first in range(0, num_episodes, _CHUNK)]
+            crossings.append(
+                [pool.submit(_cross_chunk, grid, patches, chunk, solver.time_constant_s) for chunk in chunks]
+            )
+        for chunks in crossings:
+            yield _join([chunk.result() for chunk in chunks])
 
 
 @contextmanager

@@ -255,12 +255,12 @@ def _heading(qpos: Array) -> Array:
     return np.arctan2(forward[:, 1], forward[:, 0])
 
 
-def goal_commands(qpos: Array, cfg: CrossingCfg, speed: float) -> Array:
+def goal_commands(qpos: Array, speed: float) -> Array:
     """Commanded v_x, v_y [m/s] and yaw rate [rad/s] toward the goal, yaw frame, shape (num, 3)."""
-    to_goal = np.array(cfg.goal) - qpos[:, :2]
+    to_goal = np.array(CrossingCfg.goal) - qpos[:, :2]
     error = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - _heading(qpos)
     error = np.arctan2(np.sin(error), np.cos(error))
-    yaw_rate = np.clip(cfg.yaw_gain * error, -cfg.max_yaw_rate, cfg.max_yaw_rate)
+    yaw_rate = np.clip(CrossingCfg.yaw_gain * error, -CrossingCfg.max_yaw_rate, CrossingCfg.max_yaw_rate)
     return np.stack([speed * np.cos(error), speed * np.sin(error), yaw_rate], axis=1)
 
 

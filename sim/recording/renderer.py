@@ -3,7 +3,6 @@
 import importlib
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sim.ground import GroundMaps
-from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_EPISODE, TOUCH, Color, scene_model
+from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_CONTROLLER, TOUCH, scene_model
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import touches_of
 
@@ -45,12 +44,11 @@ class Camera:
 
 
 class Ghost(NamedTuple):
-    """Another robot in a picture: translucent, of one colour."""
+    """Another controller's robot in a picture: translucent, of one colour."""
 
     qpos: NDArray[np.floating]
     """MuJoCo's joint coordinates, shape (7 + num_joints,)."""
-    color: Color = OTHER_EPISODE
-    name: str = ""
+    name: str
     """Written over it."""
 
 
@@ -95,7 +93,7 @@ class Renderer:
         self._feet = [self.model.geom(name).id for name in robot.foot_geoms]
         self._first_foot = len(robot.geom_names) - len(robot.foot_geoms)
         self._touches, self._ground = touches_of(self.model, robot), self.model.geom(GROUND).id
-        self._data = [_mj.MjData(self.model)]
+        self._data, self._ghost_data = _mj.MjData(self.model), _mj.MjData(self.model)
         self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[_mj.mjtRndFlag.mjRND_REFLECTION] = False
@@ -107,11 +105,9 @@ class Renderer:
         self._image = np.empty((height, width, 3), np.uint8)
 
     def __enter__(self) -> "Renderer":
-        """The renderer itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Frees what it took."""
         self._gpu.free()
         self._context.free()
 
@@ -120,7 +116,7 @@ class Renderer:
         qpos: NDArray[np.floating],
         camera: Camera,
         *,
-        ghosts: Sequence[Ghost] = (),
+        ghost: Ghost | None = None,
         touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
     ) -> NDArray[np.uint8]:
@@ -130,7 +126,8 @@ class Renderer:
         are yellow, base and limbs magenta. ``foot_force`` is the contact force on each foot, world frame [N], shape
         (num_feet, 3), shown as arrows.
         """
-        data = self._posed(0, qpos)
+        data = self._data
+        self._pose(data, qpos)
         self._camera.lookat[:] = camera.target
         self._camera.distance = camera.distance
         # The sun goes with the camera, so that its shadows are sharp where one looks.
@@ -139,24 +136,21 @@ class Renderer:
         everything = _mj.mjtCatBit.mjCAT_ALL.value
         _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
-        for number, ghost in enumerate(ghosts, 1):
-            self._add_ghost(number, ghost)
+        if ghost is not None:
+            self._add_ghost(ghost)
         if foot_force is not None:
             for place, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
                 self._add_arrow(place, force)
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
-        return self._named(self._image[::-1], ghosts)  # OpenGL's lowest row is first
+        picture = self._image[::-1]  # OpenGL's lowest row is first
+        return picture.copy() if ghost is None else self._named(picture, ghost)
 
-    def _posed(self, number: int, qpos: NDArray[np.floating]) -> Any:
-        while len(self._data) <= number:
-            self._data.append(_mj.MjData(self.model))
-        data = self._data[number]
+    def _pose(self, data: Any, qpos: NDArray[np.floating]) -> None:
         data.qpos[:] = qpos
         _mj.mj_kinematics(self.model, data)
         _mj.mj_comPos(self.model, data)
         _mj.mj_camlight(self.model, data)
-        return data
 
     def _dress(self, touching: NDArray[np.bool_] | None) -> None:
         """Colours what touches, and has the ground cast no shadow: it would speckle slopes."""
@@ -170,31 +164,28 @@ class Renderer:
                 geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
                 geom.matid = -1
 
-    def _add_ghost(self, number: int, ghost: Ghost) -> None:
-        data, first = self._posed(number, ghost.qpos), self._scene.ngeom
-        moving = _mj.mjtCatBit.mjCAT_DYNAMIC.value
-        _mj.mjv_addGeoms(self.model, data, self._options, self._nudge, moving, self._scene)
+    def _add_ghost(self, ghost: Ghost) -> None:
+        self._pose(self._ghost_data, ghost.qpos)
+        first, moving = self._scene.ngeom, _mj.mjtCatBit.mjCAT_DYNAMIC.value
+        _mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
-            geom.rgba[:] = *ghost.color, _GHOST_OPACITY
+            geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
             geom.matid, geom.transparent = -1, 1
 
-    def _named(self, picture: NDArray[np.uint8], ghosts: Sequence[Ghost]) -> NDArray[np.uint8]:
-        """The picture with the ghosts' names over them."""
-        image = Image.fromarray(picture)
-        draw, height = ImageDraw.Draw(image), self._rectangle.height
+    def _named(self, picture: NDArray[np.uint8], ghost: Ghost) -> NDArray[np.uint8]:
+        """The picture with the ghost's name over it."""
+        image, (height, width, _) = Image.fromarray(picture), picture.shape
         camera = self._scene.camera[0]  # that of one eye, at most a few centimetres from the middle of both
-        for ghost in ghosts:
-            over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
-            away = np.asarray(ghost.qpos[:3], np.float64) + np.array(over) - camera.pos
-            depth = float(away @ camera.forward)
-            if not ghost.name or depth <= camera.frustum_near:
-                continue
+        over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
+        away = np.asarray(ghost.qpos[:3], np.float64) + np.array(over) - camera.pos
+        depth = float(away @ camera.forward)
+        if depth > camera.frustum_near:
             pixels = 0.5 * height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
             right, up = away @ np.cross(camera.forward, camera.up), away @ camera.up
-            place = 0.5 * self._rectangle.width + pixels * right, 0.5 * height - pixels * up
-            color = tuple(round(150.0 * share) for share in ghost.color)
+            place = 0.5 * width + pixels * right, 0.5 * height - pixels * up
+            color = tuple(round(150.0 * share) for share in OTHER_CONTROLLER)
             font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
-            draw.text(place, ghost.name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
+            ImageDraw.Draw(image).text(place, ghost.name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
         return np.array(image)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:

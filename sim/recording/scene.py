@@ -24,8 +24,8 @@ Color = tuple[float, float, float]
 """RGB, 0 to 1."""
 TOUCH, FOOT_TOUCH = (0.84, 0.09, 0.48), (1.0, 0.84, 0.04)
 """Of base and limbs, and of feet, while they touch."""
-OTHER_CONTROLLER, OTHER_EPISODE = (0.05, 0.62, 0.55), (0.88, 0.89, 0.90)
-"""Of ghosts: another controller's crossing, and another episode of the same one."""
+OTHER_CONTROLLER = (0.05, 0.62, 0.55)
+"""Of ghosts: another controller's crossing."""
 
 MARGIN_NODES = 40
 """Edge height shown on each side: a crossing may leave the terrain by 2 m."""

@@ -3,8 +3,6 @@
 An obstacle is an element of a course (:mod:`kernels.course`) of any size, within the ranges of its space or beyond.
 """
 
-import contextlib
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -81,16 +79,16 @@ _GROUND = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Dose:
     """An obstacle, and the one of its parameters that grows."""
 
     title: str
+    kind: Kind | None
+    """None: the ground, level everywhere, whose map the parameter is."""
     parameter: str
     values: tuple[float, ...]
     """Of the parameter, the easiest first."""
-    kind: Kind | None = None
-    """None: the ground, level everywhere, whose map the parameter is."""
     up: float | None = None
     """1 up, -1 down; None of an obstacle without a direction."""
     others: Mapping[str, float] = field(default_factory=dict)
@@ -125,8 +123,8 @@ class Dose:
             raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {values}")
         for name, value in [*((self.parameter, value) for value in values), *changed.items()]:
             quantity = self.quantities[name]
-            off_step = quantity.step and abs(value / quantity.step - round(value / quantity.step)) > 1e-6
-            if off_step or not quantity.low <= value <= quantity.high:
+            within = quantity.low <= value <= quantity.high
+            if not within or (quantity.step and abs(value / quantity.step - round(value / quantity.step)) > 1e-6):
                 steps = f" in steps of {quantity.step:g}" if quantity.step else ""
                 limits = f"{quantity.low:g} to {quantity.high:g} {quantity.unit}".rstrip()
                 raise ValueError(f"{self.title}: {name} must be {limits}{steps}, got {value:g}")
@@ -149,14 +147,10 @@ class Dose:
         elements["detail"] = 1.0  # pallets
         elements["first"] = (FIRST_COL + np.arange(count) * NUM_PLACES // count)[:, None]
         elements["turn"] = self._turns(count, rng)[:, None]
-        for name, value in self.others.items():
-            self._set(elements, name, value)
-        self._set(elements, self.parameter, np.array(self.values))
+        for name, value in {**self.others, self.parameter: np.array(self.values)}.items():
+            quantity = self.quantities[name]
+            elements[quantity.field] = np.rint(value / SPACING) if quantity.cells else value
         return _heights_of(elements.reshape(-1))
-
-    def _set(self, elements: Any, name: str, value: Any) -> None:
-        quantity = self.quantities[name]
-        elements[quantity.field] = np.rint(value / SPACING) if quantity.cells else value
 
     def _turns(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         if self.kind is Kind.CROSS_SLOPE:
@@ -189,48 +183,28 @@ _LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)
 _RISES = (0.05, 0.10, 0.14, 0.17, 0.20, 0.22, 0.24, 0.26, 0.28, 0.30, 0.35)
 _STEPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.50)
 _SLOPES = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
+_WIDTHS = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
+_GAPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40)
+_FRICTIONS = (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)
 _FLIGHT = {"tread": 0.30, "flight": 5.0}
 DOSES: dict[str, Dose] = {
-    "stairs_up": Dose(
-        title="stairs up", kind=Kind.STAIRS, up=1.0, parameter="rise", others=_FLIGHT, values=_RISES
-    ),
-    "stairs_down": Dose(
-        title="stairs down", kind=Kind.STAIRS, up=-1.0, parameter="rise", others=_FLIGHT, values=_RISES
-    ),
-    "step_up": Dose(title="kerb or step up", kind=Kind.STEP, up=1.0, parameter="height", values=_STEPS),
-    "step_down": Dose(title="kerb or step down", kind=Kind.STEP, up=-1.0, parameter="height", values=_STEPS),
-    "sill": Dose(title="sill", kind=Kind.SILL, parameter="height", others={"width": 0.10}, values=_LOW),
-    "rail": Dose(title="rail", kind=Kind.RAIL, parameter="height", values=_LOW),
-    "pallet": Dose(title="pallet", kind=Kind.PALLET, parameter="height", others={"length": 1.0}, values=_STEPS),
-    "ramp_up": Dose(
-        title="ramp up", kind=Kind.RAMP, up=1.0, parameter="slope", others={"length": 2.0}, values=_SLOPES
-    ),
-    "ramp_down": Dose(
-        title="ramp down", kind=Kind.RAMP, up=-1.0, parameter="slope", others={"length": 2.0}, values=_SLOPES
-    ),
-    "cross_slope": Dose(
-        title="cross slope", kind=Kind.CROSS_SLOPE, parameter="slope", others={"length": 3.0}, values=_SLOPES
-    ),
-    "ditch": Dose(
-        title="ditch", kind=Kind.DITCH, parameter="width", others={"depth": 0.50},
-        values=(0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00),
-    ),
-    "beam": Dose(
-        title="beam over a ditch", kind=Kind.BRIDGE, parameter="width", others={"depth": 0.50, "length": 1.50},
-        values=(1.00, 0.80, 0.70, 0.60, 0.50, 0.40, 0.30, 0.20, 0.10),
-    ),
-    "stones": Dose(
-        title="stepping stones", kind=Kind.STONES, parameter="gap",
-        others={"side": 0.30, "depth": 0.40, "length": 2.00}, values=(0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40),
-    ),
-    "rubble": Dose(
-        title="rubble", kind=Kind.RUBBLE, parameter="height", others={"side": 0.20, "length": 2.00}, values=_LOW
-    ),
-    "friction": Dose(
-        title="level ground", parameter="friction", values=(1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)
-    ),
-    "softness": Dose(title="level ground", parameter="softness", values=(0.015, 0.02, 0.03, 0.04, 0.05, 0.06)),
-}  # fmt: skip
+    "stairs_up": Dose("stairs up", Kind.STAIRS, "rise", _RISES, up=1.0, others=_FLIGHT),
+    "stairs_down": Dose("stairs down", Kind.STAIRS, "rise", _RISES, up=-1.0, others=_FLIGHT),
+    "step_up": Dose("kerb or step up", Kind.STEP, "height", _STEPS, up=1.0),
+    "step_down": Dose("kerb or step down", Kind.STEP, "height", _STEPS, up=-1.0),
+    "sill": Dose("sill", Kind.SILL, "height", _LOW, others={"width": 0.10}),
+    "rail": Dose("rail", Kind.RAIL, "height", _LOW),
+    "pallet": Dose("pallet", Kind.PALLET, "height", _STEPS, others={"length": 1.0}),
+    "ramp_up": Dose("ramp up", Kind.RAMP, "slope", _SLOPES, up=1.0, others={"length": 2.0}),
+    "ramp_down": Dose("ramp down", Kind.RAMP, "slope", _SLOPES, up=-1.0, others={"length": 2.0}),
+    "cross_slope": Dose("cross slope", Kind.CROSS_SLOPE, "slope", _SLOPES, others={"length": 3.0}),
+    "ditch": Dose("ditch", Kind.DITCH, "width", _WIDTHS, others={"depth": 0.50}),
+    "beam": Dose("beam over a ditch", Kind.BRIDGE, "width", _WIDTHS[::-1], others={"depth": 0.50, "length": 1.50}),
+    "stones": Dose("stepping stones", Kind.STONES, "gap", _GAPS, others={"side": 0.30, "depth": 0.40, "length": 2.00}),
+    "rubble": Dose("rubble", Kind.RUBBLE, "height", _LOW, others={"side": 0.20, "length": 2.00}),
+    "friction": Dose("level ground", None, "friction", _FRICTIONS),
+    "softness": Dose("level ground", None, "softness", (0.015, 0.02, 0.03, 0.04, 0.05, 0.06)),
+}
 """Every dose by its name."""
 
 
@@ -260,7 +234,7 @@ def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
 
 
 def _number(text: str, word: str) -> float:
-    with contextlib.suppress(ValueError):
-        if math.isfinite(value := float(text)):
-            return value
-    raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}")
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None

@@ -87,13 +87,13 @@ def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
 def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
     side = Camera(target=(2.0, 4.0, 0.5), distance=4.0, azimuth=90.0, elevation=-10.0)
     pose = standing(anymal, 2.0, 4.0, 0.0)
-    green = Ghost(standing(anymal, 3.2, 4.0, 0.0), (0.0, 1.0, 0.0), "C-G")
+    ghost = Ghost(standing(anymal, 3.2, 4.0, 0.0), "C-G")
     force, base, foot = np.zeros((4, 3)), np.zeros(13, bool), np.zeros(13, bool)
     force[0, 2], base[0], foot[-4:] = 900.0, True, True
     with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
         pictures = [
             renderer.render(pose, side, **marks).astype(int)
-            for marks in ({}, {"ghosts": [green]}, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
+            for marks in ({}, {"ghost": ghost}, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
         ]
     alone, joined, pushed, hit, stepping, again = pictures
     np.testing.assert_array_equal(alone, again)  # what was added to a picture stays in it
@@ -102,7 +102,7 @@ def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
         return (picture[..., strong].min(axis=-1) - picture[..., weak].max(axis=-1) > 60).sum()
 
     for picture, strong, weak in (
-        (joined, [1], [0, 2]),
+        (joined, [1, 2], [0]),
         (pushed, [0], [1, 2]),
         (hit, [0], [1]),
         (stepping, [0, 1], [2]),

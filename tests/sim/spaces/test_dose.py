@@ -94,7 +94,7 @@ def test_a_command_line_names_doses():
         ("ditch=0.12", "", "width"),  # no multiple of 5 cm
         ("stairs_up=0.9", "", "rise"),
         ("stairs_up=high", "", "stairs_up=high"),
-        ("ditch=nan", "", "ditch=nan"),
+        ("ditch=nan", "", "width"),
         ("stairs_up", "flight=2.5", "flight"),
         ("ditch", "tread=0.3", "tread"),
         ("ditch", "depth", "depth"),
