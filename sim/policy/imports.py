@@ -113,21 +113,16 @@ class _Found:
 
 
 def import_controller(source: Path, model_file: Path, out: Path) -> None:
-    """Writes ``out``/robot.toml and controller.toml, with the weights beside them, and prints both.
+    """Writes robot.toml and controller.toml, with the weights beside them, and prints both.
 
-    Args:
-        source: A folder or a YAML of rl_sar, a YAML of unitree_rl_gym, a run folder of Isaac Lab, an ONNX file, with or
-            without mjlab's metadata, or any other weights.
-        model_file: The robot's MJCF or URDF.
-        out: A folder, which gives the robot its name.
+    The source is a folder or a YAML of rl_sar, a YAML of unitree_rl_gym, a run folder of Isaac Lab, an ONNX file, with
+    or without mjlab's metadata, or any other weights. The folder ``out`` gives the robot its name.
     """
     if taken := [str(out / name) for name in _FILES if (out / name).exists()]:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
     if not re.fullmatch(NAME, out.resolve().name) or out.resolve().name in ROBOTS:
-        shipped = ", ".join(ROBOTS)
-        raise ValueError(
-            f"--out must end in a name of its own, of letters, digits, . _ and -, not {shipped}, got {out}"
-        )
+        shipped = " or ".join(ROBOTS)
+        raise ValueError(f"--out must end in a new name of letters, digits, . _ and -, not {shipped}, got {out}")
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
     of_file = read_robot_file(model_file)
@@ -142,9 +137,7 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
         raise ValueError(f"{source} must be {kind}, but: {type(error).__name__}: {error}") from None
     copy = out / weights.name
     if copy.exists() and copy.read_bytes() != weights.read_bytes():
-        raise ValueError(
-            f"{copy} must be a copy of {weights}, or not be there, got other weights: move them away first"
-        )
+        raise ValueError(f"{copy} must be a copy of {weights}, got other weights: move them away first")
     out.mkdir(parents=True, exist_ok=True)
     found.put(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights.name)
     print(f"{source} is read as {kind}; its weights are {weights}.")

@@ -34,9 +34,7 @@ _FORMATS = (
 Policy = Callable[[torch.Tensor], torch.Tensor]
 """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size).
 
-One that remembers has a method ``reset(rows)``, called before every step with a bool tensor of shape (num_envs,): True
-where a robot begins a new episode. Robots begin at different times. One whose ``reset()`` takes no rows is called when
-all its robots begin together, which leaves robots idle that have ended.
+One that remembers has a method ``reset``, of one of the kinds of :data:`sim.policy.runner.Memory`.
 """
 PolicySpec = str | Path | Policy
 """A controller as :func:`load_policy` takes it, or as a callable."""
@@ -90,25 +88,15 @@ def read_weights(path: Path) -> Any:
 
 
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
-    """Load a controller and try it on one batch of zeros.
+    """Loads a controller, as :class:`ControllerSpec` names it, and tries it on rows of the robot, on a Warp device.
 
     Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
     checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
     file made to harm can crash. A warning says if the training record beside a file names another robot.
-
-    Args:
-        spec: A description, an rsl_rl checkpoint, a TorchScript file, an ONNX file, ``module:callable``, or
-            ``module:adapter@file``; a Python file may stand for the module. An adapter is called with the file's
-            controller, of whatever sizes, and the robot, and returns a policy.
-        robot: The robot it is to walk: fixes observation and action size.
-        device: Warp device name.
     """
     where = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
     if where != "cpu" and not torch.cuda.is_available():
-        raise ValueError(
-            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build or "
-            "use --device cpu"
-        )
+        raise ValueError(f"torch {torch.__version__} has no CUDA: install a build with CUDA, or use --device cpu")
     named = ControllerSpec.parse(spec)
     policy = _load_file(Path(spec), robot, where) if named.place is None else _load_code(named, robot, where)
     _try_rows(policy, (robot.observation_size, robot.num_joints), where, str(spec), f"robot '{robot.name}'")
@@ -156,9 +144,7 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         called, arguments = "controller, robot", (_load_file(Path(spec.file), robot, device, fits=False), robot)
     elif not getattr(target, "faultline_factory", False):
         if inspect.isclass(target):
-            raise ValueError(
-                f"policy '{spec}' is a class: mark it by `faultline_factory = True` to be called ({called})"
-            )
+            raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; expected {_FORMATS}")
         return target
     try:
         policy = target(*arguments)
@@ -172,15 +158,12 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
 def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -> Policy:
     """The controller in a file; with ``fits`` it must have the robot's sizes."""
     if path == robot.policy_file and not path.exists():
-        raise ValueError(
-            f"robot '{robot.name}' has no controller of its own, expected at {path}: train one with "
-            f"`{robot.train_command}`, or name another with --policy"
-        )
+        remedy = f"train one with `{robot.train_command}`, or name another with --policy"
+        raise ValueError(f"robot '{robot.name}' has no controller of its own, expected at {path}: {remedy}")
     if path.suffix == ".toml" and path.is_file():
         return load_described(read_controller(path), weights_file(path), robot, device, path)
-    return load_network(
-        path, device, (robot.observation_size, robot.num_joints) if fits else None, of=f"robot '{robot.name}'"
-    )
+    sizes = (robot.observation_size, robot.num_joints) if fits else None
+    return load_network(path, device, sizes, of=f"robot '{robot.name}'")
 
 
 def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, device: str, path: Path) -> Described:
@@ -201,15 +184,11 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
 def load_network(
     path: Path, device: str, sizes: tuple[int, int] | None, *, of: str, activation: str | None = None
 ) -> Policy:
-    """The network of a file, which has a ``reset(rows)`` if it remembers.
+    """The network of a checkpoint, TorchScript or ONNX file, with a ``reset(rows)`` if it remembers.
 
-    Args:
-        path: An rsl_rl checkpoint, a TorchScript module or an ONNX file.
-        device: Torch device name.
-        sizes: Columns that it must take and actions that it must return; None takes what the file has, a TorchScript
-            module as it is.
-        of: Whose sizes they are, for errors.
-        activation: Between the layers of a checkpoint; None takes what its file or its training says.
+    ``sizes`` are the columns that it must take and the actions that it must return, and errors say ``of`` whom; None
+    takes what the file has, a TorchScript module as it is. The ``activation`` is that between the layers of a
+    checkpoint; None takes what its file or its training says.
     """
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
@@ -265,16 +244,12 @@ def _actor_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
         )
     beside = content.get("obs_norm_state_dict") or {}
     if not isinstance(beside, dict):
-        raise ValueError(
-            f"policy '{path}': obs_norm_state_dict must be a table of tensors, got {type(beside).__name__}"
-        )
+        raise ValueError(f"policy '{path}': obs_norm_state_dict must be a table, got {type(beside).__name__}")
     normaliser = {f"obs_normalizer.{key}": value for key, value in beside.items()}
     names |= {key: key for key in normaliser}
     if unknown := [key for key, name in names.items() if not re.fullmatch(_KNOWN, name)]:
-        raise ValueError(
-            f"policy '{path}' has more than a perceptron or a recurrent network: {', '.join(unknown)} are not "
-            "understood; export it as TorchScript or ONNX"
-        )
+        what = f"has more than a perceptron or a recurrent network: {', '.join(unknown)}"
+        raise ValueError(f"policy '{path}' {what}: export it as TorchScript or ONNX")
     parts = {name.partition(".")[2] for name in names.values() if name.startswith("obs_normalizer.")}
     if parts and not {"_mean", "_std"} <= parts:
         raise ValueError(f"policy '{path}' must have _mean and _std of its normaliser, got {', '.join(sorted(parts))}")
@@ -371,11 +346,7 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
 
 @torch.no_grad()
 def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> Policy:
-    """A module that remembers each robot, by its copy on the CPU.
-
-    It remembers in the buffers that a call changes, made for one robot: as many rows of them must act as one robot
-    after the other does. One that remembers elsewhere and has a ``reset()`` stays as it is.
-    """
+    """A module that remembers each robot in rows of the buffers that a call of its copy on the CPU changes."""
     rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
     begin = next((getattr(probe, name) for name in ("reset", "reset_memory") if hasattr(probe, name)), None)
     if begin is not None:
@@ -389,13 +360,13 @@ def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> P
         return _Script(module)
     initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
     if not initial:
-        return _Script(module) if begin is None or torch.equal(once, again) else module
+        return _Script(module) if begin is None or torch.equal(once, again) else module  # it remembers elsewhere
     apart = []
     for robot in range(rows.shape[1]):
         for name, value in probe.named_buffers():
             value.copy_(before[name])
         apart.append(torch.cat([probe(step[robot : robot + 1]) for step in rows]))
-    for axis in (1, 0):
+    for axis in (1, 0):  # along which rows act as one robot after the other does
         if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
             free = _RecurrentScript(probe, initial, axis)
             try:
@@ -404,10 +375,8 @@ def _by_robot(module: Any, probe: Any, path: Path, width: int, device: str) -> P
                 continue
             if torch.allclose(together, torch.stack(apart), rtol=1e-4, atol=1e-4):
                 return _RecurrentScript(module, initial, axis).to(device)
-    raise ValueError(
-        f"policy '{path}' remembers one robot alone, in {', '.join(initial)}, and rows of it do not act as one "
-        "robot does: give the checkpoint that it was exported from"
-    )
+    where = ", ".join(initial)
+    raise ValueError(f"policy '{path}' remembers one robot alone, in {where}: give the checkpoint of which it was made")
 
 
 def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, of: str) -> None:

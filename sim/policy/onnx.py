@@ -118,18 +118,15 @@ _LAYERS: dict[str, Callable[..., Any]] = {
 
 
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
-    """Load a controller from an ONNX file.
+    """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
+
+    Its graph takes observations (batch, observation_size) and gives actions (batch, num_joints), both float32; one that
+    remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
 
     Nothing but that file is read and no code in it runs: weights beside it are refused, and onnxruntime knows only its
-    own operators. It is read by onnxruntime's C++, which a file made to harm can crash. A graph of plain layers becomes
-    a torch module, if random rows of it come out as onnxruntime has them. Another that is made for one robot is changed
-    into one for any number, if it acts as one robot after the other does; else it runs once a robot.
-
-    Args:
-        path: The file; its graph takes observations (batch, observation_size) and gives actions (batch, num_joints),
-            both float32; one that remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
-        sizes: Observation and action size of the robot; None takes whatever the file has.
-        device: Torch device name; on CUDA onnxruntime runs a graph on the GPU if it is built for it, else on the CPU.
+    own operators. A graph of plain layers becomes a torch module, if random rows of it come out as onnxruntime has
+    them. Another that is made for one robot is changed into one for any number, if it acts as one robot after the other
+    does; else it runs once a robot.
     """
     where = torch.device(device)
     try:
@@ -195,10 +192,7 @@ def _tensors(message: Any) -> Iterator[Any]:
 
 
 def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
-    """Widths of observation and action, shapes of the states, and whether it takes one robot alone.
-
-    Refuses a graph that is not one batch of float32 rows of these sizes to another.
-    """
+    """Widths of observation and action, shapes of the states, and whether it takes one robot alone."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if [port.name for port in inputs[1:]] != [f"{port.name.removesuffix('_out')}_in" for port in outputs[1:]]:
         raise ValueError(

@@ -32,7 +32,11 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
 
 
 Memory = Literal["none", "reset(rows)", "reset()"]
-"""How a policy forgets: it has no memory, forgets single robots, or all, so that its robots have to begin together."""
+"""How a policy forgets: it has no memory, forgets single robots, or all.
+
+``reset(rows)`` is called before every step with a bool tensor of shape (num_envs,): True where a robot begins a new
+episode. ``reset()`` is called when all robots begin together, which leaves robots idle that have ended.
+"""
 
 
 def memory_of(policy: Any) -> Memory:
@@ -116,13 +120,9 @@ class PolicyRunner:
     def __init__(
         self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
     ) -> None:
-        """Bind the controller to Warp arrays.
+        """Bind it to Warp arrays of shapes (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
 
-        Args:
-            policy: The controller.
-            observation: Shape (num_envs, observation_size).
-            action: Where actions are written to, shape (num_envs, num_joints).
-            begins: Not 0 where an episode begins with the coming step, int, shape (num_envs,).
+        ``begins`` is not 0 where an episode begins with the coming step.
         """
         self._policy: Any = policy
         self.memory = memory_of(policy)

@@ -183,12 +183,10 @@ def about_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[s
 
 
 def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
-    """Policy of each controller by its name, in the order given; the shipped one as ``base`` if there is none.
+    """Policy of each controller by its name, in the order given; the robot's own as ``base`` if there is none.
 
-    Args:
-        policies: ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; a text may hold several, with spaces.
-        robot: The robot, whose controller is the shipped one.
-        flag: The flag that names them, for errors.
+    Each is ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; a text may hold several, with spaces. Errors
+    name the ``flag``.
     """
     text = " ".join(policies).strip() or f"base={SHIPPED}"
     controllers: dict[str, str] = {}

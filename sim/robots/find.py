@@ -28,10 +28,8 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
         from sim.robots.own import load_robot  # Newton takes seconds to load: not for the help of commands
 
         return load_robot(Path(spec))
-    raise ValueError(
-        f"unknown robot '{spec}': expected one of {', '.join(sorted(ROBOTS))}, or its robot.toml, or a Python "
-        "file that sets ROBOT (docs/robots.md)"
-    )
+    known = ", ".join(ROBOTS)
+    raise ValueError(f"unknown robot '{spec}': expected {known}, a robot.toml or a Python file (docs/robots.md)")
 
 
 def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, flag: str = "run") -> RobotCfg:
@@ -45,10 +43,7 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
     if robot is not None and robot.name != name:
         raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --{flag}")
     if robot is None and name not in ROBOTS:
-        raise ValueError(
-            f"{file} is of robot '{name}', which is not shipped: name its settings file too (--robot FILE), "
-            "since no code runs that the command line does not name"
-        )
+        raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
     robot = robot or ROBOTS[name]
     check_identity(record, robot, file, "make it anew")
     return robot

@@ -58,11 +58,9 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
 def _refuse_xacro(root: ET.Element, file: Path) -> None:
     for element in root.iter():
         marks = [value for value in element.attrib.values() if "${" in value or "$(" in value]
-        if "xacro" in element.tag or marks:
-            raise ValueError(
-                f"{file} is a xacro file ({marks[0] if marks else f'<{element.tag}>'}), expected a URDF: make one of "
-                f"it first, `xacro {file.name} > {file.stem}.expanded.urdf`"
-            )
+        if marks := marks + [element.tag] * ("xacro" in element.tag):
+            remedy = f"make one of it, `xacro {file.name} > {file.stem}.expanded.urdf`"
+            raise ValueError(f"{file} is a xacro file ({marks[0]}), expected a URDF: {remedy}")
 
 
 def _urdf_problems(root: ET.Element) -> Iterator[str]:
@@ -118,10 +116,8 @@ def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
         package, _, rest = name.removeprefix(_PACKAGE).partition("/")
         holds = [folder for folder in model_file.resolve().parents if folder.name == package]
         if not holds:
-            raise ValueError(
-                f"{model_file}: mesh {name} is in package {package}, but none of the folders above is called that: put "
-                "the URDF into its package, or write the mesh's path relative to the URDF"
-            )
+            remedy = "put the URDF into its package, or write the mesh's path relative to the URDF"
+            raise ValueError(f"{model_file}: mesh {name} is in package {package}, which no folder above is: {remedy}")
         path = holds[0] / rest
     elif "://" in name:
         raise ValueError(f"{model_file}: mesh {name} must be a file here: nothing is downloaded")

@@ -69,10 +69,7 @@ def _hull_of(vertices: _Array) -> _Hull:
     try:
         hull = ConvexHull(vertices)
     except QhullError:
-        raise ValueError(
-            f"a mesh of {len(vertices)} vertices has no volume, so no probes: expected a solid; replace it in the "
-            "robot's file by a solid one or a box"
-        ) from None
+        raise ValueError("its mesh must have a volume: replace it in the robot's file by a solid or a box") from None
     planes = np.unique(np.round(hull.equations, 9), axis=0)  # facets of one face share their plane
     return _Hull(triangles=hull.points[hull.simplices], normal=planes[:, :3], offset=-planes[:, 3])
 
@@ -155,9 +152,8 @@ def _spread(row: _Array) -> float:
 
 
 @lru_cache(maxsize=64)
-def _probes_of(content: bytes) -> tuple[list[Strip], float]:
-    vertices = np.frombuffer(content).reshape(-1, 3)
-    hull = _hull_of(vertices)
+def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
+    hull = _hull_of(np.frombuffer(vertices).reshape(-1, 3))
     corners = np.unique(hull.triangles.reshape(-1, 3), axis=0)
     tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
     while (balls := _cover(hull, tolerance)) is None:
@@ -166,14 +162,12 @@ def _probes_of(content: bytes) -> tuple[list[Strip], float]:
 
 
 def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
-    """Probes of a mesh's convex hull, and their tolerance; a mesh collides as its hull, so hollows are filled.
+    """Probes of the convex hull of vertices [m], shape (num_vertices, 3), and their tolerance [m].
 
     Rows are of one radius, in order along the mesh's longest side, and not straight. No probe sticks out; every point
-    of the hull's surface lies at most the tolerance outside of the nearest one [m].
-
-    Vertices have shape (num_vertices, 3) [m].
+    of the hull's surface lies at most the tolerance outside of the nearest one.
     """
-    return _probes_of(np.ascontiguousarray(vertices, dtype=np.float64).tobytes())
+    return _hull_probes(np.asarray(vertices, dtype=np.float64).tobytes())
 
 
 MAX_SAG = 0.005
@@ -184,22 +178,16 @@ _MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
 
 
 def _max_spacing(radius: float) -> float:
-    """Largest distance of neighbouring probes between which a sharp ridge sinks at most :data:`MAX_SAG` [m].
-
-    Two spheres of radius r at distance s leave a dent of depth ``r - sqrt(r^2 - s^2 / 4)`` between them.
-    """
-    sag = min(MAX_SAG, radius)
+    """Largest distance of neighbouring probes between which a sharp ridge sinks at most :data:`MAX_SAG` [m]."""
+    sag = min(MAX_SAG, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
 
 
-def _line(low: float, high: float, spacing: float) -> np.ndarray:
-    length = high - low
-    if length <= 1e-9:
-        return np.array([0.5 * (low + high)])
-    return np.linspace(low, high, int(np.ceil(length / spacing - 1e-9)) + 1)
+def _line(low: float, high: float, spacing: float) -> _Array:
+    return np.linspace(low, high, int(np.ceil((high - low) / spacing - 1e-9)) + 1)
 
 
-def _along_z(x: float, y: float, z: np.ndarray) -> np.ndarray:
+def _along_z(x: float, y: float, z: _Array) -> _Array:
     return np.stack([np.full_like(z, x), np.full_like(z, y), z], axis=1)
 
 
@@ -208,7 +196,7 @@ def capsule_strips(radius: float, half_height: float) -> list[Strip]:
     return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, _max_spacing(radius))), radius=radius)]
 
 
-def box_strips(half: tuple[float, float, float]) -> list[Strip]:
+def box_strips(*half: float) -> list[Strip]:
     """Parallel strips under the whole surface of a box, along its longest side (z of a cube).
 
     Edges and corners are rounded by at most 2 cm; faces are exact at every probe.
@@ -248,7 +236,7 @@ _PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., list[Strip]]]] = {
     newton.GeoType.SPHERE: (1, lambda radius: [Strip(centres=np.zeros((1, 3)), radius=radius)]),
     newton.GeoType.CAPSULE: (2, capsule_strips),
     newton.GeoType.CYLINDER: (2, cylinder_strips),
-    newton.GeoType.BOX: (3, lambda *half: box_strips(half)),
+    newton.GeoType.BOX: (3, box_strips),
 }
 """How many sizes a primitive has, and its strips."""
 
@@ -266,18 +254,13 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
         raise ValueError(f"its sizes must be positive numbers, got {', '.join(f'{size:g}' for size in sizes)} m")
     longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
     if not longest <= _MAX_SIDE:
-        raise ValueError(
-            f"it is {longest:g} m long, at most {_MAX_SIDE:g} m are taken: lengths are in metres, and a mesh in "
-            "millimetres has a scale"
-        )
+        raise ValueError(f"it is {longest:g} m long, more than {_MAX_SIDE:g} m: give lengths in m, a mesh its scale")
     if make_strips is not None:
         return make_strips(*map(float, sizes))
     if shape_type in _MESHES:
         return hull_probes(vertices)[0]
-    raise ValueError(
-        f"no probes for a {newton.GeoType(shape_type).name} collision shape: "
-        "expected SPHERE, CAPSULE, BOX, CYLINDER or MESH; replace it in the robot's file"
-    )
+    kind = newton.GeoType(shape_type).name
+    raise ValueError(f"it is a {kind}, not a SPHERE, CAPSULE, BOX, CYLINDER or MESH: replace it in the robot's file")
 
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:

@@ -43,10 +43,8 @@ def shown_spec(robot: RobotCfg) -> Any:
     for body in spec.bodies[1:]:
         _dress(body, touching_geoms(body), looks.pop(body.name, []), robot)
     if looks:
-        raise ValueError(
-            f"{look_file} has a body '{next(iter(looks))}', which {robot.model_file} has not: expected one of "
-            f"{', '.join(body.name for body in spec.bodies[1:])}"
-        )
+        names = ", ".join(body.name for body in spec.bodies[1:])
+        raise ValueError(f"{look_file} has a body '{next(iter(looks))}': expected those of {robot.model_file}, {names}")
     return spec
 
 
@@ -148,8 +146,6 @@ class Skeleton:
         Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
         (num_frames, nq), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
         """
-        if qpos.ndim != 2 or qpos.shape[1] != self.model.nq:
-            raise ValueError(f"qpos must have shape (num_frames, {self.model.nq}), got {qpos.shape}")
         data = _mj.MjData(self.model)
         positions, quaternions = (np.empty((len(qpos), self.num_bodies, count)) for count in (3, 4))
         for frame, row in enumerate(qpos):

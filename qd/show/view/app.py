@@ -167,6 +167,5 @@ def check_port(host: str, port: int) -> None:
             probe.bind(address)
     except OSError as error:
         raise ValueError(
-            f"nothing can be served at port {port} of {host}: {error.strerror or error}: give another --port above "
-            "1023, and a --host that is an address of this machine"
+            f"nothing can be served at port {port} of {host}: {error.strerror or error}: give another --port or --host"
         ) from None

@@ -81,12 +81,14 @@ class Listing:
         elites, faults = self.ranking.elites, self.archive.faults
         count = int(elites.counted[number])
         head = "fresh" if elites.fresh[number] else "as found"
-        columns = [(head, count, {name: elites.hits(name, number) for name in RATES})]
+        columns: list[Column] = [(head, count, {name: elites.hits(name, number) for name in RATES})]
         if faults is not None:
             counts = {"finer contact": faults.resolved_outcomes[number]}
             if name := certifier_of(self.archive, number):
                 counts[name] = faults.certifier_outcomes[number, faults.certifiers.index(name)]
-            columns += [(head, *_counts_of(outcomes)) for head, outcomes in counts.items() if outcomes.any()]
+            for head, outcomes in counts.items():
+                hits = dict(zip(("goal_rate", "collision_rate", "other_rate"), outcomes.tolist(), strict=False))
+                columns += [(head, sum(hits.values()), hits)] * bool(outcomes.any())
         return columns
 
     def details(self, number: int) -> str:
@@ -102,12 +104,6 @@ class Listing:
         if minima is not None and number in minima.genes:
             parts.insert(0, f"**Minimal terrain**: {minima.words(number)}.")
         return "\n\n".join(parts)
-
-
-def _counts_of(outcomes: NDArray[np.integer]) -> tuple[int, dict[str, int]]:
-    """Valid episodes, and how they ended, of counts by :data:`qd.archive.OUTCOMES`."""
-    goal, collided, other, _ = outcomes.tolist()
-    return goal + collided + other, {"goal_rate": goal, "collision_rate": collided, "other_rate": other}
 
 
 def column_of(head: str, recording: Recording) -> Column:

@@ -169,12 +169,13 @@ window.faultline = (() => {
     if (name) send(name, target.type === "checkbox" ? target.checked : Number(target.value));
     target.blur();
   });
+  const pauseAt = (time) => { send("play", false); send("seek", time); };
   const TASKS = {
     play: () => send("play", !state.playing),
-    mark: () => state.marks?.length && send("pause_at", (state.marks.find(([time]) => time > state.time + 1e-6) ?? state.marks[0])[0]),
+    mark: () => state.marks?.length && pauseAt((state.marks.find(([time]) => time > state.time + 1e-6) ?? state.marks[0])[0]),
   };
-  const KEYS = { " ": TASKS.play, m: TASKS.mark, ArrowLeft: () => send("pause_at", state.time - 0.1),
-    ArrowRight: () => send("pause_at", state.time + 0.1), n: () => send("step", 1), p: () => send("step", -1),
+  const KEYS = { " ": TASKS.play, m: TASKS.mark, ArrowLeft: () => pauseAt(state.time - 0.1),
+    ArrowRight: () => pauseAt(state.time + 0.1), n: () => send("step", 1), p: () => send("step", -1),
     f: () => send("follow", !state.follow), o: () => send("overview") };
   on(document, "keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;

@@ -1,11 +1,12 @@
-"""Records crossings on the CPU in a process of its own, while the page goes on answering.
+"""Records and films crossings on the CPU in a process of its own, while the page goes on answering.
 
-The process takes seconds to load the simulation. So it is begun before the page, and this file loads nothing of that.
+The process takes seconds to load the simulation. So it is begun before the page, and only the process loads that.
 """
 
 import threading
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from typing import Any
@@ -29,11 +30,43 @@ class Report:
     failed: bool = False
 
 
-def build_simulator(drop: Event, num_terrains: int) -> Any:
-    """What the process works with, called in it."""
-    from qd.show.view.simulator import Simulator
+class _DroppedError(Exception):
+    """Nobody waits for it any more."""
 
-    return Simulator(drop)
+
+class Simulator:
+    """What works in the process: it does the task that is put in, and drops it where ``drop`` is set."""
+
+    def __init__(self, drop: Event, num_terrains: int) -> None:
+        import sim.simulation  # noqa: F401  Newton takes seconds to load: now, and not when somebody waits
+        from qd.show.recordings import Simulation
+
+        self._drop, self._simulation_of = drop, Simulation
+        self._simulation: Simulation | None = None
+
+    def put(self, wanted: Any, robot: Any) -> None:
+        """Take on a :class:`qd.show.recordings.Wanted`, or a film as :func:`qd.show.film.film` makes it."""
+        self._task = wanted, robot
+
+    def take(self, progress: Callable[[float], None]) -> Any:
+        """The recording or the file of the task; an error of it; None if it was dropped."""
+        wanted, robot = self._task
+
+        def report(share: float) -> None:
+            progress(share)
+            if self._drop.is_set():
+                raise _DroppedError
+
+        try:
+            if isinstance(wanted, partial):
+                wanted(progress=report)
+                return wanted.keywords["out"]
+            self._simulation = self._simulation or self._simulation_of(robot, "cpu")
+            return self._simulation([wanted], report)[0]
+        except _DroppedError:
+            return None
+        except (ValueError, OSError) as error:
+            return error
 
 
 class Recorder:
@@ -43,7 +76,7 @@ class Recorder:
         build: Makes what works in the process; a module-level function, since the process imports it by name.
     """
 
-    def __init__(self, *, build: Callable[[Event, int], Any] = build_simulator) -> None:
+    def __init__(self, *, build: Callable[[Event, int], Any] = Simulator) -> None:
         self.robot: Any = None
         """Whose crossings they are; set before the first task."""
         self.report: Callable[[Report], None] = lambda report: None

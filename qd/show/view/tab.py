@@ -66,11 +66,10 @@ class Tab:
     def act(self, name: str, value: Any) -> None:
         """Do what a visitor did on the bar, by a key or with an elite; what makes no sense is left out."""
         tasks: dict[str, tuple[Callable[[Any], Any], Callable[..., None]]] = {
-            "play": (bool, self.play), "seek": (float, self.seek), "pause_at": (float, self.pause_at),
-            "speed": (float, self.set_speed), "episode": (int, lambda number: self.choose_replica(number - 1)),
-            "follow": (bool, self.set_follow), "overview": (bool, lambda _: self.overview()),
-            "pick": (str, self.pick), "step": (int, self.step), "resize": (list, self.resize),
-            "open": (str, self.go_to),
+            "play": (bool, self.play), "seek": (float, self.seek), "speed": (float, self.set_speed),
+            "episode": (int, lambda number: self.choose_replica(number - 1)), "follow": (bool, self.set_follow),
+            "overview": (bool, lambda _: self.overview()), "pick": (str, self.pick), "step": (int, self.step),
+            "resize": (list, self.resize), "open": (str, self.go_to),
         }  # fmt: skip
         kind, method = tasks.get(name, (bool, lambda _: None))
         with suppress(TypeError, ValueError, OverflowError):
@@ -259,11 +258,6 @@ class Tab:
             self.clock.seek(time_s)
             self._show_frame()
             self._show_moment()
-
-    def pause_at(self, time_s: float) -> None:
-        """Pause, and show a time [s]."""
-        self.clock.playing = False
-        self.seek(time_s)
 
     def set_speed(self, speed: float) -> None:
         """Play at a speed in simulated seconds a real one."""
