@@ -1,17 +1,14 @@
 """The simulation as a machine: torques, steps, randomisation and errors."""
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
-from scipy.spatial.transform import Rotation
 
 from sim.bank import TerrainBank
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import resolve_device
 from sim.simulation import Simulation
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.sim.scenes import GAINS, Stepper, positions, put, standing, velocities
+from tests.sim.scenes import GAINS, Stepper, put, standing
 
 
 def flatten(sim):
@@ -45,51 +42,6 @@ def test_torque_is_the_pd_law_and_clamped(eight, robot):
     np.testing.assert_allclose(torque[2, 6:], 0.5 * kp - 3.0 * kd, rtol=1e-3)
     np.testing.assert_allclose(torque[3, 6:], 0, atol=1e-3)
     assert not torque[:, :6].any()  # nothing drives the base
-
-
-def tell_newton(sim, contacts):
-    """Writes the contacts that were found as Newton keeps them."""
-    contacts.clear()  # so that it sees that they are others
-    found = {name: getattr(sim.contacts, name).numpy() for name in ("shape", "point", "normal", "distance")}
-    env, slot = np.nonzero(np.arange(sim.contacts.shape.shape[1]) < sim.contacts.count.numpy()[:, None])
-    shape, point, normal, distance = (found[name][env, slot] for name in found)
-    shapes = sim.model.shape_body.numpy()
-    shape = int(np.flatnonzero(shapes >= 0)[0]) + env * len(sim.geom_of_shape) + shape
-    poses = sim.body_q.numpy().reshape(-1, 7)[shapes[shape]]
-    half = 0.5 * distance[:, None] * normal
-    on_robot = Rotation.from_quat(poses[:, 3:]).inv().apply(point + half - poses[:, :3])
-    zeros = np.zeros((len(env), 3))
-    columns = {"shape0": np.full(len(env), np.flatnonzero(shapes < 0)[0]), "shape1": shape, "point0": point - half,
-               "point1": on_robot, "normal": normal, "offset0": zeros, "offset1": zeros, "margin0": zeros[:, 0],
-               "margin1": zeros[:, 0]}  # fmt: skip
-    for name, values in columns.items():
-        array = getattr(contacts, f"rigid_contact_{name}")
-        whole = array.numpy().copy()
-        whole[: len(env)] = values
-        array.assign(whole)
-    contacts.rigid_contact_count.fill_(len(env))
-
-
-def test_a_step_is_newtons(eight, robot):
-    # Ours is our own from the contacts' mixed properties on. Newton does it in its own way, by mujoco_warp.
-    eight.bank.set_genes(SUPER_GAUSSIAN.hard_random(8, 3))
-    put(eight, standing(robot, 8, z=robot.default_base_height + 0.4, x=7.0))
-    contacts, touched = newton.Contacts(eight.contacts.shape.size, 0, device=eight.device), 0
-    for _ in range(60):
-        before = positions(eight), velocities(eight), np.array(eight.solver.mjw_data.qacc_warmstart.numpy())
-        step(eight)
-        ours = positions(eight), velocities(eight), np.array(eight.body_q.numpy())
-        touched += int(eight.contacts.count.numpy().sum())
-        eight.joint_q.assign(np.float32(before[0]))
-        eight.joint_qd.assign(np.float32(before[1]))
-        eight.solver.mjw_data.qacc_warmstart.assign(before[2])
-        eight.refresh()
-        np.testing.assert_allclose(ours[2], eight.body_q.numpy(), atol=3e-6)  # poses of the step's beginning
-        tell_newton(eight, contacts)
-        eight.solver.step(eight._state, eight._state, eight._control, contacts, robot.physics_dt)
-        np.testing.assert_allclose(ours[0], positions(eight), atol=1e-5)
-        np.testing.assert_allclose(ours[1], velocities(eight), atol=2e-3)
-    assert touched > 100
 
 
 def test_friction_and_mass_of_each_robot(anymal, device):

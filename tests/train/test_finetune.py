@@ -16,7 +16,7 @@ from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.spaces import registry as spaces
 from tests.builders import fresh_values, make_archive, write_run
-from tests.sim.spaces.spaces import move, write_ridges
+from tests.sim.spaces.spaces import write_ridges
 from tests.train.conftest import begun
 from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg
@@ -204,7 +204,7 @@ def test_a_space_of_ones_own_runs_only_where_it_is_named(places, tmp_path, monke
     assert Finetune.defaults(["--resume", str(run)]).space is None
     with pytest.raises(ValueError, match="spaces"):
         finetune(ROBOT, replace(cfg, space=None, iterations=2), run, ON_CPU)
-    finetune(ROBOT, replace(cfg, space=move(ridges, tmp_path / "elsewhere"), iterations=2), run, ON_CPU)
+    finetune(ROBOT, replace(cfg, space=write_ridges(tmp_path / "elsewhere"), iterations=2), run, ON_CPU)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from sim.bank import heights_of
 from sim.spaces import registry
 from sim.spaces.registry import get_space, is_own, load_space
-from tests.sim.spaces.spaces import move, write_ridges
+from tests.sim.spaces.spaces import write_ridges
 
 LEAST = """
 class Space:
@@ -108,7 +108,7 @@ def test_no_record_runs_code(ridges):
 
 def test_a_space_is_known_by_the_hash_of_its_code(ridges, tmp_path):
     digest = load_space(ridges).sha256
-    elsewhere = move(ridges, tmp_path / "elsewhere")
+    elsewhere = write_ridges(tmp_path / "elsewhere")
     moved = load_space(elsewhere)
     assert moved.sha256 == digest and get_space(ridges, digest) is moved  # the one named last
     file = Path(elsewhere.rpartition(":")[0])
