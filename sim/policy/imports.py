@@ -64,17 +64,10 @@ class _Found:
     """None where the user has to fill it in."""
     why: dict[str, str] = field(default_factory=dict)
     """Why a setting is a guess, or what belongs there."""
-    unused: list[str] = field(default_factory=list)
-    """What the source says beside, and nothing needs."""
 
     def put(self, why: str = "", **settings: Any) -> None:
         self.settings |= settings
         self.why |= dict.fromkeys(settings, why)
-
-    def leave(self, said: Mapping[str, Any], idle: str) -> None:
-        """Refuses what nobody has taken, except what is idle."""
-        self.unused = [name for name in idle.split() if name in said]
-        self.check_known(said, self.unused)
 
     def check_known(self, names: Iterable[str], known: Iterable[str]) -> None:
         """Refuses names that nobody understands."""
@@ -141,8 +134,6 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     found.put(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights.name)
     print(f"{source} is read as {kind}; its weights are {weights}.")
-    if found.unused:
-        print(f"Not needed: {', '.join(found.unused)}.")
     if not copy.exists():
         shutil.copyfile(weights, copy)
     gaps = []
@@ -246,7 +237,8 @@ def _read_rl_sar(source: Path, found: _Found) -> Path:
     periods = {"g1_phase": 0.8}  # of its code [s]
     found.put(observation=[_term(known[name], scales.get(known[name]), period_s=periods.get(name)) for name in terms])
     weights = _weights_of(file.parent, said.pop("model_name"))
-    found.leave(said, "fixed_kp fixed_kd num_of_dofs num_observations joint_controller_names framework")
+    idle = ("fixed_kp", "fixed_kd", "num_of_dofs", "num_observations", "joint_controller_names", "framework")
+    found.check_known(said, idle)
     return weights
 
 
@@ -268,7 +260,7 @@ def _read_deployment(source: Path, found: _Found) -> Path:
     clock = ", and the period of its clock" * (width == clocked)
     found.put(observation=terms, why=f"the order of unitree_rl_gym's deploy_mujoco.py{clock}")
     weights = _weights_of(source.parent, said.pop("policy_path"))
-    found.leave(said, "xml_path simulation_duration cmd_init")
+    found.check_known(said, ("xml_path", "simulation_duration", "cmd_init"))
     return weights
 
 
@@ -283,7 +275,7 @@ def _read_mjlab(source: Path, found: _Found) -> Path:
     found.put(physics_dt=0.005, decimation=4, why="the metadata do not say it; mjlab's own tasks are like this")
     scales, clips, lengths = (said.pop(f"observation_terms_{name}", [""] * len(names))
                               for name in ("scale", "clip", "history_length"))  # fmt: skip
-    found.leave(said, "run_path command_names observation_terms_flatten_history_dim")
+    found.check_known(said, ("run_path", "command_names", "observation_terms_flatten_history_dim"))
     terms, why = [], ""
     for name, scale, clip in zip(names, scales, clips, strict=True):
         limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]

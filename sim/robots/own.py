@@ -124,8 +124,7 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
         isinstance(angle, int | float) and math.isfinite(angle) for angle in pose
     ):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
-    with wp.ScopedDevice(host_device()):
-        ((bottoms, _),) = extents(builder_of(model), [pose])
+    ((bottoms, _),) = extents(builder_of(model), [pose])
     body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
     taken = {name for role in ("base_geoms", "foot_geoms", "limb_geoms") for name in given.get(role, ())}
     free = [name for name in bottoms if name not in taken]

@@ -87,7 +87,8 @@ class Listing:
             if name := certifier_of(self.archive, number):
                 counts[name] = faults.certifier_outcomes[number, faults.certifiers.index(name)]
             for head, outcomes in counts.items():
-                hits = dict(zip(("goal_rate", "collision_rate", "other_rate"), outcomes.tolist(), strict=False))
+                goal, collided, other, _ = outcomes.tolist()
+                hits = {"goal_rate": goal, "collision_rate": collided, "other_rate": other}
                 columns += [(head, sum(hits.values()), hits)] * bool(outcomes.any())
         return columns
 

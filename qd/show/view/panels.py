@@ -11,15 +11,18 @@ from typing import Any
 
 import numpy as np
 import viser
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from viser import uplot
 
 from qd.groups import ORDERS, summary_of
+from qd.show.crossed import ENDINGS
 from qd.show.figures import label_of, look_of
-from qd.show.view.legend import legend_html
 from qd.show.view.listing import FITNESS_WORDS, Column, Listing, map_svg, table_html
 from qd.show.view.playing import Crossing
-from qd.show.view.scene import PHONE, first_view_of
+from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, first_view_of
+from sim.maps.picture import SLIPPERY, SOFT, height_colors
+from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 
 _WIDTH, _NARROW_WIDTH = 360, 300  # of a panel [pixels]
 _WIDE = 1300  # a window from here on has room for two wide panels; in a narrower one the archive is folded [pixels]
@@ -162,7 +165,7 @@ class CrossingPanel:
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
         with gui.add_folder("Legend", expand_by_default=False):
-            gui.add_html(legend_html())
+            gui.add_html(_legend_html())
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
@@ -211,3 +214,33 @@ def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: 
     """Buttons side by side, each with what the loop is to call."""
     buttons = gui.add_button_group(label, tuple(tasks))
     buttons.on_click(lambda event: post(*tasks[event.target.value]))
+
+
+def _legend_html() -> str:
+    """What the colours of the page mean."""
+    ramp = ", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))))
+    bar = f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {ramp})"></span>'
+    rows = {
+        "Ground": f"low {bar} high; grey is the level of the start, and a line stands every metre; "
+        + _swatches({"slippery": SLIPPERY}, "repeating-linear-gradient(-45deg, {} 0 2px, transparent 2px 5px)")
+        + _swatches({"soft": SOFT}, "repeating-linear-gradient(90deg, {} 0 2px, transparent 2px 5px)")
+        + "the stronger the worse, crossed where ground is both",
+        "Paths": "of all episodes, by how they ended: "
+        + _swatches({ending.words: ending.color for ending in ENDINGS.values()}),
+        "Touching": _swatches({"base or limb": TOUCH, "foot": FOOT_TOUCH}),
+        "Arrows": _swatches(
+            {"force on a foot, 1 m is 1,000 N": FORCE_COLOR, "commanded velocity, 1 m is 1 m/s": COMMAND_COLOR}
+        ),
+        "Ghost": _swatches({"a second controller at the same time": OTHER_CONTROLLER}),
+    }
+    return "".join(_small(f"<b>{name}</b>: {words}") for name, words in rows.items())
+
+
+def _swatches(colors: Mapping[str, Any], fill: str = "{}") -> str:
+    """A small square a colour, with its words."""
+    box = "display:inline-block;width:0.8em;height:0.8em;border-radius:2px;background:"
+    return " ".join(
+        f'<span style="white-space:nowrap;margin-right:0.6em"><span style="{box}{fill.format(to_hex(color))}"></span> '
+        f"{escape(words)}</span>"
+        for words, color in colors.items()
+    )

@@ -31,8 +31,6 @@ class Show:
     """Which to show first; None for the first of the list."""
     controllers: dict[str, str]
     """File or code of each controller, by its name; empty if the search's controller is lost."""
-    replicas: int = 20
-    """Episodes of each elite."""
     note: str = ""
     """Why there is no controller; empty if there is one."""
     minima: MinimalTerrains | None = None
@@ -58,10 +56,8 @@ class Show:
         """A controller's crossings of an elite, or of its minimal terrain if it has one; None without a controller."""
         if controller is None:
             return None
-        return on_elite(
-            self.opened_run.archive, elite, policy=self.controllers[controller], replicas=self.replicas,
-            minimal=self.genes(elite, minimal),
-        )  # fmt: skip
+        policy, genes = self.controllers[controller], self.genes(elite, minimal)
+        return on_elite(self.opened_run.archive, elite, policy=policy, minimal=genes)
 
     def certifying(self, number: int) -> tuple[str | None, str]:
         """Name of the controller that crosses a failing elite, the best of several, or why there is none to show."""

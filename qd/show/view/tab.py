@@ -10,6 +10,7 @@ from typing import Any
 import viser
 
 from qd.show.crossed import episode_beside, typical_episode
+from qd.show.recordings import Wanted
 from qd.show.view.address import Address, read_address
 from qd.show.view.bar import Bar
 from qd.show.view.crosser import Common, Crosser
@@ -159,7 +160,7 @@ class Tab:
         show, name, space = self.common.show, self.controller, self.common.show.opened_run.space
         text = command_line(
             "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None,
-            policy=None if name is None or name == SEARCHED else show.controllers[name], replicas=show.replicas,
+            policy=None if name is None or name == SEARCHED else show.controllers[name],
             **{"minimal" if self.minimal else "elite": self.selection.picked},
         )  # fmt: skip
         self.bar.copy(text)
@@ -240,8 +241,8 @@ class Tab:
 
     def choose_replica(self, replica: int, begin_s: float | None = None, *, playing: bool = True) -> None:
         """Show another episode, counted from 0, from a time [s]; from just before the robot fails if None."""
-        if not 0 <= replica < self.common.show.replicas:
-            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {self.common.show.replicas}.")
+        if not 0 <= replica < Wanted.replicas:
+            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {Wanted.replicas}.")
             return
         self.replica, self._begin_s, self.clock.playing = replica, begin_s, playing
         if self.robot.recording is not None:
@@ -348,7 +349,7 @@ class Tab:
             self._show_frame()
 
     def _show_progress(self, words: str, share: float) -> None:
-        task = f"Recording {self.common.show.replicas} episodes of {self.controller}: {words or f'{share:.0%}'}"
+        task = f"Recording {Wanted.replicas} episodes of {self.controller}: {words or f'{share:.0%}'}"
         self.bar.show({"share": share, "task": task})
 
     def _show_crossings(self) -> None:
