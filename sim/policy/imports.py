@@ -15,8 +15,8 @@ import torch
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.policy.loaders import activation_in, load_network, read_yaml
-from sim.robots.compiled import joint_names, read_robot_file
-from sim.robots.own import NAME, PER_JOINT, per_joint
+from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
+from sim.robots.own import NAME, per_joint
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 

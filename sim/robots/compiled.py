@@ -26,16 +26,9 @@ _URDF_TIME_CONSTANT_S = 0.01
 _SLACK = 1e-3  # files round [rad]
 _SKEW = 0.01  # share by which a principal axis may miss a joint's
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
-UNITS = {
-    "default_joint_pos": "angles",
-    "stiffness": "gains [N m/rad]",
-    "damping": "gains [N m s/rad]",
-    "effort_limit": "limits [N m]",
-    "armature": "inertias [kg m^2]",
-    "saturation_effort": "torques [N m]",
-    "velocity_limit": "speeds [rad/s]",
-}
-"""Settings with a value for each joint, and what these are."""
+PER_JOINT = ("default_joint_pos", "stiffness", "damping", "effort_limit", "armature", "saturation_effort",
+             "velocity_limit")  # fmt: skip
+"""Settings with a value for each joint."""
 _NEEDED = ("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper", "gravity", "clampctrl",
            "actuation", "refsafe")  # fmt: skip
 
@@ -290,9 +283,9 @@ def _joint_problems(robot: RobotCfg, of_file: RobotFile, wrong: Collection[str])
         return problems
     if names != joint_names(model):
         return [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
-    values = {name: getattr(robot, name) for name in UNITS if name not in wrong}
+    values = {name: getattr(robot, name) for name in PER_JOINT if name not in wrong}
     short = {name: len(given) for name, given in values.items() if given is not None and len(given) != len(names)}
-    problems = [f"{name} needs {len(names)} {UNITS[name]}, got {got}" for name, got in short.items()]
+    problems = [f"{name} needs {len(names)} values, one a joint, got {got}" for name, got in short.items()]
     for name in ("armature", "damping", "frictionloss"):
         of_joints = zip(names, getattr(model, f"dof_{name}")[6:], strict=True)
         if beyond := [f"{joint} ({value:g})" for joint, value in of_joints if not value >= 0.0]:

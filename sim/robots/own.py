@@ -17,7 +17,7 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import from_builtins, problems, read_toml, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import UNITS, RobotFile, file_problems, joint_names, read_robot_file
+from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, read_robot_file
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import extents, make_probes, start_height
@@ -28,8 +28,6 @@ _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
             "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
 """Settings that a robot.toml may leave out though there is no default."""
-PER_JOINT = tuple(UNITS)
-"""Settings that a robot.toml may give as one number, or as a table of joint names or regular expressions, too."""
 NAME = r"[A-Za-z0-9][\w.-]*"
 """A robot's name, of which files and folders are made."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]

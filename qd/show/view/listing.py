@@ -51,18 +51,14 @@ class Listing:
     def _orders(self) -> dict[str, NDArray[np.int64]]:
         return {name: self.ranking.order(name) for name in ORDERS}
 
-    @cached_property
-    def _rows_by_cause(self) -> dict[str, NDArray[np.int64]]:
-        return self.ranking.by_cause()
-
     def listed(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
         """Numbers of the elites of a cause, or of all, in one of the :data:`qd.groups.ORDERS`."""
         numbers = self._orders[order]
-        return numbers[np.isin(numbers, self._rows_by_cause[cause])] if cause else numbers
+        return numbers[np.isin(numbers, self.ranking.by_cause()[cause])] if cause else numbers
 
     def causes(self) -> dict[str, str]:
         """What stops the robot by its words with the number of elites; empty for all."""
-        rows = self._rows_by_cause
+        rows = self.ranking.by_cause()
         return {"all": "", **{f"{cause} ({len(members):,})": cause for cause, members in rows.items()}}
 
     def verdict(self, number: int) -> str:

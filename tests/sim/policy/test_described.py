@@ -1,7 +1,6 @@
 """Controllers as data: what the network of a description sees, what its actions mean, and what is refused."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +9,10 @@ import warp as wp
 from rsl_rl.models import RNNModel
 from tensordict import TensorDict
 
-from sim.mujoco_c.crossing import cross, draw_starts
 from sim.policy.described import Described, read_controller
 from sim.policy.loaders import load_policy, prepare_torch
 from sim.policy.runner import PolicyRunner
 from sim.policy.spec import ControllerSpec, controller_hash
-from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
 
 OURS = """{term = "lin_vel", scale = 2.0}, {term = "ang_vel", scale = 0.25}, {term = "gravity"},
@@ -59,19 +56,6 @@ def test_the_shipped_controller_is_the_same_described(anymal, describe):
             # Columns are divided by their scale and multiplied again: some ulps, through four layers.
             torch.testing.assert_close(policy(rows), shipped(rows), rtol=1e-4, atol=1e-4)
             rows[:, 36:48] = shipped(rows)
-
-
-def test_it_crosses_in_plain_mujoco_though_robots_end_at_different_times(anymal, describe):
-    robot, flat = replace(anymal, max_duration_s=0.2), np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    starts = draw_starts(robot, flat, 3, 3, "cpu")
-    starts.qpos[0, 1] = 10.5  # outside: it ends at once
-    results = [
-        cross(robot, load_policy(path, robot, "cpu"), flat, starts)
-        for path in (describe(OURS, policy=robot.policy_file), robot.policy_file)
-    ]
-    assert results[0].duration_s.tolist() == results[1].duration_s.tolist()
-    np.testing.assert_allclose(results[0].duration_s, [[0.005, 0.2, 0.2]], rtol=1e-6)
-    np.testing.assert_allclose(results[0].penalties, results[1].penalties, rtol=1e-3, atol=1e-5)
 
 
 def test_terms_in_numbers(anymal, seen_by):

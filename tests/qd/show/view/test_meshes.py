@@ -4,27 +4,15 @@ from qd.show.view.meshes import arrow_mesh, arrow_pose, robot_parts
 from qd.show.view.playing import rotated
 from sim.robots.skeleton import Skeleton
 
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
-
-def test_a_robots_parts_hold_together_and_each_shows_one_touch(robot):
-    skeleton = Skeleton(robot)
-    qpos = np.concatenate([[0.0, 0.0, 1.0], IDENTITY, robot.default_joint_pos])[None]
-    positions, quaternions = skeleton.body_poses(qpos)
-    parts = robot_parts(skeleton, robot)
+def test_each_part_of_a_robot_shows_one_touch(robot):
+    parts = robot_parts(Skeleton(robot), robot)
     assert len({(part.body, part.touches) for part in parts}) == len(parts)
     assert {column for part in parts for column in part.touches} == set(range(len(robot.geom_names)))
-    boxes = []
-    for part in parts:
-        points = positions[0, part.body] + rotated(quaternions[0, part.body], part.mesh.vertices)
-        boxes.append((points.min(axis=0), points.max(axis=0)))
     foot = next(part.mesh for part in parts if part.is_foot)
     # Of ANYmal's 0.19, 0.19, 0.20 of 1, sRGB 0.19 is (.19 + .055 over 1.055) ** 2.4 = .030 of the light: 8 of 255.
     if robot.name == "anymal":
         assert foot.visual.vertex_colors[0].tolist() == [8, 8, 8, 255]
-    for k, (low, high) in enumerate(boxes):  # the box round each part overlaps that of another one
-        others = boxes[:k] + boxes[k + 1 :]
-        assert any((low <= top).all() and (high >= bottom).all() for bottom, top in others)
 
 
 def test_an_arrow_points_from_its_beginning_to_its_end():

@@ -36,6 +36,14 @@ def last_of(reports):
     return received
 
 
+def begin_slowly(recorder, reports):
+    """Asks for a recording that takes its time, and waits until it is crossing."""
+    recorder.record(task := wish(1, "slow"))
+    while reports.get(timeout=60).share == 0.0:
+        pass
+    return task
+
+
 def test_progress_comes_before_the_recording(recorder, reports):
     recorder.record(wish(2))
     received = last_of(reports)
@@ -46,9 +54,7 @@ def test_progress_comes_before_the_recording(recorder, reports):
 
 
 def test_of_several_wishes_the_last_one_counts(recorder, reports):
-    recorder.record(wish(1, "slow"))
-    while reports.get(timeout=60).share == 0.0:  # until it is crossing
-        pass
+    begin_slowly(recorder, reports)
     for number in (2, 3, 4):
         recorder.record(wish(number, "slow"))
     assert last_of(reports)[-1].result == "spot: slow on 1"
@@ -70,19 +76,14 @@ def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
 
 
 def test_what_is_worked_on_can_be_cancelled(recorder, reports):
-    recorder.record(task := wish(1, "slow"))
-    while reports.get(timeout=60).share == 0.0:  # until it is crossing
-        pass
-    began = time.perf_counter()
+    task, began = begin_slowly(recorder, reports), time.perf_counter()
     recorder.cancel(task)
     recorder.record(wish(2))
     assert last_of(reports)[-1].result == "spot: fast on 2" and time.perf_counter() - began < 0.9
 
 
 def test_stopping_does_not_wait_for_a_recording(recorder, reports):
-    recorder.record(wish(1, "slow"))
-    while reports.get(timeout=60).share == 0.0:
-        pass
+    begin_slowly(recorder, reports)
     began = time.perf_counter()
     recorder.stop()
     assert time.perf_counter() - began < 0.9
