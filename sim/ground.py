@@ -7,10 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.ground import FIRM, PATCHES
-from kernels.ground import LEAST_FRICTION as LEAST_FRICTION
-from kernels.ground import LEAST_TIME_CONSTANT_S as LEAST_TIME_CONSTANT_S
-from kernels.ground import MOST_TIME_CONSTANT_S as MOST_TIME_CONSTANT_S
+from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""

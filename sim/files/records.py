@@ -49,9 +49,10 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str | None]:
-    """Versions of Python and of the packages that results depend on; None of one that is not installed."""
-    return {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+@cache
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
 
 
 def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
@@ -81,14 +82,6 @@ def without_machine(word: str) -> str:
     """A word of a command line, or a path, without where on this machine it lies: an absolute path's last name."""
     here = f"{Path.cwd()}{os.sep}"
     return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", word.replace(here, ""))
-
-
-@cache
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except ModuleNotFoundError:  # a checkout on the path without being installed
-        return None
 
 
 def device_name(device: str) -> str:

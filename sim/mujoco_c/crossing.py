@@ -245,19 +245,10 @@ def cross_terrains(
 ) -> Iterator[RolloutResult]:
     """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
 
-    Args:
-        robot: As in the search.
-        policy: The controller, as :func:`sim.policy.loaders.load_policy` takes it.
-        terrains: Genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
-        seeds: One a terrain, uint32.
-        space: What genes mean.
-        num_episodes: Episodes a terrain; the first of them begin as a rollout's do, which may have fewer.
-        processes: How many at once.
-        resolved: Whether contact is resolved (:func:`sim.crossing.resolved`), else the search's settings hold.
-        device: Warp device that makes the terrains and draws the starts.
-
-    Yields:
-        The crossings of each terrain, in order.
+    Terrains are genes of the space, shape (num_terrains, num_genes), or heights [m], (num_terrains, NUM_ROWS,
+    NUM_COLS); seeds are uint32, one a terrain. The first of ``num_episodes`` a terrain begin as a rollout's do, which
+    may have fewer. Contact is ``resolved`` (:func:`sim.crossing.resolved`), or the search's settings hold. The Warp
+    ``device`` makes the terrains and draws the starts. Yields the crossings of each terrain, in order.
     """
     if terrains.ndim == 2 and "softness" in space.ground:  # before any work
         raise ValueError(NO_SOFTNESS)

@@ -40,7 +40,6 @@ class Starts:
     [rad/s]; shape (num_episodes, 6 + num_joints)."""
 
     def __getitem__(self, rows: slice) -> "Starts":
-        """Some of the episodes."""
         return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows])
 
 
