@@ -5,7 +5,6 @@ import torch
 import warp as wp
 
 from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
-from sim.bank import TerrainBank
 from sim.ground import patches_at
 from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -30,10 +29,15 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     float32, shape (num_terrains, 41, 121).
     """
     heights = genes.new_empty(len(genes), *SHAPE)
+    rows, cols = (slice(round(low / SPACING) - 1, round(high / SPACING) + 2) for low, high in (Y, X))
     with wp.ScopedDevice(wp.device_from_torch(genes.device)):
         for first in range(0, len(genes), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
-            heights[part] = (_sampled if space.any_spacing else _averaged)(genes[part], space)
+            if space.any_spacing:
+                heights[part] = _rasterised(genes[part], space, SHAPE, NODE_SPACING, X[0], Y[0])
+            else:
+                grids = _rasterised(genes[part], space, (NUM_ROWS, NUM_COLS), SPACING)[:, None, rows, cols]
+                heights[part] = torch.nn.functional.avg_pool2d(grids, 3, stride=2)[:, 0]
     return heights
 
 
@@ -63,14 +67,10 @@ def _nodes(span: tuple[float, float]) -> np.ndarray:
     return np.arange(first, last + 1, round(NODE_SPACING / SPACING))
 
 
-def _sampled(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    heights = genes.new_empty(len(genes), *SHAPE)
-    space.rasterise(wp.from_torch(genes.contiguous()), NODE_SPACING, wp.from_torch(heights), X[0], Y[0])
+def _rasterised(
+    genes: torch.Tensor, space: TerrainSpace, shape: tuple[int, ...], spacing: float, *origin: float
+) -> torch.Tensor:
+    """Heights [m] of terrains on nodes of a grid, shape (num_terrains, *shape)."""
+    heights = genes.new_empty(len(genes), *shape)
+    space.rasterise(wp.from_torch(genes.contiguous()), spacing, wp.from_torch(heights), *origin)
     return heights
-
-
-def _averaged(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    bank = TerrainBank(len(genes), device=str(wp.device_from_torch(genes.device)))
-    space.rasterise(wp.from_torch(genes.contiguous()), SPACING, bank.heights)
-    rows, cols = (slice(round(low / SPACING) - 1, round(high / SPACING) + 2) for low, high in (Y, X))
-    return torch.nn.functional.avg_pool2d(wp.to_torch(bank.heights)[:, None, rows, cols], 3, stride=2)[:, 0]

@@ -84,22 +84,13 @@ def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
     return heights
 
 
-def _difficulty(kind: str, kinds: tuple[str, ...], level: int) -> float:
-    if kind not in kinds:
-        raise ValueError(f"terrain type must be one of {', '.join(kinds)}, got {kind!r}")
-    if not 0 <= level < NUM_LEVELS:
-        raise ValueError(f"level must be in 0..{NUM_LEVELS - 1}, got {level}: difficulty is level / {NUM_LEVELS}")
-    return level / NUM_LEVELS
-
-
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
 
     ``kind`` is one of :data:`CROSSING_TYPES`; levels go from 0 (nearly flat) to 9. Heights [m], float32, shape
     (NUM_ROWS, NUM_COLS).
     """
-    d = _difficulty(kind, CROSSING_TYPES, level)
-    rng = np.random.default_rng(seed)
+    d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
     feature = {
         "slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d),
         "rough_slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d) + _roughness(rng),
@@ -141,8 +132,7 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     ``kind`` is one of :data:`TILE_TYPES`; levels go from 0 (nearly flat) to 9. ``inverted`` turns a slope into a pit,
     and no other type. Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
-    d = _difficulty(kind, TILE_TYPES, level)
-    rng = np.random.default_rng(seed)
+    d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
     tile = {
         "slope": lambda: _slope(_INSET_TILE_CM, -0.4 * d if inverted else 0.4 * d),
         "rough_slope": lambda: _slope(_INSET_TILE_CM, 0.4 * d) + _roughness(rng),
@@ -163,8 +153,6 @@ def training_tiles(num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray
         Heights [m] float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
         index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
     """
-    if num_columns < 1:
-        raise ValueError(f"num_columns must be at least 1, got {num_columns}")
     ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")
     heights = np.empty((NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), np.float32)

@@ -162,18 +162,6 @@ def test_obstacles_tile_has_the_levels_heights_and_keeps_off_the_edge():
     assert not tiles[:, [0, -1]].any() and not tiles[:, :, [0, -1]].any()
 
 
-# Contracts
-
-
-@pytest.mark.parametrize(
-    ("call", "field"),
-    [
-        (lambda: terrain.hand_crafted_crossings(0, 0), "count"),
-        (lambda: terrain.training_tiles(0, 0), "num_columns"),
-        (lambda: crossing_terrain("slope", 10, 0), "level"),
-        (lambda: training_tile("noise", 1, 0), "type"),
-    ],
-)
-def test_arguments_out_of_range_are_refused(call, field):
-    with pytest.raises(ValueError, match=field):
-        call()
+def test_no_crossings_are_refused():
+    with pytest.raises(ValueError, match="count"):
+        terrain.hand_crafted_crossings(0, 0)
