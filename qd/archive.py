@@ -19,7 +19,6 @@ from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.rates import MAX_INVALID_SHARE
 
 ARCHIVE_FILE = "archive.npz"
-"""Name of the archive in a run directory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +29,9 @@ class FreshValues(Evaluation):
     """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
 
     def corrected_elites(self) -> NDArray[np.int64]:
-        """The archive that fresh episodes alone would make: of each cell that an elite lands in, its fittest.
+        """Rows of the archive that fresh episodes alone would make: the fittest elite of each cell that one lands in.
 
-        Returns:
-            Indices into the elites, one a filled cell (the "corrected archive" of Flageat and Cully 2023).
+        It is the "corrected archive" of Flageat and Cully 2023.
         """
         valid = np.flatnonzero(self.valid & (self.fitness > FITNESS_FLOOR))
         order = valid[np.lexsort((-self.fitness[valid], self.cell[valid]))]
@@ -56,7 +54,6 @@ class FaultCounts:
     certifiers: tuple[str, ...] = ()
     """Names of C other controllers."""
     certifier_sha256: tuple[str, ...] = ()
-    """Their hashes."""
     certifier_outcomes: NDArray[np.int64]
     """By them at the search's settings, shape (N, C, 4)."""
     certifier_resolved_outcomes: NDArray[np.int64]
@@ -73,10 +70,9 @@ COUNTS = tuple(field.name for field in fields(FaultCounts) if field.name.endswit
 
 
 def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Share of valid episodes that reached the goal, of counts of shape (..., 4).
+    """Share of valid episodes that reached the goal, shape (...), of counts of shape (..., 4).
 
-    Returns:
-        Shape (...); NaN where nothing was crossed, or too many episodes are invalid.
+    NaN where nothing was crossed, or too many episodes are invalid.
     """
     episodes, invalid = counts.sum(axis=-1), counts[..., OUTCOMES.index("invalid")]
     known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
@@ -89,7 +85,6 @@ class Archive(Evaluation):
 
     robot: str
     robot_sha256: str
-    """Hash of the robot that was searched."""
     penalty_definition: str
     """How its penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
     space: str
@@ -103,7 +98,6 @@ class Archive(Evaluation):
     collision_bit: bool
     """Whether base collision is a descriptor too."""
     iterations: int
-    """Iterations the search had done."""
     genes: NDArray[np.float32]
     """Clipped genes, shape (N, num_genes)."""
     iteration: NDArray[np.int64]
@@ -127,7 +121,6 @@ class Archive(Evaluation):
         return {name: getattr(self, name) for name in ("robot", "robot_sha256", "policy_sha256", "penalty_definition")}
 
     def __len__(self) -> int:
-        """Number of elites."""
         return len(self.fitness)
 
     @property
@@ -223,10 +216,8 @@ PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (
 
 def write_archive(path: Path, archive: Archive) -> None:
     """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
-    settings = {name: getattr(archive, name) for name in _SETTINGS}
-    content = {name: np.asarray(value) for name, value in settings.items() if value is not None}
-    content |= {name: np.asarray(getattr(archive, name)) for name in PER_ELITE}
-    content |= {name: getattr(archive, name) for name in _JUDGED if getattr(archive, name) is not None}
+    known = {name: getattr(archive, name) for name in (*_SETTINGS, *PER_ELITE, *_JUDGED)}
+    content = {name: np.asarray(value) for name, value in known.items() if value is not None}
     if archive.fresh is not None:
         content |= {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
     if archive.faults is not None:

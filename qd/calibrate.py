@@ -60,11 +60,9 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
 
     Terrains of a user's robot are of the height that fits (:func:`fitting_height`). So many hard-random ``terrains``
     are crossed to begin with. As many again are drawn until 200 episodes have missed the goal, up to five times as
-    many. With fewer failing episodes even then, all episodes give the scales.
-
-    Returns:
-        The content of the file. A penalty that never occurred is a ValueError, once the others' scales are written;
-        one of a robot.toml, whose penalties are all that could occur, has the scale 1.
+    many. With fewer failing episodes even then, all episodes give the scales. A penalty that never occurred is a
+    ValueError, once the others' scales are written; one of a robot.toml, whose penalties are all that could occur, has
+    the scale 1. Returns the content of the file.
     """
     space, out, most = SUPER_GAUSSIAN, robot.scales_file, _MOST * terrains
     prepare_output(out)

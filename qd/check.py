@@ -32,13 +32,11 @@ _MOST_CONTACTS = 1_000  # a robot that has more is refused
 _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
 
 
-def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anyway: bool = False) -> bool:
-    """Prints what is read, whether it stands and walks, and what it gets over; ``anyway`` also if it does not walk.
+def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bool:
+    """Prints what is read, whether it stands and walks, and what it gets over if it does.
 
-    The robot's own controller is taken if there is no other.
-
-    Returns:
-        Whether it stands as it should and walks alike in both simulators.
+    Returns whether it stands as it should and walks alike in both simulators. Without ``policy`` it walks by the
+    robot's own controller.
     """
     print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
     robot, standing = _with_room(robot, compute.device, 3.0)
@@ -50,8 +48,7 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
         return fine
     check_policy(policy, robot, compute.device)
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
-        walks = _walks(robot, walk(crossings, policy))
-        if not (walks or anyway):
+        if not _walks(robot, walk(crossings, policy)):
             return False
         most, share = fitting_height(crossings, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
@@ -60,7 +57,7 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute, anywa
     dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
     up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
     print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
-    return fine and walks
+    return fine
 
 
 def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:

@@ -238,16 +238,13 @@ class Check(ControllerFlags, WorkerFlags):
     mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
     """
 
-    anyway: bool = False
-    """Go on although it does not walk."""
-
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
         from qd.check import check
         from qd.workers.evaluator import Compute
 
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
-        return 0 if check(get_robot(self.robot), self.policy, compute=compute, anyway=self.anyway) else 1
+        return 0 if check(get_robot(self.robot), self.policy, compute=compute) else 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,13 +17,9 @@ _SUM_TOLERANCE = 1e-9  # a mean over 20 episodes of ratios that sum to 1 is off 
 def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64]:
     """Mean over a terrain's valid episodes of each penalty's share in the sum of an episode's penalties.
 
-    Args:
-        penalties: Scaled penalties, not negative, shape (num_terrains, num_replicas, num_penalties); anything in
-            invalid episodes. An episode without any has equal ratios.
-        valid: Whether an episode counts, shape (num_terrains, num_replicas).
-
-    Returns:
-        Ratios, shape (num_terrains, num_penalties), each row summing to 1; equal ones where no episode is valid.
+    Scaled penalties are not negative, shape (num_terrains, num_replicas, num_penalties), and may be anything in
+    episodes that are not ``valid``, shape (num_terrains, num_replicas). Ratios have shape (num_terrains,
+    num_penalties), each row sums to 1. They are equal in an episode without any, and where no episode is valid.
     """
     valid = np.asarray(valid, dtype=bool)[..., None]
     penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)
@@ -51,8 +47,6 @@ class Cells:
     def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
         if num_ratios < 2:
             raise ValueError(f"num_ratios must be at least 2, got {num_ratios}: a single ratio is always 1")
-        if intervals < 1:
-            raise ValueError(f"intervals must be at least 1, got {intervals}")
         if math.comb(intervals + num_ratios - 1, intervals) > _MAX_CELLS:
             raise ValueError(
                 f"intervals must leave fewer than {_MAX_CELLS:,} cells for {num_ratios} penalties, got {intervals}: "
@@ -131,10 +125,7 @@ class Cells:
         return tuples
 
     def are_neighbours(self, first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
-        """Whether cells, by their indices, are the same or neighbours, all of shape (batch,).
-
-        Interval indices of neighbours differ by at most 1, and their collision bits agree.
-        """
+        """Whether cells agree in their collision bits, and in their intervals up to 1, by their indices (batch,)."""
         bit_a, tuple_a = np.divmod(np.asarray(first), len(self.tuples))
         bit_b, tuple_b = np.divmod(np.asarray(second), len(self.tuples))
         close = (np.abs(self.tuples[tuple_a] - self.tuples[tuple_b]) <= 1).all(axis=1)

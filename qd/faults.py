@@ -158,9 +158,8 @@ def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None of what nobody looked at.
 
-    Returns:
-        ``resolved``: rate of the controller with contact resolved; ``certificates``: of each controller that certifies
-        it name, hash, and rates at the ``searched`` settings and with contact ``resolved``.
+    ``resolved`` is the rate with contact resolved; ``certificates`` has of each controller that certifies it name,
+    hash, and rates at the ``searched`` settings and with contact ``resolved``.
     """
     faults = archive.counts
     resolved = faults.resolved_outcomes[number]

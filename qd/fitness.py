@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
-from sim.files.settings import check
+from sim.files.settings import PositiveFloat, check
 from sim.rates import MAX_INVALID_SHARE, counted_episodes, typical_outcome
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class FitnessCfg:
 
     penalties: tuple[str, ...]
     """Names of the penalties, in the order of the ratios."""
-    scales: tuple[float, ...]
+    scales: tuple[PositiveFloat, ...]
     """Scale of each penalty: raw sums are divided by it."""
     alpha: float = 1.0
     """Weight of the standard deviations."""
@@ -35,6 +35,8 @@ class FitnessCfg:
 
     def __post_init__(self) -> None:
         check(self)
+        if len(self.scales) != len(self.penalties):
+            raise ValueError(f"scales must be one for each of {', '.join(self.penalties)}, got {self.scales}")
 
     def of_penalties(self, names: Sequence[str]) -> "FitnessCfg":
         """The same of some of the penalties alone, which must be at least 2: a single ratio is always 1."""
@@ -136,11 +138,6 @@ def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray
 
 def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.float64]:
     """Penalties of ``cfg`` divided by their scales, shape (T, R, P)."""
-    missing = [name for name in cfg.penalties if name not in result.penalty_names]
-    if missing:
-        raise ValueError(f"no penalty named {', '.join(missing)}: the rollout has {', '.join(result.penalty_names)}")
-    if len(cfg.scales) != len(cfg.penalties) or not all(0.0 < scale < np.inf for scale in cfg.scales):
-        raise ValueError(f"scales must be one positive number a penalty {cfg.penalties}, got {cfg.scales}")
     columns = [result.penalty_names.index(name) for name in cfg.penalties]
     return np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
 

@@ -23,8 +23,6 @@ from sim.robots.shipped import ROBOTS
 from sim.spaces.base import TerrainSpace
 
 VERDICTS = ("", "failing", "confirmed", "certified", "fault")
-"""What an elite is, in a word."""
-
 KIN_M = 0.06
 """Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
 _EVERY = 2  # nodes; distances are compared at 0.1 m

@@ -19,7 +19,7 @@ from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
 from qd.fitness import FAILING_GOAL_RATE, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
-from qd.run.directory import CONFIG_FILE, METRICS_FILE, SUMMARY_FILE, RunDirectory, check_space, claimed
+from qd.run.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, check_config, check_space, claimed
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
@@ -78,7 +78,6 @@ class Search:
     """A search whose elites are judged."""
 
     run: Path
-    """Its directory."""
     cfg: SearchCfg
     robot: RobotCfg
     policy: str
@@ -88,13 +87,8 @@ class Search:
 
     def read_archive(self) -> Archive:
         """Its archive, which must be of the settings beside it."""
-        archive, cfg = read_archive(self.run), self.cfg
-        of_archive = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
-        if of_archive != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
-            raise ValueError(
-                f"{self.run / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
-                f"{', '.join(map(str, of_archive))}: put back the one that is not this run's"
-            )
+        archive = read_archive(self.run)
+        check_config(archive, self.cfg, self.run)
         check_space(archive, None)
         return archive
 

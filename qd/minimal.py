@@ -41,7 +41,6 @@ class Trial(NamedTuple):
     """What is left of a terrain, to be crossed."""
 
     parts: Parts
-    """Parts that are left."""
     scale: float = 1.0
     """What their heights are multiplied by."""
     fresh: bool = False
@@ -62,7 +61,6 @@ class Case:
     how: How
     """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
     scalable: bool
-    """Whether its heights can be scaled."""
     flat: Parts = ()
     """Parts that change no height, such as slippery patches. Where they alone are left, nothing is scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)

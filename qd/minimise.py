@@ -49,9 +49,7 @@ def minimise(
     Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
     certified, confirmed and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
     terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.judge.judge` takes it.
-
-    Returns:
-        What the run has now; None without a failing elite.
+    Returns what the run has now; None without a failing elite.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     check_policy(search.policy, search.robot, compute.device)

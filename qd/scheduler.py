@@ -146,10 +146,7 @@ class Scheduler:
         Iterations are numbered from 1.
         """
         asked = self._asked[group]
-        if asked is None:
-            raise RuntimeError("tell() must follow ask(), got no terrains asked for")
-        if len(evaluation.fitness) != len(asked):
-            raise ValueError(f"evaluation must have {len(asked)} rows, got {len(evaluation.fitness)}")
+        assert asked is not None
         columns = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
         rows = columns | {
             "solution": asked,

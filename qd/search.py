@@ -13,7 +13,7 @@ from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.groups import rank, summary_of
 from qd.minima import read_minimal
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
-from qd.run.progress import SearchBar, clock, describe_search
+from qd.run.progress import Bar, clock, describe_iteration, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
 from qd.show.figures import write_figures
@@ -48,10 +48,8 @@ def search(
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
     Nothing is written before the simulation stands; whatever stops a search, all iterations that ended are saved. A
-    robot that is not shipped is given, and a controller that lies elsewhere than ``cfg`` says.
-
-    Returns:
-        The archive; with what judging says of its elites if nothing was left to do.
+    robot that is not shipped is given, and a controller that lies elsewhere than ``cfg`` says. The archive has what
+    judging says of its elites if nothing was left to do.
     """
     robot = robot or get_robot(cfg.robot)
     policy = policy or spec_of(cfg.policy, robot)
@@ -82,7 +80,8 @@ def search(
             try:
                 with compute.open(evaluator) as pipeline:
                     run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
-                    with SearchBar(cfg.iterations, done) as bar:
+                    begun = f"iteration {done + 1}/{cfg.iterations}: compiling and evaluating"
+                    with Bar(begun, cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name)
@@ -105,7 +104,7 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str) -> 
 
 
 def _run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: SearchBar
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar
 ) -> None:
     """Runs the iterations that are left, and saves each.
 
@@ -145,7 +144,7 @@ def _run_iterations(
         began = ended
         metrics.append(row)
         run.save(cfg, scheduler, metrics, archive)
-        bar.show(row, status)
+        bar.move_to(iteration, describe_iteration(row, cfg.iterations, status))
 
 
 def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:

@@ -194,10 +194,7 @@ class Surrogate:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
         Genes of the ``elites`` have shape (E, num_genes), their cells and fitness (E,). ``under_way`` are genes of
-        terrains that robots are to cross already, shape (U, num_genes).
-
-        Returns:
-            Genes in [-1, 1], shape (count, num_genes).
+        terrains that robots are to cross already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes).
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
@@ -305,11 +302,8 @@ def vary_elites(
     """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
 
     A share of them takes each of its parts, such as bumps, from a further elite with a chance of a half, where the
-    space has parts (:attr:`sim.spaces.base.TerrainSpace.genes_per_part`). Elites' genes have shape (E, num_genes);
-    ``draw`` is on their device.
-
-    Returns:
-        Genes in [-1, 1], shape (count, num_genes).
+    space has parts (:attr:`sim.spaces.base.TerrainSpace.genes_per_part`). Elites' genes have shape (E, num_genes),
+    children's (count, num_genes), in [-1, 1]; ``draw`` is on their device.
     """
     on = {"generator": draw, "device": pool.device}
     elites, others, further = pool[torch.randint(len(pool), (3, count), **on)]

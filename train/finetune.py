@@ -87,13 +87,11 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains a search's own specialist and puts it with the certifiers of its run.
+    """Trains a search's own specialist, by :meth:`FinetuneCfg.specialist`, and puts it with the certifiers of its run.
 
-    It is the controller of the search, trained further on the elites that it fails, all of them: a certificate is a
-    proof of existence, so it may have trained on the terrain. The training works in ``<run>/specialist``.
-
-    The elites of ``run`` must have fresh episodes. ``cfg`` is as of :meth:`FinetuneCfg.specialist`; controller and
-    archive are those of the search.
+    It is the controller of the search, trained further on the elites that it fails by their fresh episodes, all of
+    them: a certificate is a proof of existence, so it may have trained on the terrain. The training works in
+    ``<run>/specialist``.
     """
     archive = read_elites(run, robot, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]

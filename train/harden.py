@@ -62,11 +62,8 @@ def harden(
     evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
 
     What ``run_dir`` has done already is not done again. ``certifiers`` are controllers by name that judge the searches;
-    those of :func:`qd.judge.judge` if None.
-
-    Returns:
-        The content of ``rounds.json``, which is written after each round: the counts of all searches, which trainings
-        were kept and why, and the tables of all controllers.
+    those of :func:`qd.judge.judge` if None. Returns the content of ``rounds.json``, which is written after each round:
+    the counts of all searches, which trainings were kept and why, and the tables of all controllers.
     """
     hardening = _Hardening(robot, cfg, run_dir, compute, certifiers)
     content = hardening.content

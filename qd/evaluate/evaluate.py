@@ -94,16 +94,11 @@ def evaluate(
     seed: int = 0,
     cache: Path | None = None,
 ) -> Tables:
-    """The tables of controllers on sets of terrains.
+    """The tables of controllers, policies by name of which ``shipped`` is the robot's own, on sets of terrains.
 
-    Args:
-        controllers: Policy of each by its name; ``shipped`` is the robot's own.
-        sets: Sets by name (:func:`qd.evaluate.sets.make_sets`); 24 hand-crafted and 24 hard-random terrains if None.
-        robot: The robot, or its name or settings file.
-        compute: By default the CPU.
-        episodes: On each terrain.
-        seed: Of bootstraps.
-        cache: Folder where crossings are stored and found again.
+    Sets are as of :func:`qd.evaluate.sets.make_sets`; None stands for 24 hand-crafted and 24 hard-random terrains. The
+    robot may be a name or a settings file. Without ``compute`` the CPU crosses. ``seed`` is of bootstraps, ``cache`` a
+    folder where crossings are stored and found again.
     """
     robot, compute = get_robot(robot), compute or Compute()
     sets = sets or make_sets((), _SMALL[0], seed)
@@ -129,10 +124,7 @@ def evaluate_tables(
     compute: Compute,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """The tables of controllers with where their terrains come from; prints and writes them.
-
-    Without ``out`` the file lies under runs/.
-    """
+    """The tables of controllers with where their terrains come from; prints and writes them, by default under runs/."""
     terrains, episodes = sizes_for(
         compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL
     )

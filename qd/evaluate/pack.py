@@ -48,7 +48,6 @@ HEIGHT_UNIT_M = 1e-3
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
 GROUPS = ("verdict", "cause", "kind")
-"""What terrains are grouped by."""
 
 _MAX_BYTES = 1e9  # of an array that is read
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
@@ -207,9 +206,7 @@ def make_pack(
 def candidates_of(archive: Archive, run: Path) -> tuple[list[Candidate], int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
-    Returns:
-        What is known of each with its genes, and how many failing elites and minimal terrains are left out, since
-        nobody is known to cross them.
+    Beside them stands how many failing elites and minimal terrains are left out, since nobody is known to cross them.
     """
     assert archive.fresh is not None
     space, minima = get_space(archive.space, archive.space_sha256), read_minimal(run, archive)
@@ -305,9 +302,8 @@ def _rates(abouts: Sequence[About], controller: str, name: str) -> NDArray[np.fl
 def rates_over_all(abouts: Sequence[About], controller: str, seed: int) -> dict[str, Any]:
     """Means of a controller's rates over terrains with 95 % intervals, bootstrap over families, as JSON values.
 
-    Returns:
-        ``goal_rate``, ``success_rate`` and ``fallen_rate`` with ``goal_interval`` and so on; of the valid ``terrains``
-        how many are ``failing``, and of their ``families`` in how many one is (``failing_families``).
+    Beside ``goal_rate``, ``goal_interval`` and so on: of the valid ``terrains`` how many are ``failing``, and of their
+    ``families`` in how many one is (``failing_families``).
     """
     families = np.array([about["family"] for about in abouts], np.int64)
     summary: dict[str, Any] = {}

@@ -75,7 +75,6 @@ class TerrainSet:
     """The elites, with what is known of them; None of other terrains."""
 
     def __len__(self) -> int:
-        """Number of terrains."""
         return len(self.seeds)
 
     @property

@@ -95,6 +95,16 @@ def check_space(archive: Archive, named: str | None) -> None:
         )
 
 
+def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
+    """Refuses an archive that is not of the settings beside it."""
+    of_archive = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
+    if of_archive != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
+        raise ValueError(
+            f"{folder / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
+            f"{', '.join(map(str, of_archive))}: put back the one that is not this run's"
+        )
+
+
 def folder_for(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
 

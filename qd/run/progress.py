@@ -87,21 +87,14 @@ class Bar:
         )  # fmt: skip
 
 
-class SearchBar(Bar):
-    """A bar over the iterations of a search, some of them done before."""
-
-    def __init__(self, iterations: int, done: int) -> None:
-        super().__init__(f"iteration {done + 1}/{iterations}: compiling and evaluating", iterations, done)
-
-    def show(self, row: dict[str, Any], workers: object = None) -> None:
-        """Shows where the search stands after an iteration, and how its workers fare if there are any."""
-        iteration, invalid = row["iteration"], row["invalid_episodes"] / row["episodes"]
-        why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
-        self.move_to(
-            iteration,
-            f"iteration {min(iteration + 1, self._total)}/{self._total}: {row['elites']:,} elites, "
-            + (f"{invalid:.0%} invalid ({why}), " if why else "")
-            + f"{row['episodes_per_s']:.0f} episodes/s"
-            + (f" by {workers}" if workers else "")
-            + f", fitness {row['mean_fitness']:.2f}",
-        )
+def describe_iteration(row: dict[str, Any], iterations: int, workers: object = None) -> str:
+    """Where a search stands after an iteration, and how its workers fare if there are any."""
+    invalid = row["invalid_episodes"] / row["episodes"]
+    why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
+    return (
+        f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites, "
+        + (f"{invalid:.0%} invalid ({why}), " if why else "")
+        + f"{row['episodes_per_s']:.0f} episodes/s"
+        + (f" by {workers}" if workers else "")
+        + f", fitness {row['mean_fitness']:.2f}"
+    )

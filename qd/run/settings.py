@@ -21,7 +21,6 @@ class SearchCfg:
     """What is searched, with what, and how; runs that agree in all but ``iterations`` are the same run."""
 
     robot: str
-    """Name of the robot."""
     robot_sha256: str
     """Hash of its settings, model and meshes."""
     penalty_definition: str

@@ -14,7 +14,7 @@ from qd.fitness import FitnessCfg
 from qd.groups import rank
 from qd.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.minimise import MinimalTerrains, read_minimal
-from qd.run.directory import CONFIG_FILE, RunDirectory, check_space, directory_of, find_run
+from qd.run.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy
 from sim.files.command import chosen_elites, command_line
 from sim.files.records import without_machine
@@ -26,16 +26,15 @@ from sim.spaces.registry import get_space
 
 
 class Terrain(NamedTuple):
-    """An elite's terrain, or its minimal terrain."""
+    """The terrain of an elite, by its number, or its minimal terrain."""
 
     number: int
-    """Of the elite."""
     genes: NDArray[np.float32]
     """Shape (num_genes,)."""
     stem: str
     """Name of files about it: ``elite-3`` or ``minimal-3``."""
     label: str
-    """What it is, in words."""
+    """In words."""
     minimal: dict[str, object] | None
     """What is known of a minimal terrain."""
 
@@ -72,13 +71,10 @@ class OpenedRun:
 
     def search(self) -> SearchCfg | None:
         """Settings of the search; None where the archive lies without them."""
-        archive, file = self.archive, self.folder / CONFIG_FILE
-        if not file.exists():
+        if not (self.folder / CONFIG_FILE).exists():
             return None
         cfg = RunDirectory(self.folder).read_cfg()
-        of_config, of_archive = (cfg.fitness.penalties, cfg.fitness.scales), (archive.penalties, archive.scales)
-        if of_config != of_archive:
-            raise ValueError(f"{file} must have the penalties and scales of its archive, {of_archive}, got {of_config}")
+        check_config(self.archive, cfg, self.folder)
         return cfg
 
     def policy(self, given: str | None = None) -> str:

@@ -22,10 +22,8 @@ from sim.policy.onnx import export_onnx
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 
-INDEX_FILE = "index.json"
-"""What was exported, in the folder of the files."""
-README_FILE = "README.md"
-"""How other programs take the files, beside it."""
+INDEX_FILE, README_FILE = "index.json", "README.md"
+"""What was exported, and how other programs take it, in the folder of the files."""
 _FOLDER = "terrains"
 
 
@@ -40,7 +38,6 @@ class Source:
     terrains: Iterator[ExportedTerrain]
     """The same ones in the same order."""
     origin: dict[str, Any]
-    """Where they come from."""
 
 
 def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | None = None) -> Source:

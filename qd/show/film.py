@@ -54,7 +54,6 @@ class Shot:
 
     recording: Recording
     episode: int
-    """Its index."""
     title: str = ""
     beside: tuple[str, Recording] | None = None
     """Name of another controller, to be shown as a ghost, and what was recorded of it from the same starts."""

@@ -29,7 +29,6 @@ from sim.rollout import Rollout
 from sim.spaces.registry import get_space, identity, load_space
 
 FOLDER = RUNS / "recordings"
-"""Where recordings are stored."""
 AT_ONCE = 32
 """Terrains crossed side by side on a GPU."""
 _STREAM, _OWN_STREAM = 2, 4  # of the seeds of episodes on elites, and on a user's own terrains
@@ -44,9 +43,7 @@ class Wanted:
     terrain: NDArray[np.float32] = field(compare=False)
     """Genes, shape (num_genes,), or heights [m], shape (nrow, ncol)."""
     policy: str
-    """The controller."""
     replicas: int = 20
-    """Episodes."""
     seed: int = 0
     """What ``terrain_seed`` was drawn with, for the record."""
     terrain_seed: int

@@ -45,15 +45,13 @@ class Source:
     about: Sequence[dict[str, Any]]
     """What is known of each terrain, for the file of its numbers."""
     wanted: Sequence[Wanted]
-    """The crossings of each terrain."""
     inputs: tuple[Path, ...] = ()
     """Files of the user, which are never overwritten."""
     by: str = ""
     """Name of the controller, where it is not the usual one."""
     opened_run: OpenedRun | None = None
-    """The run of elites."""
+    """The run of elites, which are ``terrains``."""
     terrains: Sequence[Terrain] = ()
-    """The elites."""
 
     @property
     def scales(self) -> dict[str, float]:

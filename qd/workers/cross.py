@@ -74,18 +74,14 @@ class Cache:
                 raise ValueError("it is another key's")
             self.touch(key)
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
-            self.discard(key, error)
+            print(f"{file} is damaged ({' '.join(str(error).split())}): it is made again", flush=True)
+            file.unlink(missing_ok=True)
             return None
         return arrays
 
     def touch(self, key: str) -> None:
         """Notes that a file was used."""
         os.utime(self.file(key))
-
-    def discard(self, key: str, why: object) -> None:
-        """Removes a damaged file and says so."""
-        print(f"{self.file(key)} is damaged ({' '.join(str(why).split())}): it is made again", flush=True)
-        self.file(key).unlink(missing_ok=True)
 
     def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Stores the arrays of a key in one step."""
@@ -126,10 +122,7 @@ class _Stored:
             arrays = self._cache.read(key)
             if arrays is None:  # removed or damaged meanwhile
                 continue
-            rows = arrays.pop(_ROWS)
-            if set(_ARRAYS) - arrays.keys() or any(len(values) != len(rows) for values in arrays.values()):
-                self._cache.discard(key, f"it must hold {', '.join(_ARRAYS)} of {len(rows)} terrains")
-                continue
+            del arrays[_ROWS]
             chosen: dict[str, Any] = {name: values[places] for name, values in arrays.items()}
             yield numbers, RolloutResult(**chosen, penalty_names=self._penalty_names)
 
@@ -206,9 +199,8 @@ class Crossings:
         to come that agrees with this one: the simulation has room for them. Invalid episodes are reported on stderr
         where they are many; a result without a valid one is returned if ``invalid_ok``.
 
-        Returns:
-            One row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C tells
-            neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
+        The result has one row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C
+        tells neither where a robot ended nor whether it had fallen, and not why an episode is invalid.
         """
         if seeds.shape != (len(terrains),):
             raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")

@@ -75,8 +75,6 @@ class Compute:
     @classmethod
     def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:
         """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU."""
-        if num_envs is not None and num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         return cls(resolve_device(device, workers), workers, num_envs)
 
     def open(self, cfg: "EvaluatorCfg") -> AbstractContextManager["Pipeline"]:
@@ -284,14 +282,10 @@ class Pipeline:
         """Crosses each terrain once a replica, in lots of ``size``; nothing else may be under way.
 
         Terrains are genes, shape (num_terrains, num_genes), or heights [m], shape (num_terrains, nrow, ncol), with an
-        uint32 seed each. ``progress`` is called now and then with the share that is done.
-
-        Yields:
-            Which terrains a lot has, and its result. Those behind are under way meanwhile as far as there is room.
+        uint32 seed each. ``progress`` is called now and then with the share that is done. Yields which terrains a lot
+        has, and its result; those behind are under way meanwhile as far as there is room.
         """
         count = len(terrains)
-        if seeds.shape != (count,) or count == 0:
-            raise ValueError(f"seeds must have shape ({count},), one a terrain and at least one, got {seeds.shape}")
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
         behind, num_crossed = deque(lots), 0
 

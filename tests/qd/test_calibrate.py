@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,23 +89,11 @@ def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing()
     np.testing.assert_array_equal(list(content["scales"].values()), means)
 
 
-def test_a_controller_that_seldom_fails_is_scaled_by_all_episodes():
-    # One of 20 fails: 40 of the 800 episodes on five times 8 terrains.
-    content = calibrated(robots(failing(0.05)), 8)
-    assert (content["terrains"], content["failing_episodes"], content["scaled_by"]) == (40, 40, "all")
-
-
 def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are_kept(scales):
     without = robots(lambda result: replace(result, penalties=result.penalties * (np.arange(6) > 0)))
     with pytest.raises(ValueError, match="yaw_rate"):
         calibrated(without, 20)
     assert list(json.loads(scales.read_text())["scales"]) == list(stand_in.PENALTIES[1:])
-
-
-def test_a_file_that_cannot_be_written_is_found_before_the_work(monkeypatch):
-    monkeypatch.setattr(RobotCfg, "scales_file", Path("/proc/missing/scales.json"))
-    with pytest.raises(ValueError, match="/proc/missing"):
-        calibrated(robots(stop_after=0), 20)
 
 
 @pytest.mark.parametrize(("crossed_up_to", "expected"), [(0.30, 0.25), (0.11, 0.1), (0.04, 0.04), (0.001, 0.02)])

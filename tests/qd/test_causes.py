@@ -5,10 +5,8 @@ import pytest
 
 from qd.causes import effects_of, on_the_way, shape_of
 from sim.bank import heights_of
-from sim.spaces.course import COURSE
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
-from tests.kernels.course_oracle import course, element
 
 Y, X = np.meshgrid(SPACING * np.arange(NUM_ROWS), SPACING * np.arange(NUM_COLS), indexing="ij")
 HALF_WIDTH = 0.4
@@ -70,11 +68,3 @@ def test_parts_are_told_from_the_rest():
     others = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
     np.testing.assert_allclose(fields.sum(axis=0), others, atol=1e-6)
     assert on_the_way(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
-
-
-def test_elements_of_a_course():
-    genes = course(
-        element("kerb", size=0.2, turn=1), element("ditch", size=0.4, length=6), element("kerb", size=0.1, turn=-1)
-    )[0]
-    fields = effects_of(genes, [0, 1, 2], COURSE).heights
-    assert [shape_of(field, HALF_WIDTH).kind for field in fields] == ["rise", "ditch", "drop"]

@@ -75,11 +75,9 @@ def test_collision_bit_needs_one_collision_in_a_valid_episode():
 def test_penalties_are_found_by_name():
     result = make_result([[[7, 10, 1]] * 4], names=("stumble", "vel_x", "yaw_rate"))
     assert evaluation_of(result, CELLS, CFG).penalty_mean.tolist() == [[1.0, 1.0]]
-    with pytest.raises(ValueError, match=r"no penalty named yaw_rate: the rollout has stumble, vel_x"):
-        evaluation_of(make_result([[[7, 10]] * 4], names=("stumble", "vel_x")), CELLS, CFG)
 
 
 @pytest.mark.parametrize("scales", [(1.0,), (1.0, 0.0), (1.0, float("nan"))])
 def test_scales_must_be_positive_one_a_penalty(scales):
     with pytest.raises(ValueError, match="scales must be"):
-        evaluation_of(make_result([[[1, 10]] * 4]), CELLS, FitnessCfg(penalties=CFG.penalties, scales=scales))
+        FitnessCfg(penalties=CFG.penalties, scales=scales)

@@ -152,12 +152,6 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
         assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
 
 
-def test_without_failing_elites_nothing_leads():
-    archive = dataclasses.replace(small_archive(4), goal_rate=np.ones(4))
-    ranking = rank(archive, SUPER_GAUSSIAN)
-    assert ranking.by_cause() == {} and sorted(ranking.worst(4)) == [0, 1, 2, 3]
-
-
 def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
     strangers = np.clip(SUPER_GAUSSIAN.hard_random(4, 0), -1.0, 1.0).astype(np.float32)
     child, grandchild = strangers[1].copy(), strangers[1].copy()

@@ -8,7 +8,7 @@ import torch
 
 from qd.judge import controllers_in
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.policy.described import read_controller, text_of
+from sim.policy.described import read_controller
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -96,11 +96,6 @@ def test_it_learns_goes_on_and_crosses(robot, tmp_path, capsys):
     expected = read_checkpoint(run / "checkpoint.pt")["critic_state_dict"]
     assert all(value.equal(expected[key]) for key, value in further.learner.alg.critic.state_dict().items())
     assert further.learner.env.controller.activation == "swish"
-
-
-def test_a_description_is_written_as_it_was_read(robot):
-    cfg = read_controller(robot.policy_file)
-    assert read_controller(robot.policy_file, text_of(cfg)) == cfg
 
 
 def test_other_networks_are_refused(robot, tmp_path):

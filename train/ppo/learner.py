@@ -5,6 +5,7 @@ Several processes of one training, as torchrun starts them, take a GPU each: gra
 
 import contextlib
 import io
+import math
 import os
 import time
 from dataclasses import dataclass
@@ -140,8 +141,7 @@ class Learner:
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.
 
-        Raises:
-            FloatingPointError: If losses or networks are not finite: they are beyond use, the last checkpoint is not.
+        After a FloatingPointError the networks are beyond use, the last checkpoint is not.
         """
         alg = self.alg
         began = time.perf_counter()
@@ -156,13 +156,14 @@ class Learner:
             torch.cuda.synchronize()  # or the simulation's time would be counted as learning
         collected = time.perf_counter()
         losses = alg.update()
-        where, remedy = f"iteration {self.iteration}", "begin again with a lower --ppo.learning-rate"
-        if not all(map(torch.isfinite, torch.tensor(list(losses.values())))):
-            raise FloatingPointError(f"{where}: losses are not finite, got {losses}: {remedy}")
         # The last step may have spoiled the networks after their losses were computed.
         parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
-        if not torch.isfinite(torch.stack([parameter.detach().sum() for parameter in parameters])).all():
-            raise FloatingPointError(f"{where}: the networks' weights are not finite: {remedy}")
+        sums = torch.stack([parameter.detach().sum() for parameter in parameters]).tolist()
+        if not all(map(math.isfinite, [*losses.values(), *sums])):
+            raise FloatingPointError(
+                f"iteration {self.iteration}: losses and weights must be finite, got losses {losses} or weights that "
+                "are not: begin again with a lower --ppo.learning-rate"
+            )
         self.iteration += 1
         return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
 

@@ -16,7 +16,6 @@ class Tiles:
     heights: np.ndarray
     """Heights [m] float32, shape (num_levels * num_columns, NUM_ROWS, NUM_COLS); the robot starts at (8, 4)."""
     type_of_column: tuple[str, ...]
-    """Terrain type of each column."""
     ground: GroundMaps | None = None
     """Friction and softness of each terrain; None where no terrain has any."""
 

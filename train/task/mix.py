@@ -30,7 +30,6 @@ class Mix:
     kind: Literal["generated", "hard-random", "hand-crafted"]
     """What half of the terrains are, the paper's C-G and C-HR, beside hand-crafted ones; or those alone, its C-HC."""
     num_terrains: int
-    """Terrains at a time."""
     draw: Draw = "uniform"
     """How elites are drawn (:class:`train.cfg.RecipeCfg`)."""
     genes: tuple[NDArray[np.float32], ...]

@@ -54,11 +54,10 @@ class CommandVecEnv(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Make one control step with ``actions`` (num_envs, num_actions).
+        """Make one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
 
-        Returns:
-            Observations after it (of the new episode where one ended), rewards (num_envs,), dones (num_envs,) and
-            ``{"time_outs": (num_envs,)}``, the dones that no failure caused. No host synchronisation.
+        What follows are observations after it (of the new episode where one ended), rewards (num_envs,), dones
+        (num_envs,) and ``{"time_outs": (num_envs,)}``, the dones that no failure caused.
         """
         self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end

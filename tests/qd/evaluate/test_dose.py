@@ -6,10 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.commands import Dose
-from qd.evaluate import dose as dose_module
 from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
-from sim.files.command import run_command
 from sim.spaces.dose import parse_doses
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
@@ -88,12 +85,3 @@ def test_where_under_half_begin_to_reach_the_goal(name, rates, limits, value, in
     half = half_of(dose, rows)
     assert half["value"] == (None if value is None else pytest.approx(value))
     assert half["interval"] == [None if limit is None else pytest.approx(limit) for limit in interval]
-
-
-@pytest.mark.parametrize(("flag", "word"), [("--elements", "step_up=high"), ("--policies", "a=nosuch.pt")])
-def test_errors_come_before_any_work_in_one_line(flag, word, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(dose_module, "cross_sets", None)
-    assert run_command(Dose, ["--device", "cpu", flag, word], name="dose") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert word.removeprefix("a=") in line and not any(tmp_path.iterdir())

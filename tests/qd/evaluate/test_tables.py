@@ -163,10 +163,3 @@ def test_the_terminal_shows_the_numbers(report, capsys):
     # C-G fails terrain 102, as base does; terrain 101 is not compared.
     (row,) = (line.split() for line in lines if line.startswith("generated, base -> C-G"))
     assert row[4:] == ["0", "(0)", "0", "(0)", "1", "2", "+0.000", "(+0.000", "to", "+0.000)"]
-
-
-def test_tables_without_a_valid_terrain_are_shown_too(anymal, capsys):
-    nothing = tables_of(anymal, {"generated": {"base": make_measured([0, 0], of=4, bad=[0, 1])}}, {})
-    assert nothing["success"]["generated"]["base"] is None and nothing["differences"] == {"generated": {}}
-    show_tables(nothing)
-    assert "base" in capsys.readouterr().out
