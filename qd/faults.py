@@ -5,7 +5,7 @@ controller crosses it, at the search's settings and with contact resolved. A fau
 certificate is not known to be passable.
 """
 
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from itertools import compress
 from typing import Any
 
@@ -103,11 +103,6 @@ def certifier_of(archive: Archive, number: int, among: Container[str] | None = N
     rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
     names = [name for name, rate in rate_of.items() if rate > 0.0 and (among is None or name in among)]
     return max(names, key=rate_of.__getitem__, default=None)
-
-
-def any_of(names: Sequence[str]) -> str:
-    """Names in words: ``a, b or c``."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.run.progress import Bar
-from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, parse_workers
+from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import write_atomically
@@ -285,7 +285,8 @@ class Crossings:
     def _cross_in_mujoco_c(
         self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
     ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        processes, done = parse_workers(cfg.workers).num_processes, list[RolloutResult]()
+        workers, done = parse_workers(cfg.workers), list[RolloutResult]()
+        processes = (None if workers.on_ray else workers.count) or available_cores()  # Ray has no part in it
         with Bar(label, len(missing)) as bar:
             crossings = cross_terrains(
                 self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),

@@ -43,11 +43,6 @@ class Workers(NamedTuple):
     count: int | None
     """How many; None: one a device of the cluster, or a core of this machine."""
 
-    @property
-    def num_processes(self) -> int:
-        """Processes of this machine for what Ray has no part in."""
-        return (None if self.on_ray else self.count) or available_cores()
-
 
 def parse_workers(text: str | None) -> Workers:
     """Reads ``--workers``: ``4`` processes, ``ray``, or ``ray:4``; None for one process a core."""

@@ -48,8 +48,3 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
     for level, column in np.ndindex(NUM_LEVELS, cfg.noise_columns):
         grid[level, cfg.num_columns + column] = crossing_terrain("noise", level, noise_rng)
     return Tiles(heights=grid.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
-
-
-def first_levels(num_envs: int, cfg: CurriculumCfg, rng: np.random.Generator) -> np.ndarray:
-    """Levels robots begin on, int32 of shape (num_envs,)."""
-    return rng.integers(cfg.max_first_level, size=num_envs, endpoint=True, dtype=np.int32)

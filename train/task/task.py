@@ -31,7 +31,7 @@ from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
 from train.task.cfg import TaskCfg
-from train.task.curriculum import Tiles, first_levels, make_tiles
+from train.task.curriculum import Tiles, make_tiles
 
 _FALLS = (Outcome.BASE_COLLISION, Outcome.TILT, Outcome.INVALID)
 """An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast."""
@@ -64,7 +64,8 @@ class CommandTask:
         first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
         self.tiles = tiles or make_tiles(cfg.curriculum, int(tile_seed))
         columns = self.tiles.columns_of(num_envs)
-        levels = first_levels(num_envs, cfg.curriculum, np.random.default_rng(level_seed)) % self.tiles.num_levels
+        most, rng = cfg.curriculum.max_first_level, np.random.default_rng(level_seed)
+        levels = rng.integers(most, size=num_envs, endpoint=True, dtype=np.int32) % self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
         self._task = _make_task(cfg, robot)
         self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive
-from qd.faults import any_of, fault_numbers
+from qd.faults import fault_numbers
 from qd.groups import VERDICTS, Ranking, summary_of
 from qd.minimise import MinimalTerrains
 from qd.run.directory import METRICS_FILE, Metrics, RunDirectory
@@ -32,7 +32,7 @@ def content_of(
     """What the template takes, beside the terrains that a controller crossed for the page."""
     archive, search, run = opened_run.archive, opened_run.search(), RunDirectory(opened_run.folder)
     elites, space, (searched, _) = ranking.elites, opened_run.space, opened_run.as_searched()
-    metrics, certifiers = _metrics_of(run, archive), archive.counts.certifiers
+    metrics = _metrics_of(run, archive)
     return {
         "archive": archive,
         "run": opened_run.command,
@@ -44,7 +44,7 @@ def content_of(
         "place": without_machine(str(opened_run.path)),
         "summary": summary_of(ranking, archive),
         "failing": int(elites.failing.sum()),
-        "certifiers": any_of(certifiers) if certifiers else "",
+        "certifiers": " or ".join(archive.counts.certifiers),
         "numbers": fault_numbers(archive),
         "fault_families": len(np.unique(ranking.families[elites.verdict == _FAULT])),
         "means": {name: mean_words(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},

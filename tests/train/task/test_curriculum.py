@@ -1,10 +1,10 @@
-"""Training tiles: grid order, shares, first levels."""
+"""Training tiles: grid order and shares."""
 
 import numpy as np
 import pytest
 
 from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
-from train.task.curriculum import CurriculumCfg, first_levels, make_tiles
+from train.task.curriculum import CurriculumCfg, make_tiles
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +34,6 @@ def test_every_column_gets_its_share(tiles):
     assert counts.tolist() == [100] * 7
     assert set(np.bincount(tiles.columns_of(703))) == {100, 101}
     assert tiles.columns_of(3).max() < 7
-
-
-def test_first_levels_are_uniform():
-    levels = first_levels(6000, CurriculumCfg(max_first_level=2), np.random.default_rng(0))
-    counts = np.bincount(levels)
-    assert len(counts) == 3 and (np.abs(counts - 2000) < 150).all()  # standard deviation 37
 
 
 def test_columns_of_noise_alone_and_none_at_all():
