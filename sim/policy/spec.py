@@ -30,7 +30,6 @@ class ControllerSpec:
     name: str | None = None
     """What to take of it."""
     file: str | None = None
-    """The controller's file, if any."""
 
     @classmethod
     def parse(cls, spec: str | Path) -> "ControllerSpec":

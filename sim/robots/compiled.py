@@ -40,9 +40,7 @@ class RobotFile:
     spec: Any
     """The ``MjSpec``, with what simulations take of it, under names."""
     model: Any
-    """The same, compiled."""
     drives: "_Drives"
-    """What its actuators do."""
     home: list[float] | None
     """Joint angles of its keyframe ``home`` [rad]; None without one."""
     is_urdf: bool
@@ -323,17 +321,16 @@ class _Drives:
         taken: list[int] = []
         for k, actuator in enumerate(spec.actuators):
             joint, where = int(model.actuator_trnid[k, 0]) - 1, f"on {actuator.target} ({actuator.info})"
-            kind = self._kind(model, k)
-            if model.actuator_trntype[k] != _TRN or joint < 0:
-                self.problems.append(f"an actuator that moves no joint {where}")
-            elif kind not in ("position", "motor"):
-                self.problems.append(f"{kind} {where}")
-            elif joint in taken:
-                self.problems.append(f"a second actuator {where}")
-            elif joint in self.follow:
-                self.problems.append(f"a drive of a joint that follows another {where}")
-            elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
-                self.problems.append(f"a gear other than 1 on a position actuator {where}")
+            kind, geared = self._kind(model, k), model.actuator_gear[k, 0] != 1.0
+            findings = [
+                (model.actuator_trntype[k] != _TRN or joint < 0, "an actuator that moves no joint"),
+                (kind not in ("position", "motor"), kind),
+                (joint in taken, "a second actuator"),
+                (joint in self.follow, "a drive of a joint that follows another"),
+                (kind == "position" and geared, "a gear other than 1 on a position actuator"),
+            ]
+            if strange := next((text for holds, text in findings if holds), ""):
+                self.problems.append(f"{strange} {where}")
             else:
                 taken.append(joint)
                 self._add(model, k, joint, kind, where)

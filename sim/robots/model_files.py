@@ -75,11 +75,9 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
         if mimic is not None and mimic.get("joint") not in [other.get("name") for other in root.findall("joint")]:
             yield f"{name} follows {mimic.get('joint')}, no joint of the file"
         limit = joint.find("limit")
-        lacking = [key for key in ("lower", "upper") if limit is None or limit.get(key) is None]
-        if kind in ("revolute", "prismatic") and (
-            limit is None or len(lacking) == 1
-        ):  # of a limit without both it moves freely
-            missing = "<limit>" if limit is None else lacking[0]
+        ends = [key for key in ("lower", "upper") if limit is not None and limit.get(key) is None]
+        missing = "<limit>" if limit is None else ends[0] if len(ends) == 1 else ""  # without both it moves freely
+        if missing and kind in ("revolute", "prismatic"):
             yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
         if limit is not None and limit.get("effort", "").strip().startswith("-"):
             yield f"{name} must have an effort above 0, got {limit.get('effort')}"

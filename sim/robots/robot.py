@@ -92,11 +92,8 @@ class RobotCfg:
     contact_time_constant_s: PositiveFloat | None = None
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
-    """What the training of its controller takes of the robot."""
     learning: LearningCfg = field(default_factory=LearningCfg)
-    """How that training goes on a GPU."""
     tuning: TuningCfg = field(default_factory=TuningCfg)
-    """How the controller is fine-tuned."""
     settings_file: Path | None = None
     """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
 

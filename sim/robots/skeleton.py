@@ -118,7 +118,6 @@ class Skeleton:
         self.model: Any = robot_model(shown_spec(robot), robot)
         """The ``MjModel``, whose body 0 is the world."""
         self.touches = touches_of(self.model, robot)
-        """What is seen of it, and what it shows (:func:`touches_of`)."""
 
     @property
     def num_bodies(self) -> int:

@@ -51,7 +51,6 @@ class Standing:
     restless: float
     """How much the forces on its feet change from one physics step to the next in that time, in weights."""
     contacts: int
-    """Most contacts of a robot."""
     overflowed: bool
     """Whether there was too little room for contacts, at any time."""
     finite: bool

@@ -92,7 +92,6 @@ class TuningCfg:
     tracking_lin_vel: float = 2.0
     """Weight of :attr:`RewardCfg.tracking_lin_vel` in place of the robot's own."""
     draw: Draw = "learnable"
-    """How elites are drawn."""
     start_spread: Annotated[float, Meta(ge=0, le=MOST_SPREAD)] = 8.0
     """Robots start up to so far along the way [m]."""
     entropy: NonNegativeFloat = 0.005

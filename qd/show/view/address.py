@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
-_POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"
-"""Viser's own: its page starts with that camera."""
+_POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"  # viser's own: its page starts with that camera
 _MINIMAL = "minimal"
 
 Point = tuple[float, float, float]
@@ -20,9 +19,7 @@ class Address:
     elite: int | None = None
     controller: str | None = None
     ghost: str | None = None
-    """The controller that crosses beside it."""
     minimal: bool = False
-    """Whether it is the elite's minimal terrain."""
     episode: int | None = None
     """Counted from 1."""
     time_s: float | None = None

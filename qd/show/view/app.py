@@ -21,10 +21,8 @@ from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
-_FRAME_S = 0.04
-"""Real time from one shown frame to the next."""
-_IDLE_S = 0.5
-"""Real time from one look at the cameras to the next while nothing plays."""
+_FRAME_S = 0.04  # real time from one shown frame to the next
+_IDLE_S = 0.5  # real time from one look at the cameras to the next while nothing plays
 _WINDOW = (1400, 900)  # one that is not known yet [pixels]
 
 

@@ -19,13 +19,11 @@ class Common:
     show: Show
     skeleton: Skeleton
     parts: list[Part]
-    """Of the robot."""
     recordings: Recordings
     recorder: Recorder
     films: Callable[[], Recorder]
     """What makes films, in a process of its own from the first call on."""
     post: Callable[..., None]
-    """:meth:`qd.show.view.app.App.post`."""
 
 
 class Crosser:
@@ -35,7 +33,6 @@ class Crosser:
         """Nobody yet; the recorder does what the ``key`` asked for last."""
         self._common, self._key = common, key
         self.name: str | None = None
-        """Of the controller; None if there is none."""
         self.wanted: Wanted | None = None
         self.recording: Recording | None = None
         self.crossing: Crossing | None = None

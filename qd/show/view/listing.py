@@ -38,9 +38,7 @@ class Listing:
     archive: Archive
     """It has at least one."""
     space: TerrainSpace
-    """What its genes mean."""
     minima: MinimalTerrains | None = None
-    """Minimal terrains of the elites, if there are some."""
 
     @cached_property
     def ranking(self) -> Ranking:

@@ -45,7 +45,6 @@ class Crossing:
     touching: NDArray[np.bool_]
     """Whether each recorded geom touches something, shape (F, num_geoms)."""
     marks: tuple[Mark, ...]
-    """As :func:`marks_of` has them."""
     moment_s: float
     """When it went wrong [s], as :func:`qd.show.crossed.moment_of_failure` has it."""
 

@@ -21,8 +21,7 @@ FORCE_COLOR, COMMAND_COLOR = (0.84, 0.10, 0.11), (0.0, 0.62, 0.45)
 _START_COLOR, _GOAL_COLOR, _WAY_COLOR = (255, 255, 255), (0, 158, 115), (240, 200, 60)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
 """What is behind all, blue above and pale below, as an image of one column."""
-_BEHIND = np.array([-1.6, -2.4, 1.5])
-"""From the robot to the camera that follows it [m]."""
+_BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
 _PATH_WIDTH = 1.2  # [pixels]
@@ -78,7 +77,6 @@ class Scene:
         self.paths: list[Any] = []
         self._followed: Points | None = None
         self.follow = False
-        """Whether the camera goes along with the robot."""
 
     def _add_bodies(self, name: str) -> tuple[Any, list[Any]]:
         """A frame that is not visible yet, and a frame in it for each body of the robot."""

@@ -26,7 +26,6 @@ class Show:
     """What the viewer shows."""
 
     opened_run: OpenedRun
-    """Archive, robot and search."""
     elite: int | None
     """Which to show first; None for the first of the list."""
     controllers: dict[str, str]
@@ -34,7 +33,6 @@ class Show:
     note: str = ""
     """Why there is no controller; empty if there is one."""
     minima: MinimalTerrains | None = None
-    """Minimal terrains of the elites, if there are some."""
     minimal: bool = False
     """Whether the first terrain is the elite's minimal one."""
 

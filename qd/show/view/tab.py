@@ -25,16 +25,10 @@ from sim.bank import terrains_of
 from sim.files.command import command_line
 from sim.recording.recorder import Recording
 
-_BAR_S = 0.1
-"""Real time from one update of the bar's time to the next, while playing."""
-_ADDRESS_S = 1.0
-"""Real time from one update of the address to the next; browsers take no more than some three a second."""
-_SETTLES_S = 3.0
-"""How long a browser that has just come may still say where its camera stood before it was moved."""
-_BEFORE_S = 1.0
-"""How long before the robot fails an episode begins to be shown."""
-
-
+_BAR_S = 0.1  # real time from one update of the bar's time to the next, while playing
+_ADDRESS_S = 1.0  # real time from one update of the address to the next; browsers take no more than some three a second
+_SETTLES_S = 3.0  # how long a browser that has just come may still say where its camera stood before it was moved
+_BEFORE_S = 1.0  # how long before the robot fails an episode begins to be shown
 CERTIFYING, NOBODY = "who certifies it", "none"
 """Ghosts to choose beside the controllers: the one that certifies the elite, if it is at hand, and no ghost."""
 

@@ -14,7 +14,6 @@ CHECKPOINTS = {
     "another robot's rows": rsl_rl_actor(48).state_dict(),
     "NaN": STATE | {"mlp.0.bias": STATE["mlp.0.bias"] * float("nan")},
     "no bias": {name: value for name, value in STATE.items() if name != "mlp.2.bias"},
-    "no tensor": STATE | {"mlp.2.weight": "lost"},
     "a layer that does not fit": STATE | {"mlp.2.weight": torch.zeros(16, 31)},
     "no multilayer perceptron": {"rnn.weight": torch.zeros(2)},
 }

@@ -96,23 +96,23 @@ def test_a_look_of_no_body_of_the_robot_is_named(tmp_path):
             Skeleton(get_robot(str(file)))
 
 
-SHAPES = {"sphere": ".2", "capsule": ".1 .3", "ellipsoid": ".1 .2 .3", "cylinder": ".1 .3", "box": ".1 .2 .3"}
+SHAPES = {  # sizes as MuJoCo has them, and what that is along x, y and z after the turn [m]
+    "sphere": (".2", (0.4, 0.4, 0.4)),
+    "capsule": (".1 .3", (0.2, 0.8, 0.2)),
+    "ellipsoid": (".1 .2 .3", (0.4, 0.6, 0.2)),
+    "cylinder": (".1 .3", (0.2, 0.6, 0.2)),
+    "box": (".1 .2 .3", (0.4, 0.6, 0.2)),
+}
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_the_vertices_of_a_shape_lie_on_it(tmp_path, kind):
-    """By MuJoCo's rays toward its middle from a metre off."""
-    file = write_dog(tmp_path, **KINDS["mjcf"])
-    box = f'type="{kind}" size="{SHAPES[kind]}" pos=".3 -.2 .1" quat=".5 .5 -.5 .5"'
-    file.with_suffix(".look.xml").write_text(LOOK.format("trunk").replace('type="box" size=".1 .2 .3"', box))
+def test_a_shape_has_its_size_and_stands_in_its_place(tmp_path, kind):
+    file, (sizes, extents) = write_dog(tmp_path, **KINDS["mjcf"]), SHAPES[kind]
+    shape = f'type="{kind}" size="{sizes}" pos=".3 -.2 .1" quat=".5 .5 -.5 .5"'  # turns y to x, z to y, x to z
+    file.with_suffix(".look.xml").write_text(LOOK.format("trunk").replace('type="box" size=".1 .2 .3"', shape))
     dog = Skeleton(get_robot(str(file)))
     (geom,) = (geom for geom in dog.touches if dog.model.geom_bodyid[geom] == 1)
-    mesh, model, turn = dog.shape(geom)[0], dog.model, np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    points = np.float64(np.float32(mesh.vertices))  # a ray along an edge misses it
-    inward = model.geom_pos[geom] - points
-    size = np.linalg.norm(inward, axis=1)
-    for point, way in zip(points[size > 1e-6], (inward / size[:, None])[size > 1e-6], strict=True):
-        cast = (model.geom_pos[geom], turn, model.geom_size[geom], point - way, way, model.geom_type[geom])
-        assert mujoco.mju_rayGeom(*cast) == pytest.approx(1.0, abs=1e-5)
+    mesh = dog.shape(geom)[0]
+    np.testing.assert_allclose(mesh.extents, extents, rtol=0.03)  # a sphere has corners
+    np.testing.assert_allclose(mesh.bounds.mean(axis=0), [0.3, -0.2, 0.1], atol=1e-6)
     assert mesh.volume > 0.0  # faces look outward

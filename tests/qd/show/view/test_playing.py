@@ -44,6 +44,7 @@ def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     assert (first[:, 0] == first[:, 1]).all()  # none at the start
     np.testing.assert_allclose(last[0, 1] - last[0, 0], [0.0, 0.0, 0.5])  # 500 N
     assert (last[1:, 0] == last[1:, 1]).all()
+    assert crossing_of(recording, 2, skeleton, (), ()) is None  # it broke at once
 
 
 def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
@@ -52,10 +53,6 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
     np.testing.assert_allclose(begin[:2], [2.0, 4.0], atol=1e-6)
-
-
-def test_an_episode_that_broke_at_once_has_nothing_to_show(skeleton, recording):
-    assert crossing_of(recording, 2, skeleton, (), ()) is None
 
 
 def test_paths_of_all_episodes(recording):
