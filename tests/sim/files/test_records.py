@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim.files.atomic import locked, read_json, to_json, write_atomically
+from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.files.records import check_identity, code_fingerprint, identity, provenance, robot_digest
 from sim.robots.training import TrainingCfg
@@ -94,13 +94,6 @@ def test_a_robots_hash_follows_its_settings_but_those_of_training(anymal):
     digest = robot_digest(anymal)
     assert robot_digest(dataclasses.replace(anymal, max_speed=99.0)) != digest
     assert robot_digest(dataclasses.replace(anymal, training=TrainingCfg(push_speed=9.0))) == digest
-
-
-def test_a_locked_folder_has_one_owner(tmp_path):
-    with locked(tmp_path, "it is busy"), pytest.raises(ValueError, match="it is busy"), locked(tmp_path, "it is busy"):
-        pytest.fail("two are in")
-    with locked(tmp_path, "it is busy"):
-        pass
 
 
 def test_arrays_are_read_by_name_and_their_shapes_agree(tmp_path):
