@@ -1,19 +1,15 @@
 """The crossing: how episodes end, and what they cost."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-import warp as wp
 
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
-from sim.mujoco_c.model import step_penalties, to_mujoco
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import crossing_terrain
-from tests.sim.policies import Remembers, stretch
-from tests.sim.scenes import FLAT, crossing, positions, put, spike, velocities
+from tests.sim.policies import Remembers
+from tests.sim.scenes import FLAT, crossing, positions, put
 
 TERRAINS, REPLICAS = 4, 4
 
@@ -119,52 +115,6 @@ def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_the
     result = rollout.evaluate(FLAT[None], np.array([1]))
     assert (result.invalidity == Invalidity.ACTION).all() and result.invalid.all()
     np.testing.assert_allclose(result.duration_s, 1.005, atol=1e-6)
-
-
-def test_penalties_equal_a_replay_on_the_host(robot, device):
-    """The captured rollout against single eager steps of the same actions, summed by the float64 oracle."""
-    rows, actions, starts, robots = [], [], [], []
-
-    def record(observation):
-        if not starts:
-            starts.append((positions(sim), velocities(sim)))
-            robots.extend(np.argsort(recorder.episode.numpy()))  # on a GPU they take episodes in any order
-        action = stretch(observation)
-        rows.append(np.array(observation.cpu().numpy(), dtype=np.float64))
-        actions.append(np.array(action.cpu().numpy(), dtype=np.float32))
-        return action
-
-    robot = dataclasses.replace(robot, max_duration_s=0.4 if robot.name == "anymal" else 0.7)  # a pelvis falls farther
-    recorder = Rollout(robot, record, num_terrains=2, num_replicas=2, device=device)
-    sim = recorder.sim
-    result = recorder.evaluate(np.stack([FLAT, spike()]), np.array([3, 4]))
-    put(sim, *starts[0])
-    feet = np.array([name in robot.foot_geoms for name in sim.geom_names])
-    bases = [sim.geom_names.index(name) for name in robot.base_geoms]
-    sums, ended, limit = np.zeros((4, 6)), np.zeros(4, bool), robot.contact_force_limit
-    with wp.ScopedDevice(device):
-        for row, action in zip(rows, actions, strict=True):
-            targets = np.zeros((4, 19), np.float32)
-            targets[:, 7:] = np.float32(robot.default_joint_pos) + np.float32(robot.action_scale) * action
-            sim.targets.assign(targets)
-            command = row[:, 9:12] / [2, 2, 0.25]
-            for _ in range(robot.decimation):
-                sim.physics_step()
-                sim.read_geom_forces()
-                q, qd = positions(sim), velocities(sim)
-                force = np.array(sim.geom_force.numpy(), dtype=np.float64)
-                plain = to_mujoco(q, qd, np.array(sim.sensors.base_com))
-                step = step_penalties(plain.qpos, plain.qvel, command, force, feet=feet, force_limit=limit)
-                sums[~ended] += robot.physics_dt * step[~ended]
-                ended |= np.linalg.norm(force[:, bases], axis=2).max(axis=1) > 1
-    sums, ended = sums[robots], ended[robots]
-    assert ended.tolist() == [False, False, True, True]
-    np.testing.assert_array_equal(result.base_collision.ravel(), ended)
-    columns = [PENALTIES.index(name) for name in robot.penalties]
-    tolerance = {"rtol": 1e-3, "atol": 1e-4} if device.startswith("cuda") else {"rtol": 1e-4, "atol": 1e-6}
-    np.testing.assert_allclose(result.penalties.reshape(4, -1), sums[:, columns], **tolerance)
-    assert (sums[:, :3] > 0.0002).all()  # above the tolerance, on every device
-    assert sums[2:, 5].min() > 0  # the base's touch itself is counted
 
 
 def test_wrong_input_is_named(rollout):

@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from kernels.episode import Invalidity, Outcome
+from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import crossing_model, step_penalties, to_mujoco
@@ -75,7 +76,7 @@ DRIVES = {"saturation_effort": (90.0,) * 12, "velocity_limit": (6.0,) * 12, "dri
 
 
 def crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s=None):
-    """The robots as :func:`cross` leaves them on level ground, which is a plane in MuJoCo, after some time."""
+    """Robots as :func:`cross` leaves them on level ground, which is a plane in MuJoCo, and what that cost them."""
     seen = []
 
     class Seen(Episodes):
@@ -85,8 +86,8 @@ def crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s=None):
 
     monkeypatch.setattr("sim.mujoco_c.crossing.Episodes", Seen)
     robot = dataclasses.replace(robot, max_duration_s=seconds)
-    cross(robot, load_policy(policy, robot, "cpu"), FLAT, starts, time_constant_s=time_constant_s)
-    return seen[0]
+    result = cross(robot, load_policy(policy, robot, "cpu"), FLAT, starts, time_constant_s=time_constant_s)
+    return seen[0], result.penalties[0]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +99,8 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     # ANYmal walks for 0.2 s. Cassie needs 0.15 s to come down, and swings on its legs for 0.25 s, since to balance it
     # lets every difference grow. The softer a contact, the more of a toe lies on the ground, where MuJoCo has the two
     # ends alone.
-    seconds, metres, radians = {"anymal": (0.2, 2e-4, 6e-3), "cassie": (0.4, 3e-3, 0.04)}[robot.name]
+    by_robot = {"anymal": (0.2, 2e-4, 6e-3, 1e-4), "cassie": (0.4, 3e-3, 0.04, 0.15)}
+    seconds, metres, radians, share = by_robot[robot.name]
     if robot.name == "cassie" and time_constant_s == 0.003:
         metres, radians = 5e-4, 0.01
     policy = robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
@@ -106,7 +108,7 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
     rollout.put(FLAT[None], np.array([1000], np.uint32))
     starts = draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
-    plain = crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s)
+    plain, penalties = crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s)
     for _ in range(round(seconds / robot.control_dt)):
         rollout.control_step()
     joint_q = rollout.sim.joint_q.numpy()
@@ -115,8 +117,10 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     assert (np.abs(plain.forces[:, :, 2]).sum(axis=1) > 50.0).all()  # and the ground has a part in it
     np.testing.assert_allclose(joint_q[:, :3], plain.qpos[:, :3], atol=metres)
     np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
+    sums = rollout.penalty_sums.numpy()[:, [PENALTIES.index(name) for name in robot.penalties]]
+    np.testing.assert_allclose(sums, penalties, rtol=share, atol=1e-6)
     if changes is DRIVES:
-        ideal = crossed(monkeypatch, shipped, policy, starts, seconds)
+        ideal, _ = crossed(monkeypatch, shipped, policy, starts, seconds)
         assert np.abs(ideal.qpos[:, 7:] - plain.qpos[:, 7:]).max() > 0.2
 
 
