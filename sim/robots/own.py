@@ -210,17 +210,15 @@ class PackedRobot:
     """A user's robot with its files, for a machine that may lack them."""
 
     robot: RobotCfg
-    model: str
-    """The model file among ``files``."""
     files: tuple[tuple[str, bytes], ...]
-    """Path and content of the model's files, below a folder they have in common."""
+    """Path and content of the model's files, itself first, below a folder they have in common."""
 
     def unpacked(self, folder: Path) -> RobotCfg:
         """The robot with its files in ``folder``; they are needed until its model is built."""
         for name, content in self.files:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
-        return replace(self.robot, model_file=folder / self.model)
+        return replace(self.robot, model_file=folder / self.files[0][0])
 
 
 def pack_robot(robot: RobotCfg) -> PackedRobot | str:
@@ -230,5 +228,4 @@ def pack_robot(robot: RobotCfg) -> PackedRobot | str:
     files = read_model_files(robot.model_file).files
     # The folder's own name goes along: a URDF may call its package by it.
     root = Path(os.path.commonpath([file.parent for file in files])).parent
-    packed = tuple((str(file.relative_to(root)), file.read_bytes()) for file in files)
-    return PackedRobot(robot=robot, model=packed[0][0], files=packed)
+    return PackedRobot(robot=robot, files=tuple((str(file.relative_to(root)), file.read_bytes()) for file in files))

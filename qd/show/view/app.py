@@ -4,6 +4,7 @@ import queue
 import socket
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ class App:
         return self._recorders[1]
 
     def _come(self, client: viser.ClientHandle) -> None:
-        self.bars[client.client_id] = Bar(client, lambda name, value: self.post(self.act, client, name, value))
+        self.bars[client.client_id] = Bar(client, partial(self.post, self.act, client))
 
     def post(self, act: Callable[..., None], *args: Any) -> None:
         """Have the loop call ``act(*args)``; from any thread."""

@@ -99,7 +99,7 @@ class ArchivePanel:
 
     def __init__(self, client: viser.ClientHandle, selection: Selection, title: str, tab: Any) -> None:
         """Lay it out; the ``tab`` does what a visitor asks for."""
-        self._selection, self._tab, gui = selection, tab, client.gui
+        self._selection, gui = selection, client.gui
         self._listing = listing = tab.common.show.listing
         panel = gui.add_panel()
         panel.dock_left()
@@ -109,16 +109,14 @@ class ArchivePanel:
         with panel.add_tab("Archive"):
             gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary_of(listing.ranking, listing.archive))}.</b>"))
             orders = {words: name for name, words in ORDERS.items()}
-            _add_choice(gui, "Cause", listing.causes(), partial(self._choose, "cause"))
-            _add_choice(gui, "Sort", orders, partial(self._choose, "order"), f"Fitness is {FITNESS_WORDS}.")
+            choose = partial(tab.common.post, self._choose)
+            _add_choice(gui, "Cause", listing.causes(), partial(choose, "cause"))
+            _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_WORDS}.")
             self.list, self._map = gui.add_html(""), gui.add_html("")
 
     def _choose(self, name: str, value: str) -> None:
-        def change() -> None:
-            self._selection.choose(**{name: value})
-            self.show()
-
-        self._tab.common.post(change)
+        self._selection.choose(**{name: value})
+        self.show()
 
     def show(self) -> None:
         """Draw list and map anew."""
@@ -145,12 +143,12 @@ class CrossingPanel:
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
         self.head = gui.add_html("")
         names = {name: name for name in controllers or ("none",)}
-        self.controller = _add_choice(gui, "Controller", names, lambda name: post(tab.choose_controller, name))
+        self.controller = _add_choice(gui, "Controller", names, partial(post, tab.choose_controller))
         ghosts = {name: name for name in tab.choices}
-        self.ghost = _add_choice(gui, "Ghost", ghosts, lambda name: post(tab.choose_ghost, name))
+        self.ghost = _add_choice(gui, "Ghost", ghosts, partial(post, tab.choose_ghost))
         self.controller.disabled = self.ghost.disabled = not controllers
         whole = {words: bool(k) for k, words in enumerate(_TERRAINS)}
-        self.terrain = _add_choice(gui, "Terrain", whole, lambda minimal: post(tab.choose_terrain, minimal))
+        self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
         names = tab.common.show.opened_run.archive.penalties
         series = [uplot.Series(label=label_of(name), stroke=look_of(name).color, width=2.0) for name in names]

@@ -18,10 +18,6 @@ _LEAST_FORCE = 5.0  # shown [N]
 _COMMAND_HEIGHT = 0.45  # over the base [m]
 
 
-Mark = tuple[float, str]
-"""When something happens [s], and what."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Crossing:
     """F frames of one episode."""
@@ -44,7 +40,8 @@ class Crossing:
     """Scaled sums so far, in the archive's order, shape (F, P)."""
     touching: NDArray[np.bool_]
     """Whether each recorded geom touches something, shape (F, num_geoms)."""
-    marks: tuple[Mark, ...]
+    marks: tuple[tuple[float, str], ...]
+    """When something happens [s], and what."""
     moment_s: float
     """When it went wrong [s], as :func:`qd.show.crossed.moment_of_failure` has it."""
 
@@ -95,7 +92,7 @@ def ending_words(recording: Recording, replica: int, after: str = "") -> str:
     return ending_of(recording.outcome[0, replica]).words + after + fallen
 
 
-def marks_of(recording: Recording, replica: int) -> tuple[Mark, ...]:
+def marks_of(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
     """First stumble, first collision, fall, stuck and end of an episode that has frames, in the order of time.
 
     Stumbles and collisions are those that the penalties count; a robot without a penalty for collisions has one
