@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from sim.files.atomic import read_json
-from sim.files.command import split_words
+from sim.files.command import chosen_elites
 from sim.files.intervals import value_words
 from sim.files.npz import read_arrays
 
@@ -30,11 +30,7 @@ class MinimalTerrains:
 
     def chosen(self, text: str, run: object) -> list[int]:
         """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
-        known = list(map(str, self.genes))
-        words = known if text.strip() == "all" else split_words([text])
-        if not words or not set(words) <= set(known):
-            raise ValueError(f"{run} has no minimal terrain of elite {text}: expected all, or {', '.join(known)}")
-        return [int(word) for word in dict.fromkeys(words)]
+        return chosen_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
 
     def entry(self, number: int) -> dict[str, Any]:
         """What ``minimal.json`` says of the minimal terrain of an elite."""

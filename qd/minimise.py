@@ -105,7 +105,7 @@ def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[
         return sorted(sorted(failing, key=lambda number: order.index(verdict_of(archive, number)))[:most])
     if elite.strip() == "all":
         return failing
-    numbers = chosen_elites(elite, len(archive), run)
+    numbers = chosen_elites(elite, range(len(archive)), f"{run} has no elite")
     if crossed := [number for number in numbers if number not in failing]:
         worst = [number for number in elites_of(archive).by_severity().tolist() if number in failing]
         known = f"{len(failing)} fail, the worst are {', '.join(map(str, worst[:5]))}" if worst else "none fails"

@@ -131,7 +131,7 @@ class OpenedRun:
         else:
             if not elite and len(archive):
                 elite = str(rank(archive, self.space, minima).worst(1)[0])
-            numbers = chosen_elites(elite or "0", len(archive), self.path)
+            numbers = chosen_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
             known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
         causes = rank(archive, self.space, minima, numbers=numbers).causes
         return [

@@ -75,7 +75,8 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
     folder = pack_folder(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
-    names = {pack.terrains[row]["name"]: row for row in chosen_elites(places, len(pack.terrains), folder)}
+    rows = chosen_elites(places, range(len(pack.terrains)), f"{folder} has no place")
+    names = {pack.terrains[row]["name"]: row for row in rows}
     return Source(
         folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
         about={name: {"robot": of_robot.name, "place": row, **pack.terrains[row]} for name, row in names.items()},

@@ -266,12 +266,13 @@ def split_words(values: Sequence[str]) -> list[str]:
     return " ".join(values).replace(",", " ").split()
 
 
-def chosen_elites(text: str, count: int, whose: object) -> list[int]:
-    """Numbers of ``count`` elites of a run: separated by spaces or commas, or ``all``."""
-    known = [str(number) for number in range(count)]
+def chosen_elites(text: str, numbers: Sequence[int], missing: str) -> list[int]:
+    """Some of the numbers of elites: separated by spaces or commas, or ``all``; ``missing`` begins the error."""
+    known = [str(number) for number in numbers]
     words = known if split_words([text]) == ["all"] else split_words([text])
     if not words or not set(words) <= set(known):
-        raise ValueError(f"{whose} has no elite {text}: expected all, or numbers of its {count} elites, from 0")
+        few = known if len(known) <= 12 else [*known[:10], "...", known[-1]]
+        raise ValueError(f"{missing} {text}: expected all, or some of {', '.join(few) or 'none'}")
     return [int(word) for word in dict.fromkeys(words)]
 
 

@@ -18,14 +18,17 @@ def array_names(path: Path) -> list[str]:
         return [name.removesuffix(_ENDING) for name in members.namelist()]
 
 
-def read_arrays(path: Path, names: Sequence[str], *, max_bytes: float = float("inf")) -> dict[str, NDArray[Any]]:
-    """Some arrays of an npz file by name; any Exception if it is damaged, another file, or lacks one.
+def read_arrays(
+    path: Path, names: Sequence[str] | None = None, *, max_bytes: float = float("inf")
+) -> dict[str, NDArray[Any]]:
+    """All arrays of an npz file, or some by name; any Exception if it is damaged, another file, or lacks one.
 
     None may have more than ``max_bytes``: a packed file of zeros is small at any size.
     """
     with zipfile.ZipFile(path) as members:
-        missing = set(names) - {name.removesuffix(_ENDING) for name in members.namelist()}
-        if missing:
+        stored = [name.removesuffix(_ENDING) for name in members.namelist()]
+        names = stored if names is None else names
+        if missing := set(names) - set(stored):
             raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         large = {name: size for name in names if (size := members.getinfo(name + _ENDING).file_size) > max_bytes}
         if large:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sim.bank import heights_of
 from sim.files.atomic import write_atomically
-from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.files.npz import npz_bytes, read_arrays
 from sim.ground import GroundMaps
 from sim.recording.recorder import FRAME_ARRAYS, Recording
 from sim.spaces.registry import get_space, is_own
@@ -49,11 +49,10 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def _read(path: Path) -> Recording:
-    names = array_names(path)
-    version = str(read_arrays(path, ["format"])["format"]) if "format" in names else "none"
+    content = read_arrays(path)
+    version = str(content.pop("format", "none"))
     if version != FORMAT:
         raise ValueError(f"its format is {version}, expected '{FORMAT}'")
-    content = read_arrays(path, names)
     values: dict[str, Any] = {"genes": None, **content}
     for name, array in content.items():
         if array.dtype.kind == "U":
@@ -64,5 +63,4 @@ def _read(path: Path) -> Recording:
     if "heights" not in content:
         values["heights"] = heights_of(content["genes"], get_space(origin["space"]))
     values |= {name: content[name].astype(np.float32) for name in FRAME_ARRAYS} | {"dt": float(content["dt"])}
-    del values["format"]
     return Recording(**values)

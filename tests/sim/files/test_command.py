@@ -125,10 +125,10 @@ def test_a_report_is_shown_and_written_and_where_is_tried_before_the_work(tmp_pa
 
 
 def test_elites_are_named_by_numbers_or_all():
-    assert chosen_elites("2 0, 2", 3, "a run") == [2, 0] and chosen_elites("all", 3, "a run") == [0, 1, 2]
+    assert chosen_elites("2 0, 2", [0, 2], "") == [2, 0] and chosen_elites("all", range(3), "") == [0, 1, 2]
     for text, count in (("3", 3), ("-1", 3), ("", 3), ("0 all", 3), ("all", 0)):
         with pytest.raises(ValueError, match="a run"):
-            chosen_elites(text, count, "a run")
+            chosen_elites(text, range(count), "a run has no elite")
 
 
 @pytest.mark.parametrize(("line", "value"), [("--seed 3 --a wide", "wide"), ("--a=b=c", "b=c"), ("--a b --a=", "")])
