@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.workers.process import EvaluatorError as EvaluatorError
 from qd.workers.process import WorkerProcess
 from qd.workers.shards import join_results
 from sim.crossing import SolverCfg, resolved

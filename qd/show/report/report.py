@@ -60,7 +60,7 @@ def write_report(
     if tables is not None:
         about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
         compared = compared_of(read_tables(tables, opened_run.robot), **about)
-    content = content_of(opened_run, ranking, minima, crosser, is_searched=policy is None)
+    content = content_of(opened_run, ranking, minima, crosser, is_searched=not suffix)
     heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
     heads = heads or ranking.worst(num_elites)
     causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}

@@ -18,7 +18,7 @@ from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
 from sim.files.intervals import bootstrap_interval
 from sim.files.records import without_machine
-from sim.policy.spec import SHIPPED, ControllerSpec
+from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
 _MOST_BARS = 10
 _FAULT = VERDICTS.index("fault")
@@ -33,13 +33,16 @@ def content_of(
     archive, search, run = opened_run.archive, opened_run.search(), RunDirectory(opened_run.folder)
     elites, space, (searched, _) = ranking.elites, opened_run.space, opened_run.as_searched()
     metrics = _metrics_of(run, archive)
+    controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
+    if search is None and opened_run.suffix(spec_of(SHIPPED, opened_run.robot)):
+        controller = "a controller that is not at hand"
     return {
         "archive": archive,
         "run": opened_run.command,
         "search": search,
         "metrics": metrics,
         "gpus": run.read_summary().get("gpus"),
-        "controller": "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label,
+        "controller": controller,
         "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
         "place": without_machine(str(opened_run.path)),
         "summary": summary_of(ranking, archive),

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from qd.workers import evaluator
-from qd.workers.evaluator import EvaluatorCfg, EvaluatorError, open_evaluator, parse_workers
+from qd.workers.evaluator import EvaluatorCfg, open_evaluator, parse_workers
+from qd.workers.process import EvaluatorError
 from sim.robots.find import get_robot
 from tests.qd import crossers, stand_in
 from tests.qd.stand_in import assert_same

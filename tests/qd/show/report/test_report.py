@@ -141,7 +141,16 @@ def test_what_cannot_be_crossed_is_left_out(reported, run):
     out, crossed = reported()  # code that only the run names is not run
     assert crossed == [] and code in text_of(out.read_bytes())
     out, crossed = reported(policy=code)
-    assert crossed and f"another controller than was searched: {code}" in text_of(out.read_bytes())
+    assert crossed and "than was searched" not in text_of(out.read_bytes())
+    out, crossed = reported(policy=str(open_run(None, run).robot.policy_file))
+    assert crossed and "another controller than was searched: anymal.pt" in text_of(out.read_bytes())
+
+
+def test_an_archive_alone_of_another_controller_is_not_crossed_by_the_robots_own(reported, run):
+    (run / "config.json").unlink()
+    write_archive(run / "archive.npz", dataclasses.replace(read_archive(run), policy_sha256="f" * 64))
+    out, crossed = reported()
+    assert not crossed and "with a controller that is not at hand" in text_of(out.read_bytes())
 
 
 def test_bad_input_is_refused_and_the_page_stays_as_it_was(reported, run, tmp_path):
