@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from qd.run.directory import RUNS
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, origin_of
+from qd.workers.evaluator import Compute
 from qd.workers.invalid import refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg
@@ -82,7 +82,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
             if (count := _failing(result).sum()) >= _ENOUGH:
                 break
             print(f"{count} of {result.invalid.size} episodes did not reach the goal.", flush=True)
-    origin = {**origin_of(compute.device, 0, compute.workers), **identity(robot, policy), "space": space.name}
+    origin = {**compute.origin(0), **identity(robot, policy), "space": space.name}
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
     report = {**origin, "crossing": crossing, **measured(result)}
     absent = [name for name in robot.penalties if name not in report["scales"]]

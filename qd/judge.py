@@ -23,7 +23,7 @@ from qd.run.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, check_con
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.records import identity
 from sim.policy.spec import ControllerSpec, controller_hash, spec_of, weights_file
@@ -257,7 +257,7 @@ def judge(
                 families = families_of(archive.genes, space_now)
                 causes = causes_of(elites_of(archive), archive, space_now)
                 archive = replace(archive, family=families, cause=causes)
-            origin = origin_of(compute.device, search.cfg.seed, compute.workers) | identity(search.robot, search.policy)
+            origin = compute.origin(search.cfg.seed) | identity(search.robot, search.policy)
             _write(archive, families, search, certifiers, {stage: origin})
     return archive
 

@@ -18,7 +18,7 @@ from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
 from qd.run.directory import claimed
 from qd.show.figures import draw_minimal, save_figure
 from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.bank import heights_of
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import chosen_elites
@@ -80,7 +80,7 @@ def minimise(
         if not entries:
             return None
         ordered = [entries[number] for number in sorted(entries)]
-        origin = origin_of(compute.device, search.cfg.seed, compute.workers) | identity(search.robot, search.policy)
+        origin = compute.origin(search.cfg.seed) | identity(search.robot, search.policy)
         space_named = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
         content = {**origin, **space_named, **_totals(ordered), "elites": ordered}
         arrays = {name: np.array(value) for name, value in space_named.items() if value is not None}

@@ -17,7 +17,7 @@ from qd.run.progress import Bar, clock, describe_iteration, describe_search
 from qd.run.settings import SearchCfg
 from qd.scheduler import Scheduler
 from qd.show.figures import write_figures
-from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds, origin_of
+from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
@@ -79,7 +79,7 @@ def search(
         if done < cfg.iterations:
             try:
                 with compute.open(evaluator) as pipeline:
-                    run.begin_session(cfg, origin_of(compute.device, cfg.seed, compute.workers), done)
+                    run.begin_session(cfg, compute.origin(cfg.seed), done)
                     begun = f"iteration {done + 1}/{cfg.iterations}: compiling and evaluating"
                     with Bar(begun, cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)

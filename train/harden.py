@@ -23,7 +23,7 @@ from qd.judge import judge
 from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.run.settings import SearchCfg, differences, preset
 from qd.search import search
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.intervals import value_words
@@ -120,7 +120,7 @@ class _Hardening:
             return content
         if self.path.is_dir() and not all(map(is_leftover, self.path.iterdir())):
             raise ValueError(f"{self.path} must be empty or hold a hardening, got neither: give another directory")
-        origin = origin_of(self.compute.device, self.cfg.seed, self.compute.workers)
+        origin = self.compute.origin(self.cfg.seed)
         return {**origin, "robot": self.robot.name, "settings": settings, "rounds": [], "choices": {}}
 
     def _seed(self, number: int) -> int:

@@ -14,7 +14,7 @@ from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
 from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import RUNS
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words, wilson_interval
@@ -69,7 +69,7 @@ def measure_dose(
             for controller in controllers
         }
         return {
-            **origin_of(compute.device, seed, compute.workers),
+            **compute.origin(seed),
             "robot": robot.name,
             **robot_identity(robot),
             "resolved": resolved,

@@ -25,7 +25,7 @@ from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Tables, check_seeds, make_tables
 from qd.run.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.files.command import publish
 from sim.files.records import identity, robot_identity
 from sim.policy.spec import about_controllers, crosser_name, spec_of
@@ -158,8 +158,7 @@ def evaluate_tables(
             controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed,
             cache=crossings_folder(robot),
         )  # fmt: skip
-        origin = origin_of(compute.device, cfg.seed, compute.workers)
-        return {**origin, **robot_identity(robot), "space": space.name, **about, **tables}
+        return {**compute.origin(cfg.seed), **robot_identity(robot), "space": space.name, **about, **tables}
 
     return publish(out or RUNS / f"{robot.name}-tables" / file, make, show)
 
@@ -215,7 +214,7 @@ def evaluate_rates(
         hand_crafted, hard_random, flat = (results[name][controller] for name in sets)
         types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
         return {
-            **origin_of(compute.device, seed, compute.workers),
+            **compute.origin(seed),
             **identity(robot, policy),
             "space": drawn_in.name,
             "hand_crafted": summarise(hand_crafted, seed, types=types, levels=levels),

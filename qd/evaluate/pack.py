@@ -27,7 +27,7 @@ from qd.groups import families_of, rank, verdict_of
 from qd.judge import certifiers_of, find_search
 from qd.minima import read_minimal
 from qd.run.directory import RUNS
-from qd.workers.evaluator import Compute, check_policy, origin_of
+from qd.workers.evaluator import Compute, check_policy
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
@@ -108,7 +108,7 @@ def evaluate_pack(
         abouts = with_rates(known, {"this": result})
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
         return {
-            **origin_of(compute.device, seed, compute.workers),
+            **compute.origin(seed),
             **identity(robot, policy),
             "episodes": episodes,
             "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": size},
@@ -184,7 +184,7 @@ def make_pack(
         )["pack"]  # fmt: skip
         abouts = with_rates([about for about, _ in chosen], crossed)
         return {
-            **origin_of(compute.device, seed, compute.workers),
+            **compute.origin(seed),
             **identity(body, searched),
             "space": search.cfg.space,
             "space_sha256": search.cfg.space_sha256,

@@ -71,6 +71,10 @@ class Compute:
         """What a command line asks for, on the device that is there: CUDA if there is one, else the CPU."""
         return cls(resolve_device(device, workers), workers, num_envs)
 
+    def origin(self, seed: int) -> dict[str, Any]:
+        """Provenance of what is crossed; on a cluster the device is ``cuda`` or ``cpu`` alone."""
+        return provenance(self.device, seed) | ({"device": self.device} if parse_workers(self.workers).on_ray else {})
+
     def open(self, cfg: "EvaluatorCfg") -> AbstractContextManager["Pipeline"]:
         """Opens what crosses terrains."""
         return open_evaluator(cfg)
@@ -166,16 +170,11 @@ def resolve_device(name: str | None, workers: str | None = None) -> str:
     return warp_device
 
 
-def origin_of(device: str, seed: int, workers: str | None = None) -> dict[str, Any]:
-    """Provenance of what is crossed on a device, or on the devices of a cluster."""
-    return provenance(device, seed) | ({"device": device} if parse_workers(workers).on_ray else {})
-
-
-def check_policy(policy: str, robot: RobotCfg | str, device: str) -> None:
+def check_policy(policy: str, robot: RobotCfg, device: str) -> None:
     """Loads a controller and tries it on the robot, so that a bad one is found before any long work."""
     # A cluster's GPUs need not be this machine's.
     local_device = device if device == "cpu" else resolve_device(None)
-    load_policy(policy, get_robot(robot), device if local_device.startswith("cuda") else "cpu")
+    load_policy(policy, robot, device if local_device.startswith("cuda") else "cpu")
 
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Rollout:
