@@ -27,7 +27,7 @@ from sim.maps.picture import LENGTH, height_colors
 from sim.mujoco_c.model import surface_heights
 from sim.policy.spec import SHIPPED, label_suffix, spec_of
 from sim.recording.recorder import Recording
-from sim.recording.renderer import Camera, Ghost, Renderer, open_context
+from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
 
 FPS, GIF_FPS = 25, 12.5
@@ -142,9 +142,9 @@ def pictures_of(
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
             frame = min(time_s / dt, float(len(poses) - 1))
             pose, here = pose_at(poses, frame), (0, shot.episode, int(frame + 0.5))
-            ghost = None if beside is None else Ghost(pose_at(beside, time_s / dt), name)
+            ghost = None if beside is None else pose_at(beside, time_s / dt)
             touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
-            picture = Image.fromarray(renderer.render(pose, camera, ghost=ghost, **touch))
+            picture = Image.fromarray(renderer.render(pose, camera, ghost=ghost, ghost_name=name, **touch))
             picture = picture.resize(size, Image.Resampling.BOX)
             _letter(picture, shot, time_s, slowness[number])
             inset = chart.copy()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sim.files.atomic import read_json
-from sim.files.npz import array_names, check_shapes, read_arrays
+from sim.files.npz import array_names, read_arrays
 from sim.files.settings import from_builtins
 from sim.ground import GroundMaps
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -107,7 +107,6 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     try:
         names = [name for name in array_names(path) if name in ("size_m", *_GROUND)]
         arrays = read_arrays(path, ["heights", *names], max_bytes=8 * _MAX_NODES**2 + 1024)
-        check_shapes(arrays, {"heights": ("nrow", "ncol")})
         return {**arrays, "heights": arrays["heights"].astype(np.float64, casting="same_kind")}
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file with an array 'heights', got: {error}") from None
@@ -143,8 +142,8 @@ def _is_whole(size_m: tuple[float, float]) -> bool:
 
 
 def _check_heights(path: Path, heights: NDArray[np.float64]) -> None:
-    if min(heights.shape) < 2 or max(heights.shape) > _MAX_NODES:
-        raise ValueError(f"{path}: a heightmap needs 2 to {_MAX_NODES} nodes a side, got {heights.shape}")
+    if heights.ndim != 2 or min(heights.shape) < 2 or max(heights.shape) > _MAX_NODES:
+        raise ValueError(f"{path}: heights must have 2 axes of 2 to {_MAX_NODES} nodes, got {heights.shape}")
     if count := np.count_nonzero(~np.isfinite(heights)):
         raise ValueError(f"{path}: {count} of {heights.size} heights are NaN or infinite: fill them first")
     low, high = float(heights.min()), float(heights.max())

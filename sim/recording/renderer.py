@@ -1,10 +1,9 @@
-"""Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL on Linux, on a GPU or in software."""
+"""Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL, on a GPU or in software."""
 
 import importlib
 import os
-import sys
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -43,20 +42,10 @@ class Camera:
     """Of the view over the horizon [deg]; negative looks down."""
 
 
-class Ghost(NamedTuple):
-    """Another controller's robot in a picture: translucent, of one colour."""
-
-    qpos: NDArray[np.floating]
-    """MuJoCo's joint coordinates, shape (7 + num_joints,)."""
-    name: str
-    """Written over it."""
-
-
 def open_context(width: int, height: int) -> Any:
-    """A current OpenGL context without a screen: EGL on Linux, or what MUJOCO_GL names; free it with ``free()``."""
-    usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
-    name = os.environ.get("MUJOCO_GL", "").strip().lower() or usual
-    if name not in ("egl", "osmesa", "glfw", "cgl"):
+    """A current OpenGL context without a screen: EGL, or what MUJOCO_GL names; free it with ``free()``."""
+    name = os.environ.get("MUJOCO_GL", "").strip().lower() or "egl"
+    if name not in ("egl", "osmesa", "glfw"):
         raise ValueError(f"MUJOCO_GL must be egl, osmesa or glfw for pictures, got '{name}': leave it unset")
     try:
         context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
@@ -116,12 +105,14 @@ class Renderer:
         qpos: NDArray[np.floating],
         camera: Camera,
         *,
-        ghost: Ghost | None = None,
+        ghost: NDArray[np.floating] | None = None,
+        ghost_name: str = "",
         touching: NDArray[np.bool_] | None = None,
         foot_force: NDArray[np.floating] | None = None,
     ) -> NDArray[np.uint8]:
         """A picture of one pose in MuJoCo's joint coordinates, shape (7 + num_joints,): RGB, (height, width, 3).
 
+        ``ghost`` is the pose of another controller's robot, translucent and with its name over it.
         ``touching`` says whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do
         are yellow, base and limbs magenta. ``foot_force`` is the contact force on each foot, world frame [N], shape
         (num_feet, 3), shown as arrows.
@@ -144,7 +135,7 @@ class Renderer:
         _mj.mjr_render(self._rectangle, self._scene, self._gpu)
         _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         picture = self._image[::-1]  # OpenGL's lowest row is first
-        return picture.copy() if ghost is None else self._named(picture, ghost)
+        return picture.copy() if ghost is None else self._named(picture, ghost[:3], ghost_name)
 
     def _pose(self, data: Any, qpos: NDArray[np.floating]) -> None:
         data.qpos[:] = qpos
@@ -164,20 +155,20 @@ class Renderer:
                 geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
                 geom.matid = -1
 
-    def _add_ghost(self, ghost: Ghost) -> None:
-        self._pose(self._ghost_data, ghost.qpos)
+    def _add_ghost(self, qpos: NDArray[np.floating]) -> None:
+        self._pose(self._ghost_data, qpos)
         first, moving = self._scene.ngeom, _mj.mjtCatBit.mjCAT_DYNAMIC.value
         _mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
             geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
             geom.matid, geom.transparent = -1, 1
 
-    def _named(self, picture: NDArray[np.uint8], ghost: Ghost) -> NDArray[np.uint8]:
-        """The picture with the ghost's name over it."""
+    def _named(self, picture: NDArray[np.uint8], base: NDArray[np.floating], name: str) -> NDArray[np.uint8]:
+        """The picture with a name over a robot whose base is there [m]."""
         image, (height, width, _) = Image.fromarray(picture), picture.shape
         camera = self._scene.camera[0]  # that of one eye, at most a few centimetres from the middle of both
         over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
-        away = np.asarray(ghost.qpos[:3], np.float64) + np.array(over) - camera.pos
+        away = np.asarray(base, np.float64) + np.array(over) - camera.pos
         depth = float(away @ camera.forward)
         if depth > camera.frustum_near:
             pixels = 0.5 * height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
@@ -185,7 +176,7 @@ class Renderer:
             place = 0.5 * width + pixels * right, 0.5 * height - pixels * up
             color = tuple(round(150.0 * share) for share in OTHER_CONTROLLER)
             font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
-            ImageDraw.Draw(image).text(place, ghost.name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
+            ImageDraw.Draw(image).text(place, name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
         return np.array(image)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:

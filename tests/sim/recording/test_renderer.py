@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.mujoco_c.model import surface_heights
-from sim.recording.renderer import Camera, Ghost, Renderer, open_context
+from sim.recording.renderer import Camera, Renderer, open_context
 from sim.recording.scene import ground_paint, scene_model
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.sim.plain_mujoco import rays_from_above, to_c
@@ -87,13 +87,13 @@ def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
 def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
     side = Camera(target=(2.0, 4.0, 0.5), distance=4.0, azimuth=90.0, elevation=-10.0)
     pose = standing(anymal, 2.0, 4.0, 0.0)
-    ghost = Ghost(standing(anymal, 3.2, 4.0, 0.0), "C-G")
+    ghost = {"ghost": standing(anymal, 3.2, 4.0, 0.0), "ghost_name": "C-G"}
     force, base, foot = np.zeros((4, 3)), np.zeros(13, bool), np.zeros(13, bool)
     force[0, 2], base[0], foot[-4:] = 900.0, True, True
     with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
         pictures = [
             renderer.render(pose, side, **marks).astype(int)
-            for marks in ({}, {"ghost": ghost}, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
+            for marks in ({}, ghost, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
         ]
     alone, joined, pushed, hit, stepping, again = pictures
     np.testing.assert_array_equal(alone, again)  # what was added to a picture stays in it
