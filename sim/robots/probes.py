@@ -260,7 +260,7 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     if shape_type in _MESHES:
         return hull_probes(vertices)[0]
     kind = newton.GeoType(shape_type).name
-    raise ValueError(f"it is a {kind}, not a SPHERE, CAPSULE, BOX, CYLINDER or MESH: replace it in the robot's file")
+    raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the robot's file")
 
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
@@ -338,8 +338,7 @@ def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str
     with wp.ScopedDevice(host_device()):
         model, probes = builder.finalize(), make_probes(builder)
         state: Any = model.state()
-        counts = np.diff(np.append(probes.strip_start.numpy(), len(probes.position))).astype(int)
-        counts = counts[: len(probes.strip_radius)]
+        counts = np.diff(probes.strip_start.numpy())
         shape, radius = (np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("shape", "radius"))
         points, names = probes.position.numpy(), np.array(builder.shape_label)[shape]
         body = np.array(builder.shape_body)[shape]

@@ -9,8 +9,6 @@ from urllib.parse import parse_qsl, quote, urlencode
 _POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"  # viser's own: its page starts with that camera
 _MINIMAL = "minimal"
 
-Point = tuple[float, float, float]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Address:
@@ -24,12 +22,12 @@ class Address:
     """Counted from 1."""
     time_s: float | None = None
     follow: bool = False
-    camera: tuple[Point, Point] | None = None
-    """Where the camera stands and what it looks at [m]."""
+    camera: tuple[str, str] | None = None
+    """Where the camera stands and what it looks at [m], ``x,y,z`` each."""
 
     def query(self) -> str:
         """The address behind its question mark."""
-        camera = {} if self.camera is None else dict(zip((_POSITION, _LOOK_AT), self.camera, strict=True))
+        position, look_at = self.camera or (None, None)
         values = {
             "elite": self.elite,
             "terrain": _MINIMAL if self.minimal else None,
@@ -38,7 +36,8 @@ class Address:
             "episode": self.episode,
             "t": None if self.time_s is None else f"{self.time_s:.2f}".rstrip("0").rstrip("."),
             "follow": "1" if self.follow else None,
-            **{name: ",".join(f"{value:.2f}" for value in point) for name, point in camera.items()},
+            _POSITION: position,
+            _LOOK_AT: look_at,
         }
         ours = [(name, str(value)) for name, value in values.items() if value is not None]
         return urlencode(ours, safe=",", quote_via=quote)
@@ -57,7 +56,7 @@ def read_address(query: str) -> tuple[Address, list[str]]:
         refused.append(f"{name}={values[name]} in the address is no number that makes sense: it is left out.")
         return None
 
-    position, look_at = _point(values.get(_POSITION)), _point(values.get(_LOOK_AT))
+    position, look_at = values.get(_POSITION), values.get(_LOOK_AT)
     return Address(
         elite=read("elite", int),
         controller=values.get("controller"),
@@ -66,13 +65,5 @@ def read_address(query: str) -> tuple[Address, list[str]]:
         episode=read("episode", int),
         time_s=read("t", float),
         follow=values.get("follow") == "1",
-        camera=None if position is None or look_at is None else (position, look_at),
+        camera=(position, look_at) if position and look_at else None,
     ), refused
-
-
-def _point(text: str | None) -> Point | None:
-    try:
-        x, y, z = map(float, (text or "").split(","))
-    except ValueError:
-        return None
-    return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None

@@ -19,7 +19,7 @@ from qd.show.view.listing import column_of
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
 from qd.show.view.playing import episodes_by_ending, paths_of
 from qd.show.view.recorder import Report
-from qd.show.view.scene import Scene, View, first_view_of, overview_of
+from qd.show.view.scene import Points, Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
 from sim.bank import terrains_of
 from sim.files.command import command_line
@@ -130,8 +130,7 @@ class Tab:
     def show_address(self) -> None:
         """Have the browser's address say what the tab shows."""
         self._address_at = time.perf_counter()
-        camera = self.client.camera
-        position, look_at = ((float(x), float(y), float(z)) for x, y, z in (camera.position, camera.look_at))
+        position, look_at = self.client.camera.position, self.client.camera.look_at
         address = Address(
             elite=self.selection.picked,
             controller=self.controller,
@@ -140,7 +139,7 @@ class Tab:
             episode=None if self.replica is None else self.replica + 1,
             time_s=self.clock.time_s if self.robot.crossing is not None else self._begin_s,
             follow=self.scene.follow,
-            camera=(position, look_at),
+            camera=(_point_words(position), _point_words(look_at)),
         )
         query = address.query()
         if query != self.query:
@@ -390,3 +389,7 @@ class Tab:
 
     def _show_moment(self) -> None:
         self.bar.show({"time": round(self.clock.time_s, 3), "playing": self.clock.playing})
+
+
+def _point_words(point: Points) -> str:
+    return ",".join(f"{value:.2f}" for value in point)

@@ -9,7 +9,7 @@ from qd.show.view.address import Address, read_address
         Address(),
         Address(elite=12, controller="C-G", episode=3, time_s=8.4, follow=True),
         Address(elite=0, controller="as searched & more=50%", time_s=0.0),
-        Address(camera=((1.0, -2.5, 3.25), (4.0, 5.0, 0.0))),
+        Address(camera=("1.00,-2.50,3.25", "4.00,5.00,0.00")),
     ],
 )
 def test_what_an_address_says_comes_back(address):
@@ -18,8 +18,6 @@ def test_what_an_address_says_comes_back(address):
 
 
 def test_what_means_nothing_is_said_and_left_out():
-    address, refused = read_address(
-        "elite=twelve&episode=1.5&t=nan&initialCameraPosition=1,2&initialCameraLookAt=1,2,3"
-    )
+    address, refused = read_address("elite=twelve&episode=1.5&t=nan&initialCameraLookAt=1,2,3")
     assert address == Address()
     assert [words.split("=")[0] for words in refused] == ["elite", "episode", "t"]
