@@ -181,9 +181,8 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
         text = " ".join(takewhile(lambda line: not line.startswith("For full helptext"), words))
         what, _, help_line = text.partition(" Argument helptext: ")
         if form := re.match(r"(--\S+) (\{.*?\}|\S+)", help_line):
-            flag = form[1]
-            given = "".join(f", got {value}" for value in [_values(argv, flag)] if value)
-            what = f"{flag} must be {form[2].strip('{}').replace('|', ' or ')}{given}"
+            expected = form[2].strip("{}").replace("|", " or ")
+            what = f"{form[1]} must be {expected}, got {_values(argv, form[1])}"
         raise UserError(f"{what.rstrip('.')}; `faultline {name} --help` tells all flags") from None
 
 

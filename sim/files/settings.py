@@ -51,10 +51,9 @@ def problems(settings: Any, prefix: str = "") -> list[str]:
     return lines
 
 
-def check(settings: Any, prefix: str = "") -> None:
+def check(settings: Any) -> None:
     """Raises a ValueError that names every value of settings that is of another type or out of its range."""
-    lines = problems(settings, prefix)
-    if lines:
+    if lines := problems(settings):
         raise ValueError("; ".join(lines))
 
 

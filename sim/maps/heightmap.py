@@ -91,8 +91,8 @@ def read_heightmap(
     else:
         raise ValueError(f"a heightmap must be an .npz or a .png file, got {path}: save it as one of these")
     given = {"size_m": size_m, "scale_m": scale_m, "offset_m": offset_m}
-    values = {name: values.get(name) if value is None else value for name, value in given.items()}
-    values = {name: value for name, value in values.items() if value is not None}
+    values = {name: value for name, value in values.items() if name in given}
+    values |= {name: value for name, value in given.items() if value is not None}
     if "size_m" not in values:
         raise ValueError(f"{path}: expected its size: give --size X Y [m], or size_m in the .npz or in {beside.name}")
     meaning = from_builtins(_Meaning, values, str(path))

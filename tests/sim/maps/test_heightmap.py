@@ -105,6 +105,7 @@ GRAY, SIZE = np.zeros((5, 9), np.uint16), {"size_m": [16, 8]}
 PNG_MISTAKES = {
     "no scale": (GRAY, SIZE, "scale_m"),
     "a scale in words": (GRAY, SIZE | {"scale_m": "1 cm"}, "scale_m"),
+    "a scale that is nothing": (GRAY, SIZE | {"scale_m": None}, "scale_m"),
     "millimetres for metres": (GRAY + 700, SIZE | {"scale_m": 1.0}, "700"),
     "colours": (np.zeros((5, 9, 3), np.uint8), SIZE | {"scale_m": 0.1}, "RGB"),
 }
