@@ -24,7 +24,6 @@ from train.commands import Finetune
 from train.finetune import elites_of, finetune, train_specialist
 from train.ppo import training
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
-from train.ppo.ppo import CapturedPPO
 from train.task.task import CommandTask
 
 ROBOT = get_robot("anymal")
@@ -158,7 +157,7 @@ def test_a_normaliser_becomes_part_of_the_first_layer(places):
     torch.testing.assert_close(load_policy(places / "folded.pt", ROBOT, "cpu")(rows), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_it_goes_on_without_the_first_controller_and_from_an_archive_that_moved(places, monkeypatch):
+def test_it_goes_on_without_the_first_controller_and_from_an_archive_that_moved(places):
     start, archive, moved, run = (places / name for name in ("gone.pt", "gone.npz", "moved.npz", "moving"))
     start.write_bytes((places / "start.pt").read_bytes())
     write_archive(archive, make_archive(10))
@@ -169,9 +168,6 @@ def test_it_goes_on_without_the_first_controller_and_from_an_archive_that_moved(
     longer = replace(cfg, archive=(str(moved),), iterations=2)
     finetune(ROBOT, longer, run, ON_CPU)
     saved = (run / "checkpoint.pt").read_bytes()
-    with monkeypatch.context() as patch, pytest.raises(FloatingPointError, match="learning-rate"):
-        patch.setattr(CapturedPPO, "update", lambda alg: {"value": float("nan")})
-        finetune(ROBOT, replace(longer, iterations=3), run, ON_CPU)
     write_archive(moved, make_archive(10, seed=1))  # as many others
     with pytest.raises(ValueError, match="elites"):
         finetune(ROBOT, replace(longer, iterations=3), run, ON_CPU)
