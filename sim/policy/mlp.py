@@ -16,10 +16,7 @@ class MlpPolicy(torch.nn.Module):
     """Multilayer perceptron: rsl_rl's ``MLPModel`` without its distribution."""
 
     def __init__(self, state: dict[str, torch.Tensor], activation: str = "elu") -> None:
-        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``.
-
-        Between layers is one of :data:`ACTIVATIONS`.
-        """
+        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``."""
         super().__init__()
         self.activation = activation
         weights = {key.removeprefix("mlp."): value for key, value in state.items() if key.startswith("mlp.")}

@@ -110,10 +110,7 @@ def mesh_of(model: Any, geom: int) -> tuple[NDArray[np.float32], NDArray[np.int3
 
 
 def _of_urdf(root: ET.Element) -> Any:
-    """A URDF with a free base, its contact by the page on robots; what is fixed to a link adds its mass to it.
-
-    MuJoCo alone welds the first link to the world, and refuses inertias of fixed links that are those of no body.
-    """
+    """A URDF with a free base, its contact by the page on robots; what is fixed to a link adds its mass to it."""
     compiler = root
     for tag in ("mujoco", "compiler"):
         own = compiler.find(tag)
@@ -130,7 +127,7 @@ def _of_urdf(root: ET.Element) -> Any:
     for first in spec.worldbody.bodies:
         if not first.joints:  # the world's joint may be floating already
             first.add_freejoint()
-        _sum_masses(first)
+        _sum_masses(first)  # MuJoCo alone refuses inertias of fixed links that are those of no body
     return spec
 
 
@@ -157,11 +154,8 @@ def _sum_masses(body: Any) -> list[Any]:
 
 
 def _without_rotor(inertia: NDArray[np.float64], joint: Any) -> NDArray[np.float64]:
-    """An inertia without what it has about the joint's axis beyond any body's: a rotor's, the joint's armature.
-
-    The largest principal inertia of a body is at most the sum of the others. Some URDFs add that of the motor, behind
-    its gears, to that of the link.
-    """
+    """An inertia without what it has about the joint's axis beyond any body's: a rotor's, the joint's armature."""
+    # The largest principal inertia of a body is at most the sum of the others; some URDFs add that of the motor.
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     about = float(axis @ inertia @ axis)
     excess = 2.0 * about - float(np.trace(inertia))

@@ -331,10 +331,7 @@ def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
 
 
 def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
-    """Of each pose, shape (num_joints,) [rad], relative to the upright base: lowest points, and the farthest one [m].
-
-    The lowest points are by the names of their geoms.
-    """
+    """Lowest point of each geom, and the farthest of all, from the upright base [m] in poses of shape (num_joints,)."""
     with wp.ScopedDevice(host_device()):
         model, probes = builder.finalize(), make_probes(builder)
         state: Any = model.state()

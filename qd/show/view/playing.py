@@ -158,10 +158,7 @@ def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> 
 
 
 def paths_of(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
-    """Positions of the base at every tenth frame [m], shape (num_points, 3), and the colour of the outcome, by episode.
-
-    The last frame is always among them.
-    """
+    """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
     paths = []
     for frames, outcome, positions in zip(
         recording.num_frames[0].tolist(), recording.outcome[0], recording.base_position[0], strict=True

@@ -70,13 +70,10 @@ class Simulator:
 
 
 class Recorder:
-    """Does the tasks that each tab asked for last, the oldest first; earlier ones that are not begun are dropped.
-
-    Args:
-        build: Makes what works in the process; a module-level function, since the process imports it by name.
-    """
+    """Does the tasks that each tab asked for last, the oldest first; earlier ones that are not begun are dropped."""
 
     def __init__(self, *, build: Callable[[Event, int], Any] = Simulator) -> None:
+        """The process imports by its name what ``build`` is, and has it make what works there."""
         self.robot: Any = None
         """Whose crossings they are; set before the first task."""
         self.report: Callable[[Report], None] = lambda report: None
