@@ -16,9 +16,8 @@ from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.policy.loaders import activation_in, load_network, read_yaml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
-from sim.robots.own import NAME, per_joint
+from sim.robots.own import NEW_NAME, is_new_name, per_joint
 from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
 
 _FILES = {
     "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
@@ -113,9 +112,8 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     """
     if taken := [str(out / name) for name in _FILES if (out / name).exists()]:
         raise ValueError(f"--out must name a folder without a robot, got {' and '.join(taken)}: move them away first")
-    if not re.fullmatch(NAME, out.resolve().name) or out.resolve().name in ROBOTS:
-        shipped = " or ".join(ROBOTS)
-        raise ValueError(f"--out must end in a new name of letters, digits, . _ and -, not {shipped}, got {out}")
+    if not is_new_name(out.resolve().name):
+        raise ValueError(f"--out must end in {NEW_NAME}, got {out}")
     if not source.exists():
         raise ValueError(f"{source} is not there: expected a folder, a YAML, or weights")
     of_file = read_robot_file(model_file)

@@ -28,9 +28,14 @@ _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
             "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
 """Settings that a robot.toml may leave out though there is no default."""
-NAME = r"[A-Za-z0-9][\w.-]*"
-"""A robot's name, of which files and folders are made."""
+NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
+"""What a robot may be called, since files and folders are called after it."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
+
+
+def is_new_name(name: str) -> bool:
+    """Whether a robot may be called so."""
+    return re.fullmatch(r"[A-Za-z0-9][\w.-]*", name) is not None and name not in ROBOTS
 
 
 def load_robot(path: Path) -> RobotCfg:
@@ -169,10 +174,8 @@ def settings_problems(robot: RobotCfg) -> list[str]:
     """What is wrong with settings by themselves, one line each."""
     mistakes = problems(robot)
     wrong = {line.split(" ", 1)[0] for line in mistakes}
-    if "name" not in wrong and not re.fullmatch(NAME, robot.name):
-        mistakes.append(f"name must be letters, digits, . _ and -, since files are named after it, got {robot.name!r}")
-    elif "name" not in wrong and robot.name in ROBOTS:
-        mistakes.append(f"name must be one of its own, got '{robot.name}', which is a shipped robot")
+    if "name" not in wrong and not is_new_name(robot.name):
+        mistakes.append(f"name must be {NEW_NAME}, got {robot.name!r}")
     if wrong.isdisjoint(_NAMES):
         mistakes += _name_problems(robot)
     for one, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
