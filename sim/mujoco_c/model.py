@@ -83,19 +83,17 @@ def crossing_model(
     option.disableflags = _mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     patches = [] if ground is None else _patches_of(ground)
     if patches:
-        data = _add_patches(spec, heights, patches)
+        _add_patches(spec, heights, patches)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
-        data = np.zeros(0)
         _add_geom(spec, _GROUND, (0.0, 0.0, float(heights[0, 0])), type=_mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     else:
-        data = _add_field(spec, heights, 0)
+        _add_field(spec, heights, _GROUND)
     for name in robot.geom_names:
         spec.add_sensor(
             name=name, type=_mj.mjtSensor.mjSENS_CONTACT, objtype=_mj.mjtObj.mjOBJ_GEOM, objname=name,
             intprm=[1 << _mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
         )  # fmt: skip
     model = spec.compile()
-    model.hfield_data[:] = data
     of_ground = np.flatnonzero([model.geom(k).name.startswith(_GROUND) for k in range(model.ngeom)])
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
@@ -114,17 +112,16 @@ _DEPTH = 2.0  # of a level patch [m]
 
 
 def _add_field(
-    spec: Any, heights: NDArray[np.floating], number: int, low: tuple[float, float] = (0.0, 0.0),
+    spec: Any, heights: NDArray[np.floating], name: str, low: tuple[float, float] = (0.0, 0.0),
     margin: int | Margins = _MARGIN_NODES,
-) -> Array:  # fmt: skip
-    """Adds a heightfield whose first node stands at ``low`` [m]; returns its data."""
-    field, name = as_hfield(heights, margin=margin), f"{_GROUND}-{number}" if number else _GROUND
+) -> None:  # fmt: skip
+    """Adds a heightfield whose first node stands at ``low`` [m]."""
+    field = as_hfield(heights, margin=margin)
     rows, columns = field.data.shape
     spec.add_hfield(name=name, nrow=rows, ncol=columns, size=field.size, userdata=field.data.ravel())
     x, y, z = field.position
     _add_geom(spec, name, (x + low[0], y + low[1], z), type=_mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
               quat=field.quaternion)  # fmt: skip
-    return field.data.ravel()
 
 
 def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **looks: Any) -> None:
@@ -170,27 +167,21 @@ def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
     return _MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)
 
 
-def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> Array:
-    """Adds a geom a patch, a box where it is level and else a heightfield; returns the data of these."""
-    data = [np.zeros(0)]
+def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> None:
+    """Adds a geom a patch, a box where it is level and else a heightfield."""
     for number, patch in enumerate(patches):
-        part = heights[patch.rows, patch.cols]
+        part, name = heights[patch.rows, patch.cols], f"{_GROUND}-{number}" if number else _GROUND
         if np.ptp(part) > 0.0:
             if patch.time_constant_s:
                 raise ValueError(NO_SOFTNESS)
             low = SPACING * patch.cols.start, SPACING * patch.rows.start
-            data.append(_add_field(spec, part, number, low, patch.margin))
+            _add_field(spec, part, name, low, patch.margin)
             continue
-        (y, half_y), (x, half_x) = (
-            (
-                SPACING * (nodes.start - low + nodes.stop - 1 + high) / 2,
-                SPACING * (nodes.stop - 1 + high - nodes.start + low) / 2,
-            )
-            for nodes, (low, high) in zip((patch.rows, patch.cols), patch.margin, strict=True)
-        )
-        name, size = f"{_GROUND}-{number}" if number else _GROUND, (half_x, half_y, _DEPTH / 2)
+        axes = zip((patch.rows, patch.cols), patch.margin, strict=True)
+        ends = [(nodes.start - before, nodes.stop - 1 + behind) for nodes, (before, behind) in axes]
+        (y, half_y), (x, half_x) = ((SPACING * (low + high) / 2, SPACING * (high - low) / 2) for low, high in ends)
+        size = half_x, half_y, _DEPTH / 2
         _add_geom(spec, name, (x, y, float(part[0, 0]) - _DEPTH / 2), type=_mj.mjtGeom.mjGEOM_BOX, size=size)
-    return np.concatenate(data)
 
 
 def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: list[_Patch]) -> None:
