@@ -88,8 +88,9 @@ def device_name(device: str) -> str:
     """What a Warp device is, in words; its own name where this machine cannot tell."""
     if not device.startswith("cuda"):
         return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
-    index = device.partition(":")[2] or "0"
-    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader", f"--id={index}"]) or device
+    import torch  # takes seconds to load, and is loaded wherever a GPU works
+
+    return torch.cuda.get_device_name(device) if torch.cuda.is_available() else device
 
 
 def _output(command: Sequence[str | Path]) -> str | None:
