@@ -14,6 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
+from kernels.episode import Outcome
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
@@ -36,18 +37,30 @@ class Segment:
     """Shape (num_envs, 7 + num_joints)."""
     joint_qd: Any
     """Shape (num_envs, 6 + num_joints)."""
+    parked: Any
+    """2 for robots whose episodes have ended, else 0, shape (num_envs,)."""
+    num_running: int
+    """The other robots."""
     targets: list[Any]
     """Of each control step, shape (num_envs, 7 + num_joints)."""
 
 
 def record_segments(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[Segment]:
-    """State and targets of the first 10 of every 20 control steps of crossings, as :meth:`Rollout.put` takes them."""
+    """State and targets of the first 10 of every 20 control steps of crossings, as :meth:`Rollout.put` takes them.
+
+    Each robot runs one episode, and is left out once that has ended.
+    """
     sim, segments = rollout.sim, []
     rollout.clear()
     rollout.put(terrains, seeds)
     for step in range(round(rollout.robot.max_duration_s / rollout.robot.control_dt)):
         if step % SEGMENT_EVERY == 0:
-            segments.append(Segment(joint_q=wp.clone(sim.joint_q), joint_qd=wp.clone(sim.joint_qd), targets=[]))
+            ended = rollout.outcome.numpy() != Outcome.RUNNING
+            if ended.all():
+                break
+            state = {"joint_q": wp.clone(sim.joint_q), "joint_qd": wp.clone(sim.joint_qd)}
+            parked = wp.array(2 * ended, dtype=int, device=sim.device)
+            segments.append(Segment(**state, parked=parked, num_running=int((~ended).sum()), targets=[]))
         rollout.control_step()
         if step % SEGMENT_EVERY < SEGMENT_STEPS:
             segments[-1].targets.append(wp.clone(sim.targets))
@@ -60,8 +73,8 @@ class Motion:
     def __init__(self, sim: Simulation, segments: list[Segment]) -> None:
         """Captures the graph and replays two segments, so that the kernels are loaded."""
         self.sim, self.segments = sim, segments
-        self.robot_steps = sim.num_envs * sim.robot.decimation * sum(len(segment.targets) for segment in segments)
-        """Physics steps of all robots in one replay of all segments."""
+        self.robot_steps = sim.robot.decimation * sum(part.num_running * len(part.targets) for part in segments)
+        """Physics steps of the robots that are not left out, in one replay of all segments."""
 
         def control_step() -> None:
             for _ in range(sim.robot.decimation):
@@ -87,6 +100,7 @@ class Motion:
                 wp.copy(sim.joint_q, segment.joint_q)
                 wp.copy(sim.joint_qd, segment.joint_qd)
                 sim.clear_solver(all_robots)
+                wp.copy(sim.parked, segment.parked)
                 for targets in segment.targets:
                     wp.copy(sim.targets, targets)
                     wp.capture_launch(self._graph)
@@ -103,13 +117,13 @@ def seconds_of(work: Callable[[], object], device: str) -> float:
 
 
 def replay_rates(motions: list[Motion], rounds: int) -> list[float]:
-    """Physics steps a second over all robots of each motion, replayed in turns; the median of ``rounds``."""
+    """Physics steps a second over the robots of each motion, replayed in turns; the median of ``rounds``."""
     seconds = np.median([[motion.replay() for motion in motions] for _ in range(rounds)], axis=0)
     return [motion.robot_steps / float(s) for motion, s in zip(motions, seconds, strict=True)]
 
 
 def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32], rounds: int) -> dict[str, float]:
-    """Physics steps a second over all robots of contacts and solver alone.
+    """Physics steps a second, over all robots that have an episode, of contacts and solver alone.
 
     Returns:
         ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and

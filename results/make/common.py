@@ -18,7 +18,7 @@ from qd.run.directory import read_archive_of
 from qd.run.settings import SearchCfg, preset
 from qd.workers.evaluator import Compute
 from sim.device import resolve_device
-from sim.files.atomic import write_atomically
+from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import bootstrap_interval, t_interval
 from sim.files.records import identity, provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
@@ -39,6 +39,8 @@ class Script:
     small: bool
     """Whether this is a trial on a CPU, of a minute or so, whose numbers mean nothing."""
     out: Path
+    origin: dict[str, Any]
+    """Where the numbers come from, as every file says it: with robot and controller, and whether it is a trial."""
     parts: tuple[str, ...] = ()
     """Those asked for, of a script that has parts; none is all."""
 
@@ -90,20 +92,26 @@ class Script:
             shutil.copytree(self.results / "archive", run, dirs_exist_ok=True)
         return run
 
-    def origin(self) -> dict[str, Any]:
-        """Where the numbers come from, as every file says it, with robot and controller."""
-        return {**provenance(self.device, self.seed), **identity(self.robot, self.policy)}
+    def read_so_far(self, file: Path, *alike: str) -> dict[str, Any]:
+        """What a file says if today's sources made it of this robot, controller and seed, or in a trial; else nothing.
+
+        ``alike`` are further names of its origin that must be as they are now.
+        """
+        content = read_made(file)
+        names = ("sources_sha256", "small", "seed", "robot_sha256", "penalty_definition", "policy_sha256", *alike)
+        return content if all(content.get(name) == self.origin.get(name) for name in names) else {}
 
     def write(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Writes the file, with its origin first, and prints it without that; returns its content."""
         print(json.dumps(numbers, indent=1)[:4000])
-        return self.add(self.origin(), numbers)
+        return self.add(self.origin, numbers)
 
     def add(self, report: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Writes a report with numbers behind it; returns its content."""
+        """Writes a report with numbers behind it, unless the sources have changed meanwhile; returns its content."""
+        if sources_sha256() != self.origin["sources_sha256"]:
+            raise RuntimeError("the sources were changed meanwhile: leave them as they are, and measure again")
         content = {**report, **numbers}
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.out, (json.dumps(content, indent=1) + "\n").encode())
+        write_atomically(self.out, to_json(content))
         print(f"Written to {self.out}.")
         return content
 
@@ -111,7 +119,7 @@ class Script:
 def parse(
     doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results", parts: Sequence[str] = ()
 ) -> Script:
-    """Reads the flags that every script has.
+    """Reads the flags that every script has, and finds out whether its file can be written.
 
     Args:
         doc: Says what the script does.
@@ -130,13 +138,16 @@ def parse(
         parser.add_argument("--parts", nargs="+", choices=parts, help="all that this device can measure if left out")
     args = parser.parse_args(argv)
     robot = get_robot(args.robot)
-    folder = Path("runs/make/small" if args.small else published) / robot.name
+    out = args.out or Path("runs/make/small" if args.small else published) / robot.name / file
+    prepare_output(out)
+    device, trial = resolve_device(args.device), {"small": True} if args.small else {}
     return Script(
         robot=robot,
-        device=resolve_device(args.device),
+        device=device,
         seed=args.seed,
         small=args.small,
-        out=args.out or folder / file,
+        out=out,
+        origin={**provenance(device, args.seed), **identity(robot, str(robot.policy_file)), **trial},
         parts=tuple(getattr(args, "parts", None) or ()),
     )
 
@@ -155,9 +166,18 @@ def mean_over_seeds(name: str, values: Sequence[float | None]) -> dict[str, Any]
     return {name: float(numbers.mean()), f"{name}_interval": t_interval(numbers)}
 
 
+def read_made(file: Path) -> dict[str, Any]:
+    """What a file says; nothing if it is not there or broken, since it is made anew then."""
+    try:
+        return read_json(file)
+    except (FileNotFoundError, ValueError):
+        return {}
+
+
 def is_current(file: Path) -> bool:
-    """Whether a file was made by today's sources."""
-    return file.exists() and json.loads(file.read_text()).get("sources_sha256") == sources_sha256()
+    """Whether a file was made by today's sources, and not in a trial."""
+    content = read_made(file)
+    return content.get("sources_sha256") == sources_sha256() and not content.get("small")
 
 
 if __name__ == "__main__":

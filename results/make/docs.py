@@ -252,6 +252,7 @@ def public_controllers() -> str:
         "hard-random: reach the goal, here / finer / MuJoCo C, finer":
             beside("agreement", ("searched", "resolved", "mujoco_c"), None, ".2f"),
         "episodes/s of 32,768 robots": "episodes_per_s_32768",
+        "... on": lambda one: one.get("timed", {}).get("device", NONE),
         **{name.replace("_", " "): name for name in ("episodes", "elites", "corrected_elites", "failing", "confirmed",
                                                      "faults")},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
@@ -289,16 +290,17 @@ def speed() -> str:
     columns: dict[str, Column] = {
         **{f"episodes/s of {count:,} robots": inside("envs_curve", count, "episodes_per_s")
            for count in (1024, 4096, 32768)},
-        "episodes/s by Ray, by number of GPUs": lambda row: row["named"]["ray"],
+        "episodes/s by Ray, 4,096 robots a GPU with one each, by number of GPUs": lambda row: row["named"]["ray"],
         "an iteration of preset paper [s]": shown("iteration_s_median", ".2f"),
         "its physics steps/s [million]": shown("world_steps_per_s", **million),
         "... as a share of contacts and solver alone": shown("bare_physics_ratio", ".2f"),
         "an iteration of preset wide [s]": inside("wide", "surrogate", "iteration_s_median", form=".1f"),
         "... its crossings alone [s]": inside("wide", "surrogate", "crossings_s_median", form=".1f"),
-        "... minutes for the paper's episodes": inside("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
+        "... minutes for the paper's episodes at that pace":
+            inside("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
         f"... by `{mixed}` [s]": inside("wide", mixed, "iteration_s_median", form=".1f"),
         f"... minutes by `{mixed}`": inside("wide", mixed, "minutes_per_4m_episodes", form=".1f"),
-        "preset small on two CPU cores [minutes]": inside("cpu", "archive_wall_s", **minutes),
+        "preset small on a CPU [minutes]": inside("cpu", "archive_wall_s", **minutes),
         **{f"{count:,} robots standing: physics steps/s [million]{alone}":
            inside("flat", count, f"world_steps_per_s{key}", **million)
            for count in (4096, 32768) for alone, key in (("", ""), (", mujoco_warp alone", "_mujoco_warp"))},

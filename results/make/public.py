@@ -31,7 +31,7 @@ from results.make.pictures import FOLDER
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
 from sim.device import resolve_device
-from sim.files.atomic import write_atomically
+from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.records import provenance, sources_sha256
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
@@ -151,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", action="store_true", help="stills of searches that are there, and nothing else")
-    parser.add_argument("--speed", action="store_true", help="episodes a second alone, into the file that is there")
+    parser.add_argument("--speed", action="store_true", help="episodes a second alone, of those in the file")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
@@ -164,20 +164,22 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         for name in set(args.only) & set(PICTURES):
             take_picture(name, runs)
         return {}
-    content = provenance(compute.device, args.seed) | {"controllers": {}}
-    if args.speed and out.exists():
-        content = json.loads(out.read_text())
+    prepare_output(out)
+    now = provenance(compute.device, args.seed)
+    content = read_json(out) if args.speed else now | {"small": args.small, "controllers": {}}
+    if content.get("small", False) != args.small:
+        raise ValueError(f"{out} must be of a trial with --small, and of none without it")
     for name in args.only:
         numbers = content["controllers"].get(name, {})
-        if args.speed and numbers.get("timed", {}).get("sources_sha256") == sources_sha256():
-            continue
+        timed = numbers.get("timed", {})
         if not args.speed:
             numbers |= measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+        elif not numbers or all(timed.get(key) == now[key] for key in ("sources_sha256", "device")):
+            continue
         numbers |= time_alone(name, args.folder, runs, compute, seed=args.seed, small=args.small)
         content["controllers"][name] = numbers
         print(json.dumps({name: numbers}, indent=1), flush=True)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(out, (json.dumps(content, indent=1) + "\n").encode())
+        write_atomically(out, to_json(content))
     return content
 
 

@@ -1,7 +1,7 @@
 """What more devices bring: scale.json.
 
-The same evaluation of hard-random terrains by 1 to N Ray workers on one host: with as many robots a worker as keep a
-GPU busy, and at the size of the paper's iteration, which they share. Against one process without Ray.
+The same evaluation of hard-random terrains by 1 to N Ray workers on one host: with 4,096 robots a GPU, each of which
+runs one episode, and at the size of the paper's iteration, which they share. Against one process without Ray.
 """
 
 import statistics

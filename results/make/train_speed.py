@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from results.make import peer
-from results.make.common import Script, is_current, parse
+from results.make.common import Script, parse
 from sim.files.records import device_name
 from train.ppo.learner import Learner, PpoCfg, Ranks
 from train.task.task import CommandTask, TaskCfg
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         rows.append(time_mjlab(folder, device, sizes[0][0]))
     if ranks.is_first:
         gpus = {row["gpus"] for row in rows}
-        before = json.loads(script.out.read_text())["rows"] if is_current(script.out) else []
+        before = script.read_so_far(script.out, "versions").get("rows", [])
         script.write({"rows": [*(row for row in before if row["gpus"] not in gpus), *rows]})
 
 

@@ -4,7 +4,6 @@ Each result in torch is compared with the kernel's before anything is timed.
 """
 
 import argparse
-import json
 import re
 import sys
 from functools import partial
@@ -15,6 +14,7 @@ import torch
 
 from qd.evaluate.show import show_table
 from sim.device import resolve_device
+from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.intervals import value_words
 from sim.files.records import provenance
 from sim.policy.loaders import prepare_torch
@@ -83,11 +83,14 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--robot", default="anymal")
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--num-envs", type=int, help="robots: 4,096 on CUDA, 16 on the CPU")
-    parser.add_argument("--out", type=Path, help="file to write; results/bench/<device>.json if left out")
-    parser.add_argument("--small", action="store_true", help="a trial: every kernel once, without torch.compile")
+    parser.add_argument("--out", type=Path, help="file to write; <device>.json in results/bench if left out")
+    parser.add_argument("--small", action="store_true", help="a trial without torch.compile; it publishes nothing")
     args = parser.parse_args(argv)
 
     robot, device = get_robot(args.robot), resolve_device(args.device)
+    origin, folder = provenance(device, 0), Path("runs/make/small" if args.small else "results") / "bench"
+    out = args.out or folder / file_name(origin["device"])
+    prepare_output(out)
     on_gpu = device.startswith("cuda")
     num_envs = args.num_envs or (4096 if on_gpu else 16)
     num_terrains = min(num_envs, 200 if on_gpu else 8)
@@ -102,11 +105,9 @@ def main(argv: list[str]) -> None:
     cases = make_cases(scene).values()
     rows = [measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in cases]
     sizes = {"num_envs": num_envs, "num_terrains": num_terrains}
-    report = {**provenance(device, 0), "robot": robot.name, **sizes, "rows": rows}
+    report = {**origin, "small": args.small, "robot": robot.name, **sizes, "rows": rows}
     print_table(report)
-    out = args.out or Path("results/bench") / file_name(report["device"])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(report, indent=1) + "\n")
+    write_atomically(out, to_json(report))
     print(f"Written to {out}.")
 
 

@@ -64,10 +64,12 @@ def test_what_bounds_a_kernel(work, seconds, share, bound_by):
     assert CEILING.judge(work, seconds) == (pytest.approx(share), bound_by)
 
 
-def test_command(tmp_path, device, capsys):
-    out = tmp_path / "new" / "bench.json"
-    main(["--small", "--num-envs", "3", "--device", device, "--out", str(out)])
+def test_command(tmp_path, device, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    main(["--small", "--num-envs", "3", "--device", device])
+    [out] = tmp_path.rglob("*.json")
     report = json.loads(out.read_text())
+    assert out.relative_to(tmp_path).parts[0] != "results" and report["small"]  # a trial publishes nothing
     assert [row["kernel"] for row in report["rows"]] == [*KERNELS]
     for row in report["rows"]:
         assert row["speedup"] == pytest.approx(row["torch_ms"] / row["ours_ms"])

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.episode import Outcome
+from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import common, docs, speed, tables
+from results.make import bare, common, docs, speed, tables
 from sim.files.records import sources_sha256
 from sim.rates import counted_episodes
+from sim.rollout import Rollout
+from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.qd.searches import without_figures
 from tests.qd.stand_in import Stub, make_result
 
@@ -64,22 +66,132 @@ def test_every_script_loads_and_is_listed():
     assert [name for name in scripts if f" {name} " not in text and f"make.{name}" not in text] == []
 
 
-def test_a_file_of_other_sources_is_not_current(tmp_path):
-    file = tmp_path / "base.json"
+def test_a_file_of_other_sources_or_of_a_trial_is_not_current(tmp_path):
+    file, ours = tmp_path / "base.json", {"sources_sha256": sources_sha256()}
     assert not common.is_current(file)
-    for digest in (sources_sha256(), "0" * 64):
-        file.write_text(json.dumps({"sources_sha256": digest}))
-        assert common.is_current(file) == (digest != "0" * 64)
+    for content in (ours, {"sources_sha256": "0" * 64}, {**ours, "small": True}, [], None):
+        file.write_text(json.dumps(content) if content is not None else "{")
+        assert common.is_current(file) == (content == ours)
 
 
-def test_a_part_of_speed_is_measured_once_by_sources(tmp_path, monkeypatch):
-    calls, out = [], tmp_path / "speed.json"
-    for part in speed.PARTS:
-        monkeypatch.setitem(speed.PARTS, part, lambda script, part=part: calls.append(part) or {part: len(calls)})
-    for parts in (["curve"], ["flat", "curve"], ["cpu"]):
-        report = speed.main(["--device", "cpu", "--out", str(out), "--parts", *parts])
-    assert calls == ["curve", "flat", "cpu"] and report == json.loads(out.read_text())
-    assert report | {"curve": 1, "flat": 2, "cpu": 3, "wide": None} == report and list(report["measured"]) == calls
+class Speed:
+    """The script of speed.json with parts that count, on devices that need not be there."""
+
+    def __init__(self, folder, monkeypatch):
+        self.out, self.calls, self.patch = folder / "new" / "speed.json", [], monkeypatch
+        for part in speed.PARTS:
+            monkeypatch.setitem(speed.PARTS, part, lambda script, part=part: self.measure(part, script))
+
+    def measure(self, part, script):
+        self.calls.append(part)
+        return {part: script.origin if part == "cpu" else len(self.calls)}
+
+    def run(self, device, *words):
+        """What it writes; device names are as a machine without them has them."""
+        self.patch.setattr(common, "resolve_device", lambda name: name)
+        report = speed.main(["--device", device, "--out", str(self.out), *words])
+        assert report == json.loads(self.out.read_text())
+        return report
+
+
+@pytest.fixture
+def speeds(tmp_path, monkeypatch):
+    return Speed(tmp_path, monkeypatch)
+
+
+def test_a_part_of_speed_is_measured_once(speeds):
+    for words in (["cuda:0", "--parts", "curve"], ["cpu"], ["cuda:0", "--parts", "flat", "curve"], ["cpu"]):
+        report = speeds.run(*words)
+    assert speeds.calls == ["curve", "cpu", "flat"] == list(report["measured"])
+    assert report | {"curve": 1, "flat": 3, "wide": None, "device": "cuda:0"} == report
+    assert report["cpu"]["device"].startswith("CPU")
+
+
+def test_speeds_of_two_gpus_or_seeds_or_of_a_trial_are_not_mixed(speeds):
+    speeds.run("cpu")
+    assert list(speeds.run("cuda:0", "--parts", "curve", "flat")["measured"]) == ["cpu", "curve", "flat"]
+    report = speeds.run("cuda:1", "--parts", "flat")
+    assert list(report["measured"]) == ["cpu", "flat"] and "curve" not in report and report["device"] == "cuda:1"
+    assert list(speeds.run("cuda:1", "--parts", "curve", "--seed", "3")["measured"]) == ["curve"]
+    assert list(speeds.run("cuda:1", "--parts", "wide", "--seed", "3", "--small")["measured"]) == ["wide"]
+    assert list(speeds.run("cuda:1", "--parts", "flat", "--seed", "3")["measured"]) == ["flat"]
+
+
+def test_a_part_that_fails_leaves_the_others(speeds, monkeypatch):
+    before = speeds.run("cuda:0", "--parts", "curve")
+
+    def fail(script):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(speed.PARTS, "flat", fail)
+    with pytest.raises(KeyboardInterrupt):
+        speeds.run("cuda:0", "--parts", "flat", "curve")
+    assert json.loads(speeds.out.read_text()) == before
+    speeds.out.write_text("{")  # a broken file is made again
+    assert list(speeds.run("cuda:0", "--parts", "curve")["measured"]) == ["curve"]
+
+
+@pytest.mark.parametrize("words", [["cuda:0", "--parts", "cpu"], ["cpu", "--parts", "curve"]])
+def test_a_part_is_measured_on_its_own_kind_of_device(speeds, words):
+    with pytest.raises(ValueError, match="parts"):
+        speeds.run(*words)
+
+
+def test_sources_that_change_meanwhile_are_refused(speeds, monkeypatch):
+    def edit(script):
+        monkeypatch.setattr(common, "sources_sha256", lambda: "0" * 64)
+        return {}
+
+    monkeypatch.setitem(speed.PARTS, "curve", edit)
+    with pytest.raises(RuntimeError, match="sources"):
+        speeds.run("cuda:0", "--parts", "curve")
+    assert not speeds.out.exists()
+
+
+def test_a_file_that_cannot_be_written_is_found_out_first(speeds):
+    speeds.out.mkdir(parents=True)
+    with pytest.raises(ValueError, match="directory"):
+        speeds.run("cuda:0")
+    assert not speeds.calls
+
+
+def test_rates_of_training_are_of_the_same_device(speeds):
+    speeds.run("cuda:0", "--parts", "curve")
+    origin = json.loads(speeds.out.read_text())
+    row = {"gpus": 1, "num_envs": 4096, "train_env_steps_per_s": 7.0, "device": "cuda:0"}
+    rows = [
+        row,
+        {**row, "num_envs": 8192, "device": "cuda:1"},
+        {**row, "peer": "mjlab 1", "train_env_steps_per_s": 2.0},
+    ]
+    file = speeds.out.with_name("train_speed.json")
+    file.write_text(json.dumps({**origin, "rows": rows}))
+    report = speeds.run("cuda:0", "--parts", "curve")
+    assert [report[f"train_env_steps_per_s{key}"] for key in ("", "_8192", "_mjlab")] == [7.0, None, 2.0]
+    file.write_text(json.dumps({**origin, "rows": rows, "sources_sha256": "0" * 64}))
+    assert speeds.run("cuda:0", "--parts", "curve")["train_env_steps_per_s"] is None
+
+
+def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
+    # Two robots for 60 control steps, of which the first 10 of every 20 are replayed. One ends behind the 15th: of
+    # (2 + 1 + 1) * 10 control steps, 4 physics steps each, count.
+    rollout = Rollout(
+        replace(anymal, max_duration_s=1.2), anymal.policy_file, num_terrains=1, num_replicas=2, device=device
+    )
+    steps, step = [], rollout.control_step
+
+    def end_one():
+        step()
+        steps.append(None)
+        if len(steps) == 15:
+            rollout.outcome.assign([rollout.outcome.numpy()[0], Outcome.TIME_OUT])
+
+    rollout.control_step = end_one
+    level, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.zeros(1, np.uint32)
+    motion = bare.Motion(rollout.sim, bare.record_segments(rollout, level, seeds))
+    assert motion.robot_steps == 160
+    assert motion.replay() > 0.0 and rollout.sim.parked.numpy().tolist() == [0, 2]
+    assert rollout.sim.joint_q.numpy()[1, 2] == PARKING_HEIGHT
 
 
 def test_means_over_seeds():
