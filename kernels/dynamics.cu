@@ -278,8 +278,8 @@ for (int n = lane; n < NV; n += LANES) {
             driven = gear * f;
             slope -= gear * gear * steep;
         }
-        if (tree.joint_limited.data[joint]) {
-            const auto range = of_model(tree.joint_range, joint);
+        if (tree.joint_force_limited.data[joint]) {
+            const auto range = of_model(tree.joint_force_range, joint);
             driven = wp::clamp(driven, range[0], range[1]);
         }
     }

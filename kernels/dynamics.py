@@ -60,9 +60,9 @@ class Tree:
     """Of the spring of each joint."""
     armature: wp.array2d[float]
     damping: wp.array2d[float]
-    joint_limited: wp.array[bool]
-    """Whether the force of the actuators on a joint is limited, to ``joint_range``."""
-    joint_range: wp.array2d[wp.vec2]
+    joint_force_limited: wp.array[bool]
+    """Whether the force of the actuators on a joint is limited, to ``joint_force_range``."""
+    joint_force_range: wp.array2d[wp.vec2]
     actuator: wp.array[int]
     """Actuator of each dof, -1 for none."""
     gain: wp.array3d[float]

@@ -7,8 +7,9 @@ __shared__ alignas(16) float pool[$worlds * $words];
 float* memory = pool + threadIdx.x / LANES * $words;
 auto sync = [&] { __syncwarp(us); };
 auto from = [&](float x, int k) { return __shfl_sync(us, x, k, LANES); };  // that of lane k
+// The same bits in all lanes: an addition that is fused with a product would be rounded in one lane otherwise than in another.
 auto total = [&](float x) {
-    for (int k = LANES / 2; k > 0; k /= 2) x += __shfl_xor_sync(us, x, k);
+    for (int k = LANES / 2; k > 0; k /= 2) x = __fadd_rn(x, __shfl_xor_sync(us, x, k));
     return x;
 };
 #else

@@ -21,6 +21,8 @@ float* vector = inertia + NV * LD;  // over dofs, for whoever multiplies it
 float* part = vector + LD;  // CHUNK x DIM x NV; two rows of a matrix that is factorised
 float* coefficient = part + CHUNK * DIM * LD;  // CHUNK x DIM x DIM
 Contact* kept = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 * 4);
+constexpr int WORDS = (NV + 1 + CHUNK * DIM) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + KEPT * sizeof(Contact) / 4;
+static_assert(WORDS == $words, "the words of kernels/solver.py must be those used here");
 Contact* others = MOST > KEPT ? (Contact*)&wp::index(problem.others, world, 0) : kept;
 auto contact = [&](int c) -> Contact& { return c < KEPT ? kept[c] : others[c - KEPT]; };
 const int found = problem.contacts.count.data[world], num_contacts = wp::min(found, MOST);

@@ -179,7 +179,7 @@ _OF_TREE = {
     "body_iquat": "body_iquat", "body_mass": "body_mass", "body_inertia": "body_inertia",
     "subtree_mass": "body_subtreemass", "joint_pos": "jnt_pos", "joint_axis": "jnt_axis", "qpos0": "qpos0",
     "rest": "qpos_spring", "stiffness": "jnt_stiffness", "armature": "dof_armature", "damping": "dof_damping",
-    "joint_limited": "jnt_actfrclimited", "joint_range": "jnt_actfrcrange", "gear": "actuator_gear",
+    "joint_force_limited": "jnt_actfrclimited", "joint_force_range": "jnt_actfrcrange", "gear": "actuator_gear",
     "control_limited": "actuator_ctrllimited", "control_range": "actuator_ctrlrange",
     "force_limited": "actuator_forcelimited", "force_range": "actuator_forcerange",
 }  # fmt: skip
