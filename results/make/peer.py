@@ -1,5 +1,7 @@
 """How fast mjlab trains a robot of its own on rough ground, for train_speed.py: prints a line of JSON at the end.
 
+It begins with untrained networks, since no trained ones come with it.
+
 It imports nothing of faultline, and runs where mjlab and the packages that it wants are on the path.
 """
 
