@@ -285,7 +285,10 @@ def speed() -> str:
         by_ray = "; ".join(f"{one['workers']}: {one['episodes_per_s']:,.0f}" for one in scale.get("rows", ()))
         largest = [one for one in numbers.get("kernels") or () if one.get("share", 0.0) >= 0.04]
         shares = ", ".join(f"{kernel_words(one['name'])} {one['share']:.0%}" for one in largest)
-        rows[words] = {**numbers, "named": {**named, "ray": by_ray or NONE, "kernels": shares or NONE}}
+        two = [f"{one['train_env_steps_per_s']:,.0f} ({one['device']})" for one in numbers.get("training") or ()
+               if one["gpus"] == 2]  # fmt: skip
+        of_others = {"ray": by_ray, "kernels": shares, "two": " ".join(two)}
+        rows[words] = {**numbers, "named": {**named, **{key: text or NONE for key, text in of_others.items()}}}
     mixed, million, minutes = "cma_mae+map_elites", {"form": ".1f", "factor": 1e-6}, {"form": ".1f", "factor": 1 / 60}
     columns: dict[str, Column] = {
         **{f"episodes/s of {count:,} robots": inside("envs_curve", count, "episodes_per_s")
@@ -306,7 +309,7 @@ def speed() -> str:
            for count in (4096, 32768) for alone, key in (("", ""), (", mujoco_warp alone", "_mujoco_warp"))},
         "training: environment steps/s of 4,096 robots": "train_env_steps_per_s",
         "... of 8,192 robots": "train_env_steps_per_s_8192",
-        "... of 8,192 on each of two GPUs": "train_env_steps_per_s_2gpu",
+        "... of 8,192 on each of two GPUs": lambda row: row["named"]["two"],
         "... of mjlab's 4,096 Unitree Go1 in the same run": "train_env_steps_per_s_mjlab",
         "goal rate above that of finer physics": inside("agreement", "resolved", "goal_bias", form="+.3f"),
         "goal rate above that of MuJoCo C": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),

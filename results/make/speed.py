@@ -246,10 +246,13 @@ def time_view(robot: str, folder: Path) -> dict[str, float | None]:
 
 
 def training_rates(script: Script, device: str) -> dict[str, Any]:
-    """PPO's environment steps a second with learning on a device, as train_speed.py wrote them with today's sources."""
+    """PPO's environment steps a second with learning on a device, as train_speed.py wrote them with today's sources.
+
+    Those of several GPUs are of a host that has them, whose GPUs may be others.
+    """
     rows = script.read_so_far(script.out.with_name("train_speed.json")).get("rows", [])
     rates = {(row.get("peer", "")[:5], row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in rows
-             if row["device"] == device}  # fmt: skip
+             if row["device"] == device or row["gpus"] > 1}  # fmt: skip
     keys = {("", 1, 4096): "", ("", 1, 8192): "_8192", ("", 2, 8192): "_2gpu", ("mjlab", 1, 4096): "_mjlab"}
     return {f"train_env_steps_per_s{key}": rates.get(row) for row, key in keys.items()} | {"training": rows}
 
