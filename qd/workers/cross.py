@@ -307,19 +307,26 @@ def cross(
     *,
     robot: RobotCfg | str = "anymal",
     compute: Compute | None = None,
+    replicas: int,
+    space: str = "super_gaussian",
+    how: How = "searched",
+    reward: bool = False,
+    penalties_from_s: float = 0.0,
     cache: Path | None = None,
-    **crossing: Any,
 ) -> dict[str, RolloutResult]:
     """Lets each controller cross each terrain several times: one result a controller, by its name.
 
-    Arguments are those of :class:`Crossings`, and ``crossing`` those of :meth:`Crossings.cross` such as ``replicas``;
-    without ``compute`` the CPU crosses, by a process a core.
+    Arguments are those of :class:`Crossings` and :meth:`Crossings.cross`; without ``compute`` the CPU crosses, by a
+    process a core.
     """
     with Crossings(robot, compute or Compute(), cache=cache) as crossings:
         return {
-            name: crossings.cross(spec_of(policy, crossings.robot), terrains, seeds, label=name, **crossing)
+            name: crossings.cross(
+                spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how,
+                reward=reward, penalties_from_s=penalties_from_s, label=name,
+            )
             for name, policy in controllers.items()
-        }
+        }  # fmt: skip
 
 
 def _lot_size(cfg: EvaluatorCfg) -> int:
