@@ -52,6 +52,9 @@ def search(
     judging says of its elites if nothing was left to do.
     """
     robot = robot or get_robot(cfg.robot)
+    if unknown := set(cfg.fitness.penalties) - set(robot.penalties):
+        known = ", ".join(robot.penalties)
+        raise ValueError(f"fitness.penalties must be some of {robot.name}'s, {known}, got {', '.join(sorted(unknown))}")
     policy = policy or spec_of(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
     space, run = get_space(cfg.space, cfg.space_sha256), RunDirectory(path)

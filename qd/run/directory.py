@@ -215,13 +215,15 @@ class RunDirectory:
                 raise ValueError(f"{file} is lost: expected it beside {ARCHIVE_FILE}; {_REMEDY}")
             return None
         state = load_checkpoint(file)
-        metrics = state["metrics"]
-        self._check_settings(file, state["settings"], cfg)
+        settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
+        if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
+            raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {_REMEDY}")
+        self._check_settings(file, settings, cfg)
         if len(metrics) > cfg.iterations:
             raise ValueError(
                 f"iterations must be at least {len(metrics)}, as many as {self.path} has done, got {cfg.iterations}"
             )
-        return state["scheduler"], metrics
+        return scheduler, metrics
 
     @staticmethod
     def _check_settings(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:

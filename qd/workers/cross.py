@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,6 +204,8 @@ class Crossings:
         """
         if seeds.shape != (len(terrains),):
             raise ValueError(f"seeds must have shape ({len(terrains)},), one a terrain, got {seeds.shape}")
+        if replicas < 1 or how not in get_args(How):
+            raise ValueError(f"replicas must be 1 or more, how one of {get_args(How)}, got {replicas} and '{how}'")
         self._call += 1
         label = f"{self._call} of {self._calls}: {label}" if self._calls else label
         cfg = EvaluatorCfg(

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
+from qd.fitness import FitnessCfg
+from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from tests.builders import fresh_values
@@ -119,6 +121,13 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
         assert {name: (path / name).read_bytes() for name in os.listdir(path)} == before
 
     refused("iterations must be at least 3", iterations=2)
+    fitness = FitnessCfg(penalties=("yaw_rate", "wobble"), scales=(1.0, 1.0))
+    refused("fitness.penalties must be some of anymal's.*wobble", fitness=fitness)
+    state = load_checkpoint(path / "checkpoint.bin")
+    for name in state:
+        save_checkpoint(path / "checkpoint.bin", {key: value for key, value in state.items() if key != name})
+        before["checkpoint.bin"] = (path / "checkpoint.bin").read_bytes()
+        refused("must have settings, metrics and a scheduler", iterations=5)
     before["checkpoint.bin"] = (tmp_path / "other/checkpoint.bin").read_bytes()
     (path / "checkpoint.bin").write_bytes(before["checkpoint.bin"])  # one that strayed here
     refused(r"checkpoint\.bin.*seed", iterations=5)

@@ -142,6 +142,12 @@ def test_no_terrains_open_nothing_and_a_controller_whose_code_has_no_file_is_not
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("flaw", [{"replicas": 0}, {"how": "searchd"}])
+def test_settings_that_mean_nothing_are_refused(flaw):
+    with pytest.raises(ValueError, match="replicas must be 1 or more, how one of"):
+        cross({"a": "shipped"}, np.zeros((1, 64)), np.zeros(1, np.uint32), **{"replicas": 1} | flaw)
+
+
 def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
     def invalid(cfg, genes, seeds):
         result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
