@@ -101,8 +101,9 @@ class Archive(ControllerFlags, WorkerFlags):
             robot = made_ready(robot, self.policy, compute)
             space = space_at(space, self.height, robot)
             cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
-        elif self.run_dir:
-            raise ValueError("--resume goes on with a run as it is, got --run-dir too: leave it out")
+        elif self.run_dir or self.height is not None:
+            flag = "--run-dir" if self.run_dir else "--height"
+            raise ValueError(f"--resume goes on with a run as it is, got {flag} too: leave it out")
         else:
             run = find_search(self.resume, robot=self.robot, policy=self.policy, space=self.space)
             robot, policy, cfg = run.robot, run.policy, run.cfg
