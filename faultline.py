@@ -6,7 +6,6 @@ controller cross terrains; docs/searching.md shows them in twenty lines.
 
 import difflib
 import importlib
-import os
 import sys
 from typing import Any, NamedTuple
 
@@ -68,9 +67,6 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(API[name]), name)
 
 
-_DRAWN_BY = ("", "egl", "osmesa", "glfw", "glx", "1", "on", "true", "enable", "enabled", "0", "off", "false", "disable",
-             "disabled")  # fmt: skip
-"""What MuJoCo takes; with another MUJOCO_GL it cannot be imported."""
 _BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
@@ -98,9 +94,6 @@ def main(argv: list[str] | None = None) -> int:
         near = difflib.get_close_matches(name, _BY_NAME, n=1)
         meant = f"did you mean {near[0]}?" if near else "faultline --help lists them"
         say(("error:", "bold red"), f" there is no command '{name}': {meant}", error=True)
-        return 2
-    if (drawn_by := os.environ.get("MUJOCO_GL", "").strip().lower()) not in _DRAWN_BY:
-        say(("error:", "bold red"), f" MUJOCO_GL must be egl, osmesa or glfw, got '{drawn_by}': unset it", error=True)
         return 2
     module, _, cls = _BY_NAME[name].where.partition(":")
     return run_command(getattr(importlib.import_module(module), cls), rest, name=name)
