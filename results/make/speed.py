@@ -130,26 +130,17 @@ def remembering() -> Iterator[list[NDArray[np.float32]]]:
 
 
 def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]]) -> list[float]:
-    """Seconds of each iteration after the first two, of a search's crossings without the search."""
-    lots_under_way, at_once = cfg.scheduler.num_groups, cfg.scheduler.num_terrains
-    iterations = len(lots) // lots_under_way
-    seeds = np.concatenate([episode_seeds(cfg.seed, 1 + iteration, at_once) for iteration in range(iterations)])
-    behind = list(zip(lots, np.split(seeds, np.cumsum([len(lot) for lot in lots])[:-1]), strict=True))
-    ended = []
+    """Seconds of each iteration after the first two, of a search's crossings without the search; lots are equal."""
+    num_groups, num_terrains = cfg.scheduler.num_groups, cfg.scheduler.num_terrains
+    iterations = range(1, len(lots) // num_groups + 1)
+    seeds = np.concatenate([episode_seeds(cfg.seed, iteration, num_terrains) for iteration in iterations])
     evaluator = EvaluatorCfg(
-        robot=script.robot, policy=script.policy, num_terrains=at_once, num_replicas=cfg.replicas,
-        lots=lots_under_way, device=script.device, workers="1",
+        robot=script.robot, policy=script.policy, num_terrains=num_terrains, num_replicas=cfg.replicas,
+        lots=num_groups, device=script.device, workers="1",
     )  # fmt: skip
     with open_evaluator(evaluator) as pipeline:
-        for _ in range(lots_under_way):
-            pipeline.put(*behind.pop(0))
-        for _ in range(iterations):
-            for _ in range(lots_under_way):
-                pipeline.take()
-                if behind:
-                    pipeline.put(*behind.pop(0))
-            ended.append(time.perf_counter())
-    return np.diff(ended)[WARM_UP - 1 :].tolist()
+        lots_ended = [time.perf_counter() for _ in pipeline.in_lots(np.concatenate(lots), seeds, len(lots[0]))]
+    return np.diff(lots_ended[num_groups - 1 :: num_groups])[WARM_UP - 1 :].tolist()
 
 
 def time_curve(script: Script) -> dict[str, Any]:
