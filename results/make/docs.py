@@ -279,7 +279,7 @@ def speed() -> str:
         numbers, scale = (read(f"results/{robot}/{name}.json") for name in ("speed", "scale"))
         origins = [one for one in (*(numbers.get("measured") or {"": numbers}).values(), scale) if one.get("device")]
         named = {
-            key: ", ".join(dict.fromkeys(str(one[key])[: 28 if key == "device" else 12] for one in origins))
+            key: ", ".join(dict.fromkeys(str(one[key])[: 28 if key == "device" else 7] for one in origins))
             for key in ("device", "commit")
         }
         by_ray = "; ".join(f"{one['workers']}: {one['episodes_per_s']:,.0f}" for one in scale.get("rows", ()))
@@ -333,7 +333,7 @@ def kernels() -> str:
     columns: dict[str, Column] = {f"{words} [ms]": shown(key, ".4f") for words, key in (
         ("here", "ours_ms"), ("torch", "torch_ms"), ("`torch.compile`", "torch_compile_ms"))}  # fmt: skip
     columns |= {"of the ceiling": shown("ceiling_share", ".1%"), "bound by": lambda one: one["bound_by"]}
-    words = f"{numbers['num_envs']:,} robots, {numbers['device']}, commit {numbers['commit'][:12]}"
+    words = f"{numbers['num_envs']:,} robots, {numbers['device']}, commit {numbers['commit'][:7]}"
     return table(rows, columns).replace("|  |", f"| {words} |", 1)
 
 
