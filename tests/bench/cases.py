@@ -105,12 +105,18 @@ class Case:
         if ours.shape != theirs.shape:
             raise ValueError(f"{self.name}: torch gives shape {theirs.shape}, the kernel {ours.shape}")
         near = np.abs(ours - theirs) <= self.atol + self.rtol * np.abs(theirs)
-        differing = int((~near & ~(np.isnan(ours) & np.isnan(theirs))).sum())
+        differing = ~near & ~(np.isnan(ours) & np.isnan(theirs))
         present = int((~np.isnan(theirs)).sum())
         # Of few contacts, one may be undecided.
         allowed = max(self.undecided * present, ours.shape[-1]) if self.undecided else 0
-        if not present or differing > allowed:
-            raise ValueError(f"{self.name}: of {present} values of torch {differing} differ from the kernel's")
+        if not present or differing.sum() > allowed:
+            first = ", ".join(
+                f"{theirs[place]:.9g} and {ours[place]:.9g} at {place}"
+                for place in [tuple(index.tolist()) for index in np.argwhere(differing)[:3]]
+            )
+            raise ValueError(
+                f"{self.name}: of {present} values of torch {differing.sum()} differ from the kernel's: {first}"
+            )
 
 
 def _share_within_reach(genes: np.ndarray) -> float:
