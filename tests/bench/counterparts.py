@@ -43,19 +43,21 @@ def node_heights(heights: Tensor, terrain_of_env: Tensor, row: Tensor, col: Tens
     return heights[terrain, row.clamp(0, heights.shape[1] - 1), col.clamp(0, heights.shape[2] - 1)]
 
 
+_CORNERS = (0, 0), (0, 1), (1, 0), (1, 1)  # of a cell: row and column
+
+
 def surface(heights: Tensor, terrain_of_env: Tensor, spacing: float, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
     """Height [m] of the triangulated surface at points (E, N), and its slopes along x and y there."""
     u, v = x / spacing, y / spacing
     col, row = u.floor(), v.floor()
     fx, fy = u - col, v - row
-    low, row, col = fx + fy < 1.0, row.long(), col.long()
-    h10 = node_heights(heights, terrain_of_env, row, col + 1)
-    h01 = node_heights(heights, terrain_of_env, row + 1, col)
-    corner = (~low).long()
-    h = node_heights(heights, terrain_of_env, row + corner, col + corner)  # the triangle's right angle
-    rise_x = torch.where(low, h10 - h, h - h01)
-    rise_y = torch.where(low, h01 - h, h - h10)
-    return h + rise_x * (fx - corner) + rise_y * (fy - corner), rise_x / spacing, rise_y / spacing
+    row, col = row.long(), col.long()
+    h00, h10, h01, h11 = (node_heights(heights, terrain_of_env, row + i, col + j) for i, j in _CORNERS)
+    low_x, low_y, high_x, high_y = h10 - h00, h01 - h00, h11 - h01, h11 - h10
+    # Of both triangles, since a compiler that asks twice which it is may round otherwise the second time.
+    low = fx + fy < 1.0
+    height = torch.where(low, h00 + low_x * fx + low_y * fy, h11 + high_x * (fx - 1.0) + high_y * (fy - 1.0))
+    return height, torch.where(low, low_x, high_x) / spacing, torch.where(low, low_y, high_y) / spacing
 
 
 def scan(
