@@ -45,6 +45,6 @@ if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, a
   "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min
-FAULTLINE_DEVICE=cuda:0 "$python" -m pytest -q -m gpu --record results/bench/gpu-tests.json # 4 min
+FAULTLINE_DEVICE=cuda:0 "$python" -m pytest -q -m gpu --record=results/bench/gpu-tests.json # 4 min
 "$python" -m results.make.pictures                                    # some minutes, a browser
 "$python" -m results.make.docs

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import distributed
 
 from results.make import peer
 from results.make.common import Script, parse
@@ -40,8 +39,6 @@ def time_training(script: Script, device: str, num_envs: int, steps: int, iterat
     shipped = torch.load(script.policy, map_location="cpu", weights_only=True)["actor_state_dict"]
     learner.alg.get_policy().load_state_dict(shipped)
     timed = [learner.iterate() for _ in range(WARM_UP + iterations)][WARM_UP:]
-    if learner.ranks.size > 1:
-        distributed.destroy_process_group()  # the next learner makes one of its own
     seconds = statistics.median(step.collection_s + step.learning_s for step in timed)
     return {
         "gpus": learner.ranks.size,
@@ -69,6 +66,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     script = parse(__doc__, argv, "train_speed.json")
     ranks = Ranks.of_environment()
     sizes, iterations = (((8, 24), (16, 24)), 1) if script.small else (SIZES, 40)
+    if ranks.size > 1:  # several processes make one training alone
+        sizes = sizes[-1:]
     device = ranks.device(script.device)
     rows = [time_training(script, device, *size, iterations) for size in sizes]
     if ranks.size == 1 and (folder := os.environ.get("MJLAB")):
