@@ -144,11 +144,6 @@ class Archive(Evaluation):
         return float(self.fitness.mean()) if len(self) else 0.0
 
     @property
-    def collided(self) -> NDArray[np.bool_]:
-        """Whether any of the episodes that found an elite had a base collision, as the paper counts, shape (N,)."""
-        return self.collision_rate > 0.0
-
-    @property
     def counts(self) -> FaultCounts:
         """``faults``, or counts of 0 where nobody has crossed the elites under other conditions."""
         none, nobody = np.zeros((len(self), 4), np.int64), np.zeros((len(self), 0, 4), np.int64)

@@ -43,6 +43,9 @@ class Archive(ControllerFlags, WorkerFlags):
     """Size of the search: wide (the default on a GPU), paper (the paper's), or small (the default on the CPU)."""
     iterations: PositiveInt = 20
     """Iterations to reach; with --resume, more than before extend a finished run."""
+    until: Annotated[float, Meta(gt=0, lt=1)] | None = None
+    """Ends the search before, once its last tenth brought less than this share of the elites that can be expected to
+    stay in their cells, such as 0.03."""
     seed: int = 0
     """Seed of everything drawn."""
     resume: Path | None = None
@@ -122,7 +125,7 @@ class Archive(ControllerFlags, WorkerFlags):
             scheduler=scheduler,
         )
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
-        archive = search(cfg, path, compute, robot=robot, policy=policy)
+        archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         if cfg.preset != "small":
             archive = judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
         say_what_stops_the_robot(path, archive, robot=self.robot, policy=self.policy, space=self.space)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 
 FITNESS_FLOOR = -20.0
 """Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
+BIT_EPISODES = 20
+"""Episodes over which the collision bit is "any collision", as in the paper; more episodes would bias it."""
+USUAL_SPREAD = 0.4
+"""Standard deviation of a penalty over its mean, where nothing else is known."""
 FAILING_GOAL_RATE = 0.5
 """A controller fails a terrain on which it reaches the goal less often."""
 
@@ -79,6 +83,23 @@ class Evaluation:
         return self.episodes - self.invalid_episodes
 
     @property
+    def spread(self) -> NDArray[np.float64]:
+        """Standard deviations as many episodes would show them, shape (T, P): a few show too little.
+
+        One episode of the usual spread is added.
+        """
+        few = (USUAL_SPREAD * self.penalty_mean) ** 2 / np.maximum(self.counted, 1)[:, None]
+        return np.sqrt(self.penalty_std**2 + few)
+
+    @property
+    def collides(self) -> NDArray[np.bool_]:
+        """The collision bit, shape (T,): whether 20 episodes sooner have a base collision than not.
+
+        Of up to 29 episodes that were crossed, it is whether any has one.
+        """
+        return self.collision_rate > 1.0 - 0.5 ** (1.0 / BIT_EPISODES)
+
+    @property
     def valid(self) -> NDArray[np.bool_]:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
@@ -88,6 +109,11 @@ def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
     names = [field.name for field in fields(Evaluation)]
     return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
+
+
+def rows_of(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
+    """Some rows of an evaluation, copied."""
+    return Evaluation(**{name: np.array(values[rows]) for name, values in vars(terrains).items()})
 
 
 def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Evaluation:
@@ -101,23 +127,59 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
     counted = counted_episodes(invalid)
     mean = _mean(penalties, counted)
-    std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted))
-    collision_rate = _rate(result.base_collision, counted)
-    ratios = terrain_ratios(penalties, counted)
-    inconsistency = np.where(collision_rate > 0.0, 1.0 - collision_rate, 0.0)
-    fitness = mean.sum(axis=1) - cfg.alpha * std.sum(axis=1) - cfg.lam * inconsistency
-    return Evaluation(
-        fitness=np.where(counted.any(axis=1), fitness, FITNESS_FLOOR),
-        ratios=ratios,
-        cell=cells.cell_of(ratios, collision_rate > 0.0),
+    return _with_fitness(
+        cells,
+        cfg,
+        ratios=terrain_ratios(penalties, counted),
         penalty_mean=mean,
-        penalty_std=std,
-        collision_rate=collision_rate,
+        penalty_std=np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted)),
+        collision_rate=_rate(result.base_collision, counted),
         goal_rate=_rate(result.reached_goal, counted),
         fallen_rate=_rate(result.fallen, counted),
         end_position=typical_ends(result, counted),
         invalid_episodes=invalid.sum(axis=1),
         episodes=np.full(len(invalid), invalid.shape[1]),
+    )
+
+
+def merged(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
+    """The evaluation by all episodes of two evaluations of the same terrains; ends are the second's, if it has any."""
+    counts = [part.counted * part.valid for part in (first, second)]  # an invalid one has no statistics
+    share = counts[1] / np.maximum(counts[0] + counts[1], 1)
+
+    def mean_of(values: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+        shares = share if values.ndim == 1 else share[:, None]
+        return (1.0 - shares) * values + shares * others
+
+    def mean(name: str) -> NDArray[np.float64]:
+        return mean_of(getattr(first, name), getattr(second, name))
+
+    apart = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
+    ended = np.isfinite(second.end_position)
+    return _with_fitness(
+        cells,
+        cfg,
+        ratios=mean("ratios"),
+        penalty_mean=mean("penalty_mean"),
+        penalty_std=np.sqrt(mean_of(first.penalty_std**2, second.penalty_std**2) + apart),
+        collision_rate=mean("collision_rate"),
+        goal_rate=mean("goal_rate"),
+        fallen_rate=mean("fallen_rate"),
+        end_position=np.where(ended, second.end_position, first.end_position),
+        invalid_episodes=first.invalid_episodes + second.invalid_episodes,
+        episodes=first.episodes + second.episodes,
+    )
+
+
+def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> Evaluation:
+    """Adds what follows from the statistics, fitness and cell."""
+    some = Evaluation(fitness=np.zeros(0), cell=np.zeros(0, np.int64), **statistics)
+    inconsistency = np.where(some.collision_rate > 0.0, 1.0 - some.collision_rate, 0.0)
+    fitness = some.penalty_mean.sum(axis=1) - cfg.alpha * some.penalty_std.sum(axis=1) - cfg.lam * inconsistency
+    return replace(
+        some,
+        fitness=np.where(some.valid, fitness, FITNESS_FLOOR),
+        cell=cells.cell_of(some.ratios, some.collides),
     )
 
 
@@ -128,12 +190,14 @@ def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray
     the other ways, which are a base collision, the end of the time, and leaving the terrain. ``counted`` says which
     episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
-    ends = np.full((len(counted), 2), np.nan, np.float32)
-    for row in np.flatnonzero(counted.any(axis=1)).tolist():
-        outcome = result.outcome[row]
-        alike = counted[row] & (outcome == typical_outcome(outcome[counted[row]]))
-        ends[row] = np.median(result.final_position[row, alike, :2], axis=0)
-    return ends
+    from kernels.episode import Outcome  # which imports Warp: not for `--help`
+
+    outcome = np.where(counted, result.outcome, Outcome.INVALID)
+    alike = counted & (outcome == typical_outcome(outcome)[:, None])
+    places = np.sort(np.where(alike[..., None], result.final_position[..., :2], np.inf), axis=1)
+    count, rows = alike.sum(axis=1), np.arange(len(alike))
+    ends = (places[rows, np.maximum(count - 1, 0) // 2] + places[rows, count // 2]) / 2
+    return np.where(count[:, None] > 0, ends, np.nan).astype(np.float32)
 
 
 def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from qd.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
-from qd.fitness import FAILING_GOAL_RATE, FitnessCfg, evaluation_of
+from qd.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, check_config, check_space, claimed
 from qd.run.settings import SearchCfg, as_settings, find_policy, is_searched
@@ -39,7 +39,6 @@ CROSSINGS_FOLDER = "crossings"
 CERTIFIERS_FOLDER = "certifiers"
 """Folder of a run that holds its own certifiers, such as its specialist, ``<name>.pt``."""
 
-_BIT_EPISODES = 20  # the collision bit is "any collision", which more episodes than the search's would bias
 FRESH_STREAM = 1
 """Of the seeds of fresh episodes."""
 _CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM = 5, 6, 7
@@ -59,7 +58,7 @@ def fresh_values(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -
     """What 40 fresh episodes on every elite of an archive say, which are drawn apart from the search's own."""
     cells = archive.cells
     fresh = evaluation_of(result, cells, fitness)
-    collided = (result.base_collision & ~result.invalid)[:, :_BIT_EPISODES].any(axis=1)
+    collided = (result.base_collision & ~result.invalid)[:, :BIT_EPISODES].any(axis=1)
     cell = cells.cell_of(fresh.ratios, collided)
     reproduced = fresh.valid & cells.are_neighbours(archive.cell, cell)
     return FreshValues(**{**vars(fresh), "cell": cell}, reproduced=reproduced)

@@ -7,7 +7,7 @@ clipped genes as data.
 
 from collections.abc import Iterator
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,8 @@ from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter, IsoLineEmitter
 
 from qd.descriptors import Cells
-from qd.fitness import FITNESS_FLOOR, Evaluation
+from qd.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, rows_of
+from qd.pool import Pool
 from qd.run.presets import SchedulerCfg
 from qd.surrogate import Surrogate
 from sim.spaces.base import TerrainSpace, clipped
@@ -49,6 +50,20 @@ class SurrogateEmitter:
         self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
 
 
+class Asked(NamedTuple):
+    """Terrains that robots are to cross."""
+
+    solutions: NDArray[np.float32]
+    """Unclipped genes, shape (T, num_genes)."""
+    number: NDArray[np.int64]
+    """Numbers of those that are crossed again (:class:`qd.pool.Pool`); -1 of new ones, shape (T,)."""
+
+    @property
+    def new(self) -> NDArray[np.float32]:
+        """Unclipped genes of the new ones."""
+        return self.solutions[self.number < 0]
+
+
 Emitter = EvolutionStrategyEmitter | IsoLineEmitter | RandomEmitter | SurrogateEmitter
 
 
@@ -57,10 +72,13 @@ class Scheduler:
 
     ``result`` keeps the best terrain ever found in each cell and is what a search is run for. ``archive`` is what
     CMA-MAE's emitters are judged by: their own, with thresholds that lag behind. All others go by ``result``, and where
-    there are none of CMA-MAE's, ``archive`` is ``result``.
+    there are none of CMA-MAE's, ``archive`` is ``result``. Where terrains are crossed again, ``result`` has those that
+    hold the cells of ``pool``.
     """
 
-    def __init__(self, cfg: SchedulerCfg, *, cells: Cells, seed: int, space: TerrainSpace = SUPER_GAUSSIAN) -> None:
+    def __init__(
+        self, cfg: SchedulerCfg, *, cells: Cells, fitness: FitnessCfg, seed: int, space: TerrainSpace = SUPER_GAUSSIAN
+    ) -> None:
         *streams, surrogate_stream = np.random.SeedSequence(seed).spawn(cfg.emitters + 3)
         methods = list(zip(cycle(cfg.methods), streams[2:], strict=False))
         names = {method for method, _ in methods}
@@ -73,7 +91,8 @@ class Scheduler:
             )
         self.surrogate = Surrogate(cfg, cells, space, surrogate_stream) if "surrogate" in names else None
         self.emitters: list[Emitter] = [self._make_emitter(cfg, method, space, stream) for method, stream in methods]
-        self._asked: list[NDArray[np.float32] | None] = [None] * cfg.num_groups
+        self.again, self.pool = cfg.again, Pool(space.num_genes, cells, fitness) if cfg.again else None
+        self._asked: list[Asked | None] = [None] * cfg.num_groups
 
     def _make_emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
@@ -111,59 +130,70 @@ class Scheduler:
 
     def places(self, group: int) -> slice:
         """Places of a group's terrains among those of an iteration."""
-        emitters, batch_size = self._emitters_of(group), int(self.emitters[0].batch_size)
-        return slice(emitters.start * batch_size, emitters.stop * batch_size)
+        emitters, each = self._emitters_of(group), int(self.emitters[0].batch_size) + self.again
+        return slice(emitters.start * each, emitters.stop * each)
 
-    def ask(self, group: int = 0) -> NDArray[np.float32]:
+    def ask(self, group: int = 0, *, new: bool = True) -> NDArray[np.float32]:
         """The next terrains of a group of emitters; the same ones until the group is told their results.
 
-        Clipped genes, shape (emitters of the group * batch_size, num_genes).
+        Behind the emitters' come those that are crossed again, as soon as there are any. Without ``new`` ones all are
+        crossed again. Clipped genes, shape (at most emitters of the group * (batch_size + again), num_genes).
         """
         asked = self._asked[group]
         if asked is None:
-            emitters = self.emitters[self._emitters_of(group)]
+            emitters = self.emitters[self._emitters_of(group)] if new or not self.pool else []
             proposals = self._propose([emitter for emitter in emitters if isinstance(emitter, SurrogateEmitter)])
-            asked = self._asked[group] = np.concatenate(
-                [next(proposals) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters]
-            )
-        return clipped(asked)
+            solutions = [
+                next(proposals) if isinstance(emitter, SurrogateEmitter) else emitter.ask() for emitter in emitters
+            ]
+            number = np.full(sum(map(len, solutions)), -1)
+            if self.pool is not None:
+                places = self.places(group)
+                again = self.pool.least_known(places.stop - places.start - len(number), self._under_way())
+                solutions.append(self.pool.solutions_of(again))
+                number = np.append(number, again)
+            asked = self._asked[group] = Asked(np.concatenate(solutions), number)
+        return clipped(asked.solutions)
+
+    def _under_way(self) -> NDArray[np.int64]:
+        """Numbers of the terrains that robots are to cross again already."""
+        numbers = [asked.number[asked.number >= 0] for asked in self._asked if asked]
+        return np.concatenate([np.zeros(0, np.int64), *numbers])
 
     def _propose(self, emitters: list[SurrogateEmitter]) -> Iterator[NDArray[np.float32]]:
         """What the surrogate proposes for some emitters: one search for all, so that no two ask for the same."""
         if self.surrogate is None or not emitters:
             return iter(())
         data: Any = self.result.data()
-        under_way = [clipped(genes) for genes in self._asked if genes is not None]
+        under_way = [clipped(asked.new) for asked in self._asked if asked]
         sizes = [emitter.batch_size for emitter in emitters]
         genes = self.surrogate.propose(
             sum(sizes), data["genes"], data["index"], data["objective"], np.concatenate([data["genes"][:0], *under_way])
         )
         return iter(np.split(genes, np.cumsum(sizes)[:-1]))
 
-    def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> None:
+    def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> int:
         """Tells a group of emitters what became of the terrains that it last asked for, one row each in that order.
 
-        Iterations are numbered from 1.
+        Iterations are numbered from 1. Returns how many of the terrains were new.
         """
         asked = self._asked[group]
         assert asked is not None
-        columns = {name: getattr(evaluation, name) for name in _FIELDS if name not in ("genes", "iteration")}
-        rows = columns | {
-            "solution": asked,
-            "objective": evaluation.fitness,
-            "measures": evaluation.cell[:, None] + 0.5,
-            "genes": clipped(asked),
-            "iteration": np.full(len(asked), iteration),
-        }
         self._asked[group] = None
+        if self.pool is not None:
+            evaluation = self.pool.tell(*asked, evaluation, iteration)
         if self.surrogate is not None:
-            self.surrogate.learn(asked, evaluation)
+            self.surrogate.learn(asked.solutions, evaluation)
+        rows = _rows_of(asked.solutions, evaluation, iteration)
         added_to_result = self._add_to_result(rows, evaluation.valid & (evaluation.fitness > FITNESS_FLOOR))
         added = added_to_result if self.archive is self.result else self.archive.add(**rows)
-        if self.archive.empty:
-            return  # nothing valid yet: an emitter that restarts now would have no elite to start from
+        if self.pool is not None:
+            self._make_result(self.pool)
+        emitters = self.emitters[self._emitters_of(group)]
+        if self.archive.empty or not len(asked.new):
+            emitters = []  # without a valid terrain yet, one that restarts now would have no elite to start from
         first = 0
-        for emitter in self.emitters[self._emitters_of(group)]:
+        for emitter in emitters:
             batch = slice(first, first + int(emitter.batch_size))
             first = batch.stop
             if isinstance(emitter, EvolutionStrategyEmitter):  # no other learns by itself
@@ -172,6 +202,15 @@ class Scheduler:
                     **{name: values[batch] for name, values in rows.items()},
                     add_info={name: values[batch] for name, values in add_info.items()},
                 )
+        return len(asked.new)
+
+    def _make_result(self, pool: Pool) -> None:
+        """Makes ``result`` anew, of the terrains that hold the cells."""
+        rows = pool.settle(self._under_way())
+        self.result.clear()
+        if len(rows):
+            assert pool.terrains is not None
+            self.result.add(**_rows_of(pool.solutions[rows], rows_of(pool.terrains, rows), pool.iteration[rows]))
 
     def _add_to_result(self, rows: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
         """Fills ``result``; status and value of each terrain as pyribs gives them to its emitters."""
@@ -193,6 +232,20 @@ _RATES = ("collision_rate", "goal_rate", "fallen_rate")
 _COUNTS = ("invalid_episodes", "episodes", "iteration")
 _BY_RATIO = ("ratios", "penalty_mean", "penalty_std")
 _FIELDS = ("genes", *_BY_RATIO, *_RATES, *_COUNTS, "end_position")
+
+
+def _rows_of(
+    solutions: NDArray[np.float32], terrains: Evaluation, iteration: NDArray[np.int64] | int
+) -> dict[str, NDArray[Any]]:
+    """Terrains as a pyribs archive takes them, of unclipped genes (T, num_genes), with when each was found."""
+    columns = {name: getattr(terrains, name) for name in _FIELDS if name not in ("genes", "iteration")}
+    return columns | {
+        "solution": solutions,
+        "objective": terrains.fitness,
+        "measures": terrains.cell[:, None] + 0.5,
+        "genes": clipped(solutions),
+        "iteration": np.broadcast_to(iteration, len(solutions)),
+    }
 
 
 def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:

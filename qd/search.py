@@ -12,6 +12,7 @@ from qd.faults import fault_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.groups import rank, summary_of
 from qd.minima import read_minimal
+from qd.pool import chance_to_stay
 from qd.run.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.run.progress import Bar, clock, describe_iteration, describe_search
 from qd.run.settings import SearchCfg
@@ -44,11 +45,13 @@ def search(
     *,
     robot: RobotCfg | None = None,
     policy: str | None = None,
+    until: float | None = None,
 ) -> Archive:
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
-    Nothing is written before the simulation stands; whatever stops a search, all iterations that ended are saved. A
-    robot that is not shipped is given, and a controller that lies elsewhere than ``cfg`` says. The archive has what
+    It ends before if its last tenth brought a share of the elites below ``until`` (:func:`last_tenth`). Nothing is
+    written before the simulation stands; whatever stops a search, all iterations that ended are saved. A robot that is
+    not shipped is given, and a controller that lies elsewhere than ``cfg`` says. The archive has what
     judging says of its elites if nothing was left to do.
     """
     robot = robot or get_robot(cfg.robot)
@@ -70,7 +73,8 @@ def search(
     with claimed(path):
         saved = run.load(cfg)
         if saved is None:
-            scheduler, metrics = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, seed=cfg.seed), []
+            scheduler = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed)
+            metrics = []
         else:
             scheduler, metrics = saved
         if scheduler.surrogate is not None:
@@ -79,13 +83,13 @@ def search(
         say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
         if note := scaled_by_another(robot, policy):
             print(note)
-        if done < cfg.iterations:
+        if done < cfg.iterations and not (until and last_tenth(archive_of(cfg, scheduler, done), metrics) < until):
             try:
                 with compute.open(evaluator) as pipeline:
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
                     begun = f"iteration {done + 1}/{cfg.iterations}: compiling and evaluating"
                     with Bar(begun, cfg.iterations, done) as bar:
-                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar)
+                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
@@ -107,8 +111,9 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str) -> 
 
 
 def _run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar
-) -> None:
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar,
+    until: float | None,
+) -> None:  # fmt: skip
     """Runs the iterations that are left, and saves each.
 
     A group of emitters that was told asks again at once, and its next terrains wait in the queue while those of the
@@ -116,29 +121,36 @@ def _run_iterations(
     that goes on where it was stopped is the same as one that was not.
     """
     num_groups = cfg.scheduler.num_groups
+
+    def put(genes: NDArray[np.float32], iteration: int, group: int) -> None:
+        """Its seeds are those of the group's places in the iteration."""
+        seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
+        pipeline.put(genes, seeds[: len(genes)])
+
     pipeline.clear()
     num_under_way, began = 0, time.perf_counter()
-    for iteration in range(len(metrics) + 1, cfg.iterations + 1):
+    last, settling = cfg.iterations, cfg.scheduler.settling
+    while (iteration := len(metrics) + 1) <= last:
         for group in range(num_under_way, num_groups):
-            pipeline.put(scheduler.ask(group), _group_seeds(cfg, scheduler, iteration, group))
-        goes_ahead = iteration < cfg.iterations
-        results, evaluations, search_s = [], [], 0.0
+            put(scheduler.ask(group, new=iteration <= last - settling), iteration, group)
+        goes_ahead = iteration < last
+        results, evaluations, search_s, num_new = [], [], 0.0, 0
         for group in range(num_groups):
             result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
             refuse_all_invalid(result)
             evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
             emitters_began = time.perf_counter()
-            scheduler.tell(evaluation, iteration, group)
-            genes = scheduler.ask(group)
+            num_new += scheduler.tell(evaluation, iteration, group)
+            genes = scheduler.ask(group, new=iteration < last - settling)
             search_s += time.perf_counter() - emitters_began
             if goes_ahead:
-                pipeline.put(genes, _group_seeds(cfg, scheduler, iteration + 1, group))
+                put(genes, iteration + 1, group)
             results.append(result)
             evaluations.append(evaluation)
         num_under_way = num_groups if goes_ahead else 0
         archive = archive_of(cfg, scheduler, iteration)
         row = _metrics_row(archive, join_results(results, join=1), join_evaluations(evaluations), iteration)
-        row["search_s"] = search_s
+        row |= {"search_s": search_s, "terrains": num_new}
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
         row |= {"wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
@@ -147,12 +159,22 @@ def _run_iterations(
         began = ended
         metrics.append(row)
         run.save(cfg, scheduler, metrics, archive)
-        bar.move_to(iteration, describe_iteration(row, cfg.iterations, status))
+        bar.move_to(iteration, describe_iteration(row, last, status))
+        if until and last == cfg.iterations and last_tenth(archive, metrics) < until:
+            last = min(last, iteration + 1 + settling)  # what was asked for is still crossed
 
 
-def _group_seeds(cfg: SearchCfg, scheduler: Scheduler, iteration: int, group: int) -> NDArray[np.uint32]:
-    """Seeds of a group's terrains, which are those of their places in the iteration."""
-    return episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
+def last_tenth(archive: Archive, metrics: Metrics) -> float:
+    """Share of the elites to stay that were found in the last tenth of the iterations which crossed anything new.
+
+    Elites count by their chance to stay in their cells (:func:`qd.pool.chance_to_stay`).
+    """
+    exploring = [row["iteration"] for row in metrics if row["terrains"]]
+    chance = chance_to_stay(archive, archive.cells)
+    if not exploring or not len(archive):
+        return 1.0
+    found_late = archive.iteration >= exploring[-max(1, len(exploring) // 10)]
+    return float(chance[found_late].sum() / chance.sum())
 
 
 def _metrics_row(archive: Archive, result: RolloutResult, evaluation: Evaluation, iteration: int) -> dict[str, Any]:
@@ -161,7 +183,7 @@ def _metrics_row(archive: Archive, result: RolloutResult, evaluation: Evaluation
         "iteration": iteration,
         "elites": len(archive),
         **{name: getattr(archive, name) for name in ("reachable_coverage", "qd_score", "mean_fitness")},
-        "terrains": len(evaluation.fitness),
+        "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
         "episodes": int(evaluation.episodes.sum()),
         "invalid_episodes": int(evaluation.invalid_episodes.sum()),
         "invalid_terrains": int((~evaluation.valid).sum()),
@@ -229,7 +251,7 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
     origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)
     figures = write_figures(run.path, archive, metrics)
-    with_collision = int(archive.collided.sum())
+    with_collision = int(archive.collides.sum())
     numbers = {
         **origin,
         **archive.named(),
@@ -257,6 +279,7 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
         f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
         f"in {clock(numbers['wall_s'])}"
     )
+    print(f"Its last tenth brought {last_tenth(archive, metrics):.0%} of the elites that can be expected to stay.")
     print(f"Figures: {', '.join(map(str, figures))}")
     if invalid := invalid_iterations(metrics):
         print(f"Warning: {invalid}")

@@ -26,14 +26,14 @@ BATCH = 64
 """Terrains of a step of training, for each network, or as many as an iteration has if those are fewer."""
 FEWEST = 64
 """Valid terrains that must be known before the networks are asked."""
-MOST = 50_000
+MOST = 200_000
 """Terrains that are learned from, the newest ones."""
 _AT_ONCE = {"cpu": 1024, "cuda": 8192}  # terrains that are judged at once
 _GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
-_NUM_RATES = 3  # goal rate, collision rate, whether any robot collided
+_NUM_RATES = 3  # goal rate, collision rate, collision bit
 
 
 class Prediction(NamedTuple):
@@ -45,7 +45,7 @@ class Prediction(NamedTuple):
     """Logarithms of the penalties' means and standard deviations, and the fitness' area hyperbolic sine, shape
     (MEMBERS, N, 2 P + 1)."""
     rates: Tensor
-    """Logits of goal rate, collision rate, and whether any robot has a base collision, shape (MEMBERS, N, 3)."""
+    """Logits of goal rate, collision rate and collision bit, shape (MEMBERS, N, 3)."""
 
     @property
     def fitness(self) -> Tensor:
@@ -54,7 +54,7 @@ class Prediction(NamedTuple):
 
     @property
     def collided(self) -> Tensor:
-        """Whether at least one robot has a base collision, shape (MEMBERS, N)."""
+        """The collision bit, shape (MEMBERS, N)."""
         return self.rates[..., 2] > 0.0
 
 
@@ -322,11 +322,11 @@ def _targets_of(evaluation: Evaluation) -> NDArray[np.float32]:
     columns = (
         evaluation.ratios,
         np.log(evaluation.penalty_mean + _LEAST_PENALTY),
-        np.log(evaluation.penalty_std + _LEAST_PENALTY),
+        np.log(evaluation.spread + _LEAST_PENALTY),
         np.arcsinh(evaluation.fitness)[:, None],
         evaluation.goal_rate[:, None],
         evaluation.collision_rate[:, None],
-        (evaluation.collision_rate > 0.0)[:, None],
+        evaluation.collides[:, None],
     )
     return np.concatenate(columns, axis=1).astype(np.float32)
 

@@ -19,12 +19,15 @@ def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.flo
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def typical_outcome(outcome: NDArray[np.integer]) -> int:
-    """How most valid episodes end, shape (E,); where under half reach the goal, how most of the others end."""
+def typical_outcome(outcome: NDArray[np.integer]) -> NDArray[np.int64]:
+    """How most valid episodes of (..., num_episodes) end; where under half reach the goal, how most of the others end.
+
+    Shape (...); ``INVALID`` where no episode is valid.
+    """
     from kernels.episode import Outcome  # which imports Warp: not for `--help`
 
-    counts = np.bincount(outcome, minlength=max(Outcome) + 1)
-    if valid := len(outcome) - counts[Outcome.INVALID]:
-        counts[Outcome.INVALID] = 0
-        counts[Outcome.GOAL] *= 2 * counts[Outcome.GOAL] >= valid
-    return int(counts.argmax())
+    counts = (outcome[..., None] == np.arange(max(Outcome) + 1)).sum(axis=-2)
+    valid = outcome.shape[-1] - counts[..., Outcome.INVALID]
+    counts[..., Outcome.INVALID] *= valid == 0
+    counts[..., Outcome.GOAL] *= 2 * counts[..., Outcome.GOAL] >= valid
+    return counts.argmax(axis=-1)

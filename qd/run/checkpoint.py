@@ -13,7 +13,7 @@ from typing import Any
 
 from sim.files.atomic import write_atomically
 
-_MAGIC = b"faultline search checkpoint 2\n"
+_MAGIC = b"faultline search checkpoint 3\n"
 _HASH_BYTES = 32
 _REMEDY = "put a copy of it back, or start a new run"
 
@@ -31,7 +31,10 @@ _ADMITTED = {
     "ribs.emitters._iso_line_emitter": ("IsoLineEmitter",),
     "ribs.emitters.opt._cma_es": ("CMAEvolutionStrategy", "DecompMatrix"),
     "ribs.emitters.rankers": ("ImprovementRanker", "TwoStageImprovementRanker"),
-    "qd.scheduler": ("RandomEmitter", "Scheduler", "SurrogateEmitter"),
+    "qd.descriptors": ("Cells",),
+    "qd.fitness": ("Evaluation", "FitnessCfg"),
+    "qd.pool": ("Pool",),
+    "qd.scheduler": ("Asked", "RandomEmitter", "Scheduler", "SurrogateEmitter"),
     "qd.surrogate": ("Surrogate",),
 }
 """Classes that a state may hold, by their modules."""

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from sim.files.settings import PositiveInt, Share, check
+from sim.files.settings import NonNegativeInt, PositiveInt, Share, check
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
 Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
@@ -28,6 +28,12 @@ class SchedulerCfg:
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: Annotated[int, Meta(ge=2)] = 20
     """Terrains an emitter asks for in an iteration."""
+    again: NonNegativeInt = 0
+    """Terrains that are crossed again beside those of an emitter, the least known ones. All episodes of a terrain then
+    count, and it holds its cell by what it is expected to add to the QD score of fresh ones. With 0 a terrain is
+    crossed once, and the fittest of a cell holds it, as in the paper."""
+    settling: NonNegativeInt = 0
+    """Last iterations of a search that cross nothing new, if terrains are crossed again at all."""
     groups: Annotated[int, Meta(ge=1, le=32)] = 1
     """Groups of emitters that ask and are told in turn, in a fixed order, at most one an emitter: robots have the
     terrains of the others to cross while the last robots of a group's terrains still walk."""
@@ -80,7 +86,7 @@ class SchedulerCfg:
     @property
     def num_terrains(self) -> int:
         """Terrains of one iteration."""
-        return self.emitters * self.batch_size
+        return self.emitters * (self.batch_size + self.again)
 
 
 PRESETS: dict[str, dict[str, Any]] = {

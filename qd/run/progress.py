@@ -92,7 +92,8 @@ def describe_iteration(row: dict[str, Any], iterations: int, workers: object = N
     invalid = row["invalid_episodes"] / row["episodes"]
     why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
     return (
-        f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites, "
+        f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites "
+        f"({row['expected_same_cell']:,.0f} to stay), "
         + (f"{invalid:.0%} invalid ({why}), " if why else "")
         + f"{row['episodes_per_s']:.0f} episodes/s"
         + (f" by {workers}" if workers else "")

@@ -126,7 +126,7 @@ _NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}  # of robots, as their maker
 def title_of(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
     who = _NAMES.get(recording.robot, recording.robot) + (f" with {controller}" if controller else "")
-    outcome, most = recording.outcome[0], typical_outcome(recording.outcome[0])
+    outcome, most = recording.outcome[0], int(typical_outcome(recording.outcome[0]))
     valid, ended, fallen = outcome != Outcome.INVALID, outcome == most, recording.fallen[0]
     if not valid.any():
         return f"{who}, {recording.labels[0]}: no valid episode"

@@ -38,9 +38,9 @@ CFG = SearchCfg(
 )
 
 
-def run(path: Path, *, opener=open_stand_in, **changes) -> Archive:
+def run(path: Path, *, opener=open_stand_in, until=None, **changes) -> Archive:
     """A search, begun or gone on with, whose settings differ from CFG's by some."""
-    return search(dataclasses.replace(CFG, **changes), path, compute_by(opener))
+    return search(dataclasses.replace(CFG, **changes), path, compute_by(opener), until=until)
 
 
 def without_figures(patch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.descriptors import Cells
-from qd.fitness import FitnessCfg, evaluation_of
+from qd.fitness import FitnessCfg, evaluation_of, merged
 from tests.qd.stand_in import make_result
 
 CFG = FitnessCfg(penalties=("yaw_rate", "vel_x"), scales=(1.0, 10.0), alpha=0.5, lam=4.0)
@@ -70,6 +70,51 @@ def test_collision_bit_needs_one_collision_in_a_valid_episode():
     collides = [[True, False, False, False], [False, False, True, False]]
     result = make_result([[[1, 10]] * 4] * 2, base_collision=collides, invalid=invalid)
     assert (evaluation_of(result, cells, CFG).cell >= len(cells.tuples)).tolist() == [False, True]
+
+
+def test_evaluations_merge_to_that_of_all_episodes():
+    rng, cells = np.random.default_rng(0), Cells(2, collision_bit=True)
+    penalties = rng.uniform(1.0, 9.0, (5, 12, 2))
+    invalid, collides = rng.random((5, 12)) < 0.06, rng.random((5, 12)) < 0.04
+    invalid[:, 10:] = False
+
+    def of(episodes: slice):
+        some = [values[:, episodes] for values in (penalties, collides, invalid)]
+        return evaluation_of(make_result(some[0], base_collision=some[1], invalid=some[2]), cells, CFG)
+
+    whole, joined = of(slice(0, 12)), merged(of(slice(0, 10)), of(slice(10, 12)), cells, CFG)
+    assert whole.valid.all() and whole.invalid_episodes.any() and (whole.collision_rate > 0.0).any()
+    for name, values in vars(whole).items():
+        np.testing.assert_allclose(getattr(joined, name), values, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_an_invalid_crossing_adds_nothing_but_its_number_of_episodes():
+    def of(invalid):
+        return evaluation_of(make_result([[[1, 20], [3, 40], [1, 20]]], invalid=[invalid]), CELLS, CFG)
+
+    joined = merged(of([False] * 3), of([True] * 3), CELLS, CFG)
+    assert (joined.episodes.tolist(), joined.invalid_episodes.tolist(), joined.valid.tolist()) == ([6], [3], [False])
+    assert joined.fitness.tolist() == [-20.0]
+    assert joined.penalty_mean == pytest.approx(of([False] * 3).penalty_mean)
+    assert np.isfinite(joined.end_position).all()
+
+
+def test_few_episodes_show_too_little_spread():
+    rng = np.random.default_rng(0)
+    penalties = rng.normal([5.0, 50.0], [2.0, 20.0], (4000, 20, 2)).clip(0.0)
+    few, many = (evaluation_of(make_result(penalties[:, :count]), CELLS, CFG) for count in (3, 20))
+    assert few.penalty_std.mean() == pytest.approx(0.72 * 2.0, rel=0.05)
+    assert few.spread.mean() == pytest.approx(2.0, rel=0.1)
+    assert many.spread.mean() == pytest.approx(2.0, rel=0.03)
+
+
+def test_a_collision_is_expected_above_one_episode_in_thirty():
+    rates = [0, 1, 2]
+    collides = [np.arange(40) < count for count in rates]
+    result = make_result(np.ones((3, 40, 2)), base_collision=collides)
+    assert evaluation_of(result, CELLS, CFG).collides.tolist() == [False, False, True]
+    short = make_result(np.ones((1, 29, 2)), base_collision=[np.arange(29) < 1])
+    assert evaluation_of(short, CELLS, CFG).collides.tolist() == [True]
 
 
 def test_penalties_are_found_by_name():

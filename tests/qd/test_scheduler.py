@@ -24,7 +24,7 @@ def small_steps(monkeypatch):
 
 def make_search(**settings) -> Scheduler:
     cfg = {"emitters": 2, "batch_size": 6, **BRIEF, **settings}
-    return Scheduler(SchedulerCfg(**cfg), cells=CELLS, seed=0)
+    return Scheduler(SchedulerCfg(**cfg), cells=CELLS, fitness=FITNESS, seed=0)
 
 
 def advance(search: Scheduler, first: int, last: int) -> None:
@@ -61,10 +61,11 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     assert np.array_equal(elites["genes"][0], genes[0])
 
 
+@pytest.mark.parametrize("again", [0, 5])
 @pytest.mark.parametrize("method", [*METHODS, *JOINED, "cma_mae+map_elites", "cma_mae+map_elites+surrogate"])
-def test_a_saved_search_goes_on_bit_for_bit(method, tmp_path):
+def test_a_saved_search_goes_on_bit_for_bit(method, again, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut
-    straight, cut = (make_search(restart_rule=5, method=method) for _ in range(2))
+    straight, cut = (make_search(restart_rule=5, method=method, again=again) for _ in range(2))
     advance(straight, 1, 16)
     advance(cut, 1, 7)
     save_checkpoint(tmp_path / "saved", {"scheduler": cut})
@@ -107,3 +108,32 @@ def test_joined_methods_take_turns_each_judged_by_its_own_archive():
     of_result = [emitter.archive is search.result for emitter in search.emitters]
     assert of_result == [True, False, True, True, False]
     assert search.archive is not search.result
+
+
+def test_terrains_are_crossed_again_behind_new_ones_and_alone_where_nothing_new_is_wanted():
+    search = make_search(method="hard_random", again=3)
+    assert search.places(0) == slice(0, 2 * (6 + 3))
+    first = search.ask()
+    assert len(first) == 12  # there is nothing to cross again yet
+    advance(search, 1, 1)
+    known = search.elites()["genes"]
+    second = search.ask()
+    assert len(second) == 18
+    assert not np.isin(second[:12], first).all(axis=1).any()
+    assert all((genes == first).all(axis=1).any() for genes in second[12:])
+    advance(search, 2, 2)
+    settling = search.ask(new=False)
+    assert len(settling) == 18
+    assert all((genes == np.concatenate([first, second])).all(axis=1).any() for genes in settling)
+    assert len(known) and search.elites()["episodes"].max() == 8
+    evaluation = evaluation_of(stand_in.evaluate(settling, np.arange(18)), CELLS, FITNESS)
+    assert search.tell(evaluation, 3) == 0
+
+
+def test_a_group_crosses_nothing_again_that_another_one_crosses_already_while_there_is_something_else():
+    search = make_search(method="hard_random", emitters=2, again=3, groups=2)
+    for group in (0, 1):
+        genes = search.ask(group)
+        search.tell(evaluation_of(stand_in.evaluate(genes, np.arange(len(genes))), CELLS, FITNESS), 1, group)
+    again = [search.ask(group)[6:] for group in (0, 1)]
+    assert len(np.unique(np.concatenate(again), axis=0)) == 6

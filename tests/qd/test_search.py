@@ -1,5 +1,6 @@
 """The search over the stand-in evaluator: what it finds, what it leaves behind, and what a kill costs."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from qd.archive import read_archive, write_archive
-from qd.fitness import FitnessCfg
+from qd.fitness import FitnessCfg, evaluation_of
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
@@ -163,3 +164,55 @@ def test_invalid_episodes_are_counted_and_many_of_them_reported(tmp_path, capsys
     run(tmp_path / "run", opener=invalid_from(2, 0.25))
     assert "12 of 48 episodes" in capsys.readouterr().out
     assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]
+
+
+AGAIN = dataclasses.replace(CFG.scheduler, method="map_elites", again=6, settling=2)
+
+
+def test_the_last_iterations_settle_what_was_found(tmp_path):
+    path = tmp_path / "run"
+    archive = run(path, scheduler=AGAIN, iterations=6)
+    rows = rows_of(path)
+    assert [row["terrains"] for row in rows] == [12, 12, 12, 12, 0, 0]
+    assert [row["episodes"] for row in rows] == [48, *[96] * 5]
+    assert json.loads((path / "archive.json").read_text())["terrains_evaluated"] == 48
+    assert archive.iteration.max() <= 4
+    assert np.median(archive.episodes) > 8
+    run(path, scheduler=AGAIN, iterations=10)  # goes on with what it had asked for when it settled
+    assert [row["terrains"] for row in rows_of(path)][6:] == [0, 12, 0, 0]
+
+
+def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):
+    path = tmp_path / "run"
+    archive = run(path, scheduler=AGAIN, iterations=60, until=0.06)
+    rows = rows_of(path)
+    assert 6 < archive.iterations == len(rows) < 60
+    # What was asked for when it was found out is crossed, then all settles.
+    assert [bool(row["terrains"]) for row in rows] == [*[True] * (len(rows) - 2), False, False]
+    brought = capsys.readouterr().out.split("Its last tenth brought ")[1]
+    assert int(brought.split("%")[0]) < 10
+    assert run(path, scheduler=AGAIN, iterations=len(rows) + 1).iterations == len(rows) + 1
+
+
+def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
+    """Over robots whose penalties differ by half from episode to episode, at equally many episodes."""
+
+    def noisy(genes, seeds, count):
+        hardness = np.stack([np.abs(genes[:, k::6]).mean(axis=1) for k in range(6)], axis=1) ** 6
+        draws = [np.random.default_rng(int(seed)).lognormal(0.0, 0.5, (count, 6)) for seed in seeds]
+        return stand_in.make_result(400.0 * hardness[:, None] * np.stack(draws) * stand_in.SCALES)
+
+    @contextlib.contextmanager
+    def opener(cfg):
+        yield stand_in.Stub(lambda genes, seeds: noisy(genes, seeds, cfg.num_replicas))
+
+    scheduler = dataclasses.replace(CFG.scheduler, method="map_elites", emitters=4, batch_size=15)
+    once = run(tmp_path / "once", opener=opener, scheduler=scheduler, iterations=20)
+    scheduler = dataclasses.replace(scheduler, batch_size=8, again=7, settling=3)
+    again = run(tmp_path / "again", opener=opener, scheduler=scheduler, iterations=20)
+
+    def share_in_the_same_cell(archive):
+        fresh = evaluation_of(noisy(archive.genes, np.arange(len(archive)), 40), CFG.cells, CFG.fitness)
+        return (fresh.cell == archive.cell).mean()
+
+    assert share_in_the_same_cell(again) > 1.3 * share_in_the_same_cell(once)
