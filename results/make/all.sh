@@ -24,6 +24,7 @@ for robot in "${robots[@]}"; do
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 105 min: 21 searches
+  make_file "$folder/search_noise.json" search_noise "$robot"         # 10 min: eight short searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
   make_file "$folder/tables.json" tables "$robot"                     # 60 min: nine trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU

@@ -1,0 +1,84 @@
+"""Searches under noise by design, and how much of what each finds is there again: search_noise.json.
+
+Each design searches in 200,000 episodes. Then all elites cross two lots of 40 fresh episodes. The share that both put
+into one cell is what no search could exceed with these elites.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from qd.faults import FRESH_EPISODES
+from qd.judge import FRESH_STREAM, elite_seeds, fresh_values, judge
+from qd.pool import chance_to_stay
+from qd.run.directory import RunDirectory
+from qd.search import search
+from qd.workers.cross import Crossings
+from results.make.common import Script, parse
+
+SEED = 9
+EPISODES = 200_000
+DESIGNS: dict[str, dict[str, Any]] = {
+    "once": {},
+    "10 episodes": {"replicas": 10, "batch_size": 40, "candidates": 10},
+    "5 episodes": {"replicas": 5, "batch_size": 80, "candidates": 8},
+    "half again": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12},
+    "half again, settled": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1},
+    "quarter again, settled": {"replicas": 3, "batch_size": 100, "again": 33, "candidates": 12, "settling": 1},
+    "pairs, half again, settled": {"replicas": 2, "batch_size": 100, "again": 100, "candidates": 12, "settling": 1},
+    "learns twice as long": {
+        "replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1, "training_steps": 800,
+    },
+}  # fmt: skip
+"""Settings of preset wide that each design changes."""
+
+
+def screen(script: Script, name: str) -> dict[str, Any]:
+    """One design's row."""
+    design = {} if script.small else DESIGNS[name]
+    cfg = script.search_cfg(seed=SEED, **design)
+    if not script.small:
+        cfg = script.search_cfg(round(EPISODES / cfg.episodes_per_iteration), seed=SEED, **design)
+    run = script.runs / "search_noise" / name.replace(", ", "-").replace(" ", "-")
+    search(cfg, run, script.compute)
+    archive = judge(run, stages=("fresh",), compute=script.compute)
+    assert archive.fresh is not None
+    with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
+        seeds = elite_seeds(archive, cfg.seed, stream=FRESH_STREAM + 1000)
+        again = crossings.cross(
+            script.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=archive.space, label="once more",
+            invalid_ok=True,
+        )  # fmt: skip
+    second = fresh_values(archive, again, cfg.fitness)
+    both = archive.fresh.valid & second.valid
+    numbers = RunDirectory(run).read_summary()
+    counts = ("episodes", "wall_s", "elites", "elites_same_cell", "corrected_elites", "corrected_qd_score", "failing",
+              "families")  # fmt: skip
+    return {
+        "design": name,
+        "settings": {**asdict(cfg.scheduler), "replicas": cfg.replicas, "iterations": cfg.iterations},
+        **{count: numbers[count] for count in counts},
+        "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
+        "same_cell_ceiling": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
+        "failing_corrected": int(archive.failing[archive.fresh.corrected_elites()].sum()),
+        "episodes_of_an_elite": float(np.median(archive.episodes)) if len(archive) else None,
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Screens the designs that are missing, and writes the file after each."""
+    script = parse(__doc__, argv, "search_noise.json", parts=tuple(DESIGNS))
+    report: dict[str, Any] = {}
+    for name in script.parts or list(DESIGNS)[: 1 if script.small else None]:
+        rows = script.read_so_far(script.out).get("rows", [])
+        if name not in [row["design"] for row in rows]:
+            row = screen(script, name)
+            rows = [*script.read_so_far(script.out).get("rows", []), row]  # others may have been written meanwhile
+        report = script.add(script.origin, {"rows": rows})
+    return report
+
+
+if __name__ == "__main__":
+    main()
