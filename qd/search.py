@@ -91,7 +91,7 @@ def search(
                     with Bar(begun, cfg.iterations, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
-                again = _command_to_resume(path, robot, policy, space.name)
+                again = _command_to_resume(path, robot, policy, space.name, until)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
         archive = archive_of(cfg, scheduler, len(metrics))
         if (stored := _written_archive(run, archive)) is not None:
@@ -100,14 +100,14 @@ def search(
     return archive
 
 
-def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str) -> str:
+def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, until: float | None) -> str:
     """The command that goes on with a search; code that it needs is named."""
     own = {
         "robot": robot.spec if robot.settings_file else None,
         "policy": policy if ControllerSpec.parse(policy).runs_code else None,
         "space": space if is_own(space) else None,
     }
-    return command_line("archive", resume=path, **own)
+    return command_line("archive", resume=path, until=until, **own)
 
 
 def _run_iterations(

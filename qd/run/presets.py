@@ -33,7 +33,7 @@ class SchedulerCfg:
     count, and it holds its cell by what it is expected to add to the QD score of fresh ones. With 0 a terrain is
     crossed once, and the fittest of a cell holds it, as in the paper."""
     settling: NonNegativeInt = 0
-    """Last iterations of a search that cross nothing new, if terrains are crossed again at all."""
+    """Last iterations of a search, in which nothing new is crossed."""
     groups: Annotated[int, Meta(ge=1, le=32)] = 1
     """Groups of emitters that ask and are told in turn, in a fixed order, at most one an emitter: robots have the
     terrains of the others to cross while the last robots of a group's terrains still walk."""
@@ -72,6 +72,8 @@ class SchedulerCfg:
                 f"explore_share and disagree_share must be at most 1 together, got {self.explore_share} and "
                 f"{self.disagree_share}"
             )
+        if self.settling and not self.again:
+            raise ValueError(f"again must be 1 or more where iterations settle, got 0 and settling {self.settling}")
 
     @property
     def methods(self) -> tuple[str, ...]:

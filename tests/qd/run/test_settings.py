@@ -43,6 +43,14 @@ def test_values_of_the_scheduler_out_of_range_are_named(name, value):  # the squ
         SchedulerCfg(**{name: value})
 
 
+def test_iterations_that_settle_need_terrains_to_cross_again_and_others_before_them():
+    with pytest.raises(ValueError, match="again must be 1 or more"):
+        SchedulerCfg(settling=2)
+    cfg = dataclasses.replace(preset("small", robot()), scheduler=SchedulerCfg(again=2, settling=2))
+    with pytest.raises(ValueError, match="settling must be below the iterations, 2, got 2"):
+        dataclasses.replace(cfg, iterations=2)
+
+
 def test_settings_survive_json_and_those_of_something_else_are_refused_by_name():
     cfg = preset("small", robot())
     cfg = dataclasses.replace(cfg, scheduler=dataclasses.replace(cfg.scheduler, learning_rate=0.01, sigma0=0.5))
