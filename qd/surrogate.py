@@ -1,8 +1,8 @@
 """A surrogate of the simulation: networks that learn from all crossings what a terrain does to the robot.
 
 The inner loop searches the archive that they predict, and lets robots cross what promises most (after DSAGE: Bhatt et
-al. 2022, "Deep Surrogate Assisted Generation of Environments"). What a terrain promises is the mean over the networks
-of the QD score that it would add by their word, so terrains count that only some of them hold for new.
+al. 2022, "Deep Surrogate Assisted Generation of Environments"). What a terrain promises is the QD score that it is
+expected to add, where its ratios may be as far from the predicted ones as those of earlier terrains were.
 """
 
 from dataclasses import asdict
@@ -34,6 +34,8 @@ _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
 _LEAST_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
 _NUM_RATES = 3  # goal rate, collision rate, collision bit
+_DRAWS = 4  # of the ratios of a terrain, for each network's word on its fitness and collision
+_ERROR_STEP = 0.1  # of the known error of ratios toward that of the terrains told last
 
 
 class Prediction(NamedTuple):
@@ -59,7 +61,12 @@ class Prediction(NamedTuple):
 
 
 class Surrogate:
-    """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals."""
+    """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
+
+    Attributes:
+        squared_error: Of predicted ratios, by the terrains told so far, the noise of their episodes included, shape
+            (P,); None before the networks are asked.
+    """
 
     def __init__(self, cfg: SchedulerCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
         self.cfg, self.cells = cfg, cells
@@ -68,6 +75,7 @@ class Surrogate:
         self._genes = np.zeros((0, space.num_genes), np.int16)
         self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
         self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
+        self.squared_error: NDArray[np.float32] | None = None
         self._networks = Networks(1 + len(space.ground), self._targets.shape[1])
         for weights in self._networks.parameters():
             drawn = self._rng.normal(size=weights.shape) * np.sqrt(2.0 / max(1, weights[0].numel()))
@@ -113,10 +121,26 @@ class Surrogate:
         """
         valid = evaluation.valid
         if valid.any():
+            self._compare(self.ratios_of(clipped(genes[valid])), evaluation.ratios[valid])
             self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
         if len(self) >= FEWEST:
             with on_stream(self._stream):
                 self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
+
+    def ratios_of(self, genes: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        """Predicted ratios of terrains, of genes in [-1, 1], (N, num_genes); None before the networks are asked."""
+        if len(self) < FEWEST:
+            return None
+        with on_stream(self._stream):
+            return self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
+
+    def _compare(self, predicted: NDArray[np.float32] | None, ratios: NDArray[np.float64]) -> None:
+        """Notes how far predicted ratios are from those that are told now, the noise of a few episodes included."""
+        if predicted is None:
+            return
+        squared_error = ((predicted - ratios) ** 2).mean(axis=0).astype(np.float32)
+        before = squared_error if self.squared_error is None else self.squared_error
+        self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         units = np.rint(genes * _GENE_UNITS).astype(np.int16)
@@ -231,8 +255,10 @@ class Surrogate:
             children = slice(first, first + each)
             genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
             prediction = self.predict(genes[children])
-            cell = self.cells_of(prediction.ratios, prediction.collided)  # of each network
-            gain[children] = torch.where(cell >= 0, (prediction.fitness - best[cell]).clamp_min(0.0), 0.0).mean(0)
+            gain[children] = self._expected_gain(prediction, best, draw)
+            if self.cfg.passing_weight < 1.0:
+                passes = prediction.rates[..., 0].mean(0) > 0.0
+                gain[children] *= torch.where(passes, self.cfg.passing_weight, 1.0)
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
             rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])
@@ -241,6 +267,19 @@ class Surrogate:
         spread[chosen] = -torch.inf
         disputed = spread.argsort(descending=True, stable=True)[: num_proposals - len(chosen)]
         return genes[torch.cat([chosen, disputed])]
+
+    def _expected_gain(self, prediction: Prediction, best: Tensor, draw: torch.Generator) -> Tensor:
+        """What terrains are expected to add to the QD score, shape (N,), given the best fitness in each cell."""
+        ratios = prediction.ratios.mean(0)
+        if self.squared_error is None:
+            drawn = ratios.expand(1, MEMBERS, -1, -1)
+        else:
+            error = torch.from_numpy(self.squared_error).to(self.device).sqrt()
+            noise = torch.randn((_DRAWS, MEMBERS, *ratios.shape), generator=draw, device=self.device)
+            drawn = (ratios + error * noise).clamp_min(1e-6)
+            drawn = drawn / drawn.sum(-1, keepdim=True)
+        cells = self.cells_of(drawn, prediction.collided)
+        return torch.where(cells >= 0, (prediction.fitness - best[cells]).clamp_min(0.0), 0.0).mean((0, 1))
 
     def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
@@ -279,6 +318,7 @@ class Surrogate:
             "genes": self._genes,
             "targets": self._targets,
             "scale": self._scale,
+            "squared_error": self.squared_error,
             "learned": learned,
         }
 
@@ -288,7 +328,8 @@ class Surrogate:
         self.cfg = SchedulerCfg(**state["cfg"])
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
-        self._rng, self._genes, self._targets, self._scale = (state[k] for k in ("rng", "genes", "targets", "scale"))
+        self._rng, self._genes, self._targets = state["rng"], state["genes"], state["targets"]
+        self._scale, self.squared_error = state["scale"], state["squared_error"]
         self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
         moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state["learned"]]
         for weights, tensors in zip(self._networks.parameters(), moments, strict=True):

@@ -11,27 +11,36 @@ from typing import Any
 import numpy as np
 
 from qd.faults import FRESH_EPISODES
+from qd.groups import families_of
 from qd.judge import FRESH_STREAM, elite_seeds, fresh_values, judge
 from qd.pool import chance_to_stay
 from qd.run.directory import RunDirectory
 from qd.search import search
 from qd.workers.cross import Crossings
 from results.make.common import Script, parse
+from sim.spaces.registry import get_space
 
 SEED = 9
 EPISODES = 200_000
+PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12, "settling": 1}
 DESIGNS: dict[str, dict[str, Any]] = {
     "once": {},
     "10 episodes": {"replicas": 10, "batch_size": 40, "candidates": 10},
     "5 episodes": {"replicas": 5, "batch_size": 80, "candidates": 8},
-    "half again": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12},
-    "half again, settled": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1},
-    "quarter again, settled": {"replicas": 3, "batch_size": 100, "again": 33, "candidates": 12, "settling": 1},
-    "pairs, half again, settled": {"replicas": 2, "batch_size": 100, "again": 100, "candidates": 12, "settling": 1},
-    "learns twice as long": {
-        "replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1, "training_steps": 800,
-    },
-}  # fmt: skip
+    "threes, half again": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12},
+    "threes, half again, settled": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1},
+    "threes, quarter again, settled": {"replicas": 3, "batch_size": 100, "again": 33, "candidates": 12, "settling": 1},
+    "pairs, half again": {**PAIRS, "settling": 0},
+    "pairs, half again, settled": PAIRS,
+    "pairs, quarter again, settled": {**PAIRS, "batch_size": 150, "again": 50},
+    "singles, half again, settled": {"replicas": 1, "batch_size": 220, "again": 180, "candidates": 6, "settling": 1},
+    "pairs, fewer candidates": {**PAIRS, "candidates": 4},
+    "pairs, learn longer": {**PAIRS, "training_steps": 1000},
+    "pairs, networks as prior": {**PAIRS, "prior_episodes": 1.5},
+    "pairs, apart from kin": {**PAIRS, "kin_margin": 0.3},
+    "pairs, failing first": {**PAIRS, "passing_weight": 0.25},
+    "pairs, prior, failing first": {**PAIRS, "prior_episodes": 1.5, "passing_weight": 0.5},
+}
 """Settings of preset wide that each design changes."""
 
 
@@ -54,6 +63,7 @@ def screen(script: Script, name: str) -> dict[str, Any]:
     second = fresh_values(archive, again, cfg.fitness)
     both = archive.fresh.valid & second.valid
     numbers = RunDirectory(run).read_summary()
+    corrected = archive.fresh.corrected_elites()
     counts = ("episodes", "wall_s", "elites", "elites_same_cell", "corrected_elites", "corrected_qd_score", "failing",
               "families")  # fmt: skip
     return {
@@ -62,7 +72,10 @@ def screen(script: Script, name: str) -> dict[str, Any]:
         **{count: numbers[count] for count in counts},
         "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
         "same_cell_ceiling": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
-        "failing_corrected": int(archive.failing[archive.fresh.corrected_elites()].sum()),
+        "failing_corrected": int(archive.failing[corrected].sum()),
+        "families_corrected": len(
+            np.unique(families_of(archive.genes[corrected], get_space(archive.space, archive.space_sha256)))
+        ),
         "episodes_of_an_elite": float(np.median(archive.episodes)) if len(archive) else None,
     }
 

@@ -160,10 +160,13 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
         return prediction, prediction.fitness.numpy(), archive_cells(prediction.ratios.mean(0))
 
     def gains(genes):
-        """Of each network the fitness above the best of the cell where it puts a terrain; the mean over them."""
+        """The fitness above the best of the cell where a terrain may fall; the mean over 50 draws of ratios."""
         prediction, fitness, _ = predict(genes)
-        cells = np.stack([archive_cells(ratios) for ratios in prediction.ratios])
-        return np.maximum(fitness - best[cells], 0.0).mean(axis=0)
+        error = np.sqrt(learned.squared_error)
+        noise = error * np.random.default_rng(0).normal(size=(50, len(genes), 6))
+        drawn = np.maximum(prediction.ratios.mean(0).numpy() + noise, 1e-6)
+        cells = [archive_cells(torch.from_numpy(ratios)) for ratios in drawn]
+        return np.mean([np.maximum(fitness.mean(axis=0) - best[cell], 0.0) for cell in cells], axis=0)
 
     assert len(set(predict(genes)[2])) == 6
     best = np.full(CELLS.num_cells, -20.0, np.float32)
@@ -173,6 +176,16 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     assert (gains(genes) > 0.0).all()
     chance = vary_elites(torch.from_numpy(elites), 60, cfg, 8, torch.Generator().manual_seed(0))
     assert gains(genes).mean() > gains(chance.numpy()).mean()
+
+
+def test_it_knows_how_far_its_ratios_are_off(learned):
+    search = pickle.loads(pickle.dumps(learned))
+    genes = SUPER_GAUSSIAN.hard_random(50, 7)
+    evaluation = crossed(genes, 7)
+    off = ((predicted(search, genes)["ratios"].mean(axis=0) - evaluation.ratios) ** 2).mean(axis=0)
+    search.learn(genes, evaluation)  # by what it said before it learned
+    assert learned.squared_error is not None
+    np.testing.assert_allclose(search.squared_error, 0.9 * learned.squared_error + 0.1 * off, rtol=1e-4)
 
 
 @pytest.mark.parametrize("cells", [Cells(6, 10), Cells(5, 10, collision_bit=True)])
