@@ -110,6 +110,7 @@ class Pool:
             number: Of those that were crossed again, perhaps several times; -1 of new ones, shape (T,).
             told: What the crossings showed.
             iteration: In which they were, from 1.
+            prior: Their predicted ratios, shape (T, P).
         """
         known = rows_of(told, np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
