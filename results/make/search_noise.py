@@ -1,7 +1,7 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
-Each design searches in 200,000 episodes. Then all elites cross two lots of 40 fresh episodes. The share that both put
-into one cell is what no search could exceed with these elites.
+Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds. Then all elites cross two
+lots of 40 fresh episodes. The share that both put into one cell is what no search could exceed with these elites.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,9 @@ from qd.workers.cross import Crossings
 from results.make.common import Script, parse
 from sim.spaces.registry import get_space
 
-SEED = 9
-EPISODES = 200_000
+SEED, EPISODES = 9, 200_000
+"""Of the screening."""
+FINAL_SEEDS, FINAL_EPISODES = (0, 1, 2), 400_000
 PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12, "settling": 1}
 DESIGNS: dict[str, dict[str, Any]] = {
     "once": {},
@@ -42,14 +43,20 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "pairs, prior, failing first": {**PAIRS, "prior_episodes": 1.5, "passing_weight": 0.5},
 }
 """Settings of preset wide that each design changes."""
+FINALS = ("once", "pairs, half again, settled", "threes, half again, settled")
+SEARCHES = {name: (name, SEED, EPISODES) for name in DESIGNS} | {
+    f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS
+}
+"""Design, seed and episodes of each search."""
 
 
-def screen(script: Script, name: str) -> dict[str, Any]:
-    """One design's row."""
-    design = {} if script.small else DESIGNS[name]
-    cfg = script.search_cfg(seed=SEED, **design)
+def row_of(script: Script, name: str) -> dict[str, Any]:
+    """The row of one search."""
+    design_name, seed, episodes = SEARCHES[name]
+    design = {} if script.small else DESIGNS[design_name]
+    cfg = script.search_cfg(seed=seed, **design)
     if not script.small:
-        cfg = script.search_cfg(round(EPISODES / cfg.episodes_per_iteration), seed=SEED, **design)
+        cfg = script.search_cfg(round(episodes / cfg.episodes_per_iteration), seed=seed, **design)
     run = script.runs / "search_noise" / name.replace(", ", "-").replace(" ", "-")
     search(cfg, run, script.compute)
     archive = judge(run, stages=("fresh",), compute=script.compute)
@@ -67,7 +74,9 @@ def screen(script: Script, name: str) -> dict[str, Any]:
     counts = ("episodes", "wall_s", "elites", "elites_same_cell", "corrected_elites", "corrected_qd_score", "failing",
               "families")  # fmt: skip
     return {
-        "design": name,
+        "search": name,
+        "design": design_name,
+        "seed": seed,
         "settings": {**asdict(cfg.scheduler), "replicas": cfg.replicas, "iterations": cfg.iterations},
         **{count: numbers[count] for count in counts},
         "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
@@ -81,13 +90,13 @@ def screen(script: Script, name: str) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Screens the designs that are missing, and writes the file after each."""
-    script = parse(__doc__, argv, "search_noise.json", parts=tuple(DESIGNS))
+    """Makes the rows that are missing, and writes the file after each."""
+    script = parse(__doc__, argv, "search_noise.json", parts=tuple(SEARCHES))
     report: dict[str, Any] = {}
-    for name in script.parts or list(DESIGNS)[: 1 if script.small else None]:
+    for name in script.parts or list(SEARCHES)[: 1 if script.small else None]:
         rows = script.read_so_far(script.out).get("rows", [])
-        if name not in [row["design"] for row in rows]:
-            row = screen(script, name)
+        if name not in [row["search"] for row in rows]:
+            row = row_of(script, name)
             rows = [*script.read_so_far(script.out).get("rows", []), row]  # others may have been written meanwhile
         report = script.add(script.origin, {"rows": rows})
     return report
