@@ -20,27 +20,19 @@ _RATIO_SPREAD = 0.22
 _LEAST_VARIANCE = 1e-3  # of r (1 - r), where all episodes so far have a ratio of 0
 
 
-def chance_to_stay(
-    terrains: Evaluation, cells: Cells, prior: NDArray[np.float32] | None = None, prior_episodes: float = 0.0
-) -> NDArray[np.float64]:
+def chance_to_stay(terrains: Evaluation, cells: Cells) -> NDArray[np.float64]:
     """The chance that 40 fresh episodes put a terrain into the cell that it has now, shape (T,).
 
     Its own episodes and the fresh ones spread ratios about the true ones, each by itself and normally.
     """
     counted = np.maximum(terrains.counted, 1)
-    ratios, known = terrains.ratios, counted.astype(float)
-    if prior is not None and prior_episodes > 0.0:
-        has = np.isfinite(prior).all(axis=1)
-        weight = np.where(has, prior_episodes / (known + prior_episodes), 0.0)[:, None]
-        ratios = (1.0 - weight) * ratios + weight * np.where(has[:, None], prior, 0.0)
-        known = known + np.where(has, prior_episodes, 0.0)
     variance = _RATIO_SPREAD**2 * (terrains.ratios * (1.0 - terrains.ratios) + _LEAST_VARIANCE)
-    std = np.sqrt(variance * (1.0 / known + 1.0 / FRESH_EPISODES)[:, None])
+    std = np.sqrt(variance * (1.0 / counted + 1.0 / FRESH_EPISODES)[:, None])
     collides, index = np.divmod(terrains.cell, len(cells.tuples))
     intervals = cells.tuples[index]
     lower = np.where(intervals > 0, intervals / cells.intervals, -np.inf)
     upper = np.where(intervals + 1 < cells.intervals, (intervals + 1) / cells.intervals, np.inf)
-    chance = np.prod(ndtr((upper - ratios) / std) - ndtr((lower - ratios) / std), axis=1)
+    chance = np.prod(ndtr((upper - terrains.ratios) / std) - ndtr((lower - terrains.ratios) / std), axis=1)
     if cells.collision_bit:
         rate = (terrains.collision_rate * counted + 0.5) / (counted + 1.0)
         none_collides = (1.0 - rate) ** BIT_EPISODES
@@ -48,13 +40,7 @@ def chance_to_stay(
     return chance
 
 
-def expected_score(
-    terrains: Evaluation,
-    cells: Cells,
-    cfg: FitnessCfg,
-    prior: NDArray[np.float32] | None = None,
-    prior_episodes: float = 0.0,
-) -> NDArray[np.float64]:
+def expected_score(terrains: Evaluation, cells: Cells, cfg: FitnessCfg) -> NDArray[np.float64]:
     """What each terrain is expected to add to the QD score of fresh episodes, shape (T,); 0 of an invalid one.
 
     It is the chance to stay, times the fitness above the floor: as many episodes would show it, less a standard error.
@@ -63,7 +49,7 @@ def expected_score(
     fitness = terrains.fitness + cfg.alpha * (terrains.penalty_std.sum(axis=1) - spread)
     lower_bound = fitness - spread / np.sqrt(np.maximum(terrains.counted, 1))
     above = np.maximum(lower_bound - FITNESS_FLOOR, 0.0)
-    return np.where(terrains.valid, chance_to_stay(terrains, cells, prior, prior_episodes) * above, 0.0)
+    return np.where(terrains.valid, chance_to_stay(terrains, cells) * above, 0.0)
 
 
 class Pool:
@@ -76,12 +62,8 @@ class Pool:
         number: By which each is known, ascending, shape (N,).
     """
 
-    def __init__(
-        self, num_genes: int, cells: Cells, fitness: FitnessCfg, prior_episodes: float = 0.0, kin_margin: float = 0.0
-    ) -> None:
-        self.cells, self.fitness, self.prior_episodes = cells, fitness, prior_episodes
-        self.kin_margin = kin_margin
-        self.prior = np.zeros((0, cells.num_ratios), np.float32)
+    def __init__(self, num_genes: int, cells: Cells, fitness: FitnessCfg) -> None:
+        self.cells, self.fitness = cells, fitness
         self.terrains: Evaluation | None = None
         self.solutions = np.zeros((0, num_genes), np.float32)
         self.iteration, self.number = np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -96,12 +78,7 @@ class Pool:
         return self.solutions[np.searchsorted(self.number, number)]
 
     def tell(
-        self,
-        solutions: NDArray[np.float32],
-        number: NDArray[np.int64],
-        told: Evaluation,
-        iteration: int,
-        prior: NDArray[np.float32] | None = None,
+        self, solutions: NDArray[np.float32], number: NDArray[np.int64], told: Evaluation, iteration: int
     ) -> Evaluation:
         """Takes in crossings of T terrains, and returns what is known of these now.
 
@@ -110,7 +87,6 @@ class Pool:
             number: Of those that were crossed again, perhaps several times; -1 of new ones, shape (T,).
             told: What the crossings showed.
             iteration: In which they were, from 1.
-            prior: Their predicted ratios, shape (T, P).
         """
         known = rows_of(told, np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
@@ -123,13 +99,9 @@ class Pool:
             for name, values in vars(joined).items():
                 getattr(self.terrains, name)[rows] = getattr(known, name)[now] = values
             self._crossings[rows] += 1
-            if prior is not None:
-                self.prior[rows] = prior[now]
         before = () if self.terrains is None else (self.terrains,)
         self.terrains = join_evaluations([*before, rows_of(told, new)])
         self.solutions = np.concatenate([self.solutions, solutions[new]])
-        unknown = np.full((len(new), self.cells.num_ratios), np.nan, np.float32)
-        self.prior = np.concatenate([self.prior, unknown if prior is None else prior[new]])
         self.iteration = np.append(self.iteration, np.full(len(new), iteration))
         self.number = np.append(self.number, self._next + np.arange(len(new)))
         self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
@@ -144,7 +116,7 @@ class Pool:
         """
         if self.terrains is None or not len(self):
             return self.number[:0]
-        best_first = np.argsort(-self._score(), kind="stable")
+        best_first = np.argsort(-expected_score(self.terrains, self.cells, self.fitness), kind="stable")
         rows, times = np.unique(np.searchsorted(self.number, under_way), return_counts=True)
         crossings = self._crossings.copy()
         crossings[rows] += times
@@ -152,28 +124,15 @@ class Pool:
         order = np.argsort((crossings[best_first, None] + further).ravel(), kind="stable")[:count]
         return self.number[best_first[order // len(further)]]
 
-    def _score(self) -> NDArray[np.float64]:
-        assert self.terrains is not None
-        return expected_score(self.terrains, self.cells, self.fitness, self.prior, self.prior_episodes)
-
     def settle(self, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
         """Leaves each cell its best terrains, and those ``under_way``; rows of the ones that hold a cell."""
         assert self.terrains is not None
-        score = self._score()
+        score = expected_score(self.terrains, self.cells, self.fitness)
         rank = _rank(self.terrains.cell, -score)
-        if self.kin_margin > 0.0 and (rank == 0).sum() > 1:
-            genes = np.clip(self.solutions, -1.0, 1.0)
-            first = np.flatnonzero(rank == 0)
-            apart = np.stack([np.linalg.norm(genes[first] - row, axis=1) for row in genes])
-            apart[self.terrains.cell[:, None] == self.terrains.cell[first]] = np.inf
-            best = np.zeros(self.cells.num_cells)
-            np.maximum.at(best, self.terrains.cell, score)
-            equal = score >= (1.0 - self.kin_margin) * best[self.terrains.cell]
-            rank = _rank(self.terrains.cell, np.where(equal, -1e6 - apart.min(axis=1), -score))
         holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
         stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, under_way)
         self.terrains = rows_of(self.terrains, stays)
-        for name in ("solutions", "iteration", "number", "prior", "_crossings"):
+        for name in ("solutions", "iteration", "number", "_crossings"):
             setattr(self, name, getattr(self, name)[stays])
         return np.flatnonzero(holds[stays])
 

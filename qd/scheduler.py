@@ -91,10 +91,7 @@ class Scheduler:
             )
         self.surrogate = Surrogate(cfg, cells, space, surrogate_stream) if "surrogate" in names else None
         self.emitters: list[Emitter] = [self._make_emitter(cfg, method, space, stream) for method, stream in methods]
-        self.again, self.pool = (
-            cfg.again,
-            Pool(space.num_genes, cells, fitness, cfg.prior_episodes, cfg.kin_margin) if cfg.again else None,
-        )
+        self.again, self.pool = cfg.again, Pool(space.num_genes, cells, fitness) if cfg.again else None
         self._asked: list[Asked | None] = [None] * cfg.num_groups
 
     def _make_emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
@@ -184,8 +181,7 @@ class Scheduler:
         assert asked is not None
         self._asked[group] = None
         if self.pool is not None:
-            prior = None if self.surrogate is None else self.surrogate.ratios_of(clipped(asked.solutions))
-            evaluation = self.pool.tell(*asked, evaluation, iteration, prior)
+            evaluation = self.pool.tell(*asked, evaluation, iteration)
         if self.surrogate is not None:
             self.surrogate.learn(asked.solutions, evaluation)
         rows = _rows_of(asked.solutions, evaluation, iteration)

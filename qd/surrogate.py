@@ -121,23 +121,18 @@ class Surrogate:
         """
         valid = evaluation.valid
         if valid.any():
-            self._compare(self.ratios_of(clipped(genes[valid])), evaluation.ratios[valid])
+            self._compare(clipped(genes[valid]), evaluation.ratios[valid])
             self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
         if len(self) >= FEWEST:
             with on_stream(self._stream):
                 self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
-    def ratios_of(self, genes: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """Predicted ratios of terrains, of genes in [-1, 1], (N, num_genes); None before the networks are asked."""
-        if len(self) < FEWEST:
-            return None
-        with on_stream(self._stream):
-            return self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
-
-    def _compare(self, predicted: NDArray[np.float32] | None, ratios: NDArray[np.float64]) -> None:
+    def _compare(self, genes: NDArray[np.float32], ratios: NDArray[np.float64]) -> None:
         """Notes how far predicted ratios are from those that are told now, the noise of a few episodes included."""
-        if predicted is None:
+        if len(self) < FEWEST:
             return
+        with on_stream(self._stream):
+            predicted = self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
         squared_error = ((predicted - ratios) ** 2).mean(axis=0).astype(np.float32)
         before = squared_error if self.squared_error is None else self.squared_error
         self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
@@ -256,9 +251,6 @@ class Surrogate:
             genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
             prediction = self.predict(genes[children])
             gain[children] = self._expected_gain(prediction, best, draw)
-            if self.cfg.passing_weight < 1.0:
-                passes = prediction.rates[..., 0].mean(0) > 0.0
-                gain[children] *= torch.where(passes, self.cfg.passing_weight, 1.0)
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
             rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])

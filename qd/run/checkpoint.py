@@ -13,7 +13,7 @@ from typing import Any
 
 from sim.files.atomic import write_atomically
 
-_MAGIC = b"faultline search checkpoint 3\n"
+_MAGIC = b"faultline search checkpoint 4\n"
 _HASH_BYTES = 32
 _REMEDY = "put a copy of it back, or start a new run"
 

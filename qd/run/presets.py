@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveInt, Share, check
+from sim.files.settings import NonNegativeInt, PositiveInt, Share, check
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
 Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
@@ -34,12 +34,6 @@ class SchedulerCfg:
     crossed once, and the fittest of a cell holds it, as in the paper."""
     settling: NonNegativeInt = 0
     """Last iterations of a search, in which nothing new is crossed."""
-    prior_episodes: NonNegativeFloat = 0.0
-    """Surrogate: as how many episodes its word counts in who holds a cell, where terrains are crossed again."""
-    kin_margin: Share = 0.0
-    """By how much of the best score in its cell a terrain that is farther from other cells' may be worse."""
-    passing_weight: Share = 1.0
-    """Surrogate: what a terrain counts that the robot is expected to cross."""
     groups: Annotated[int, Meta(ge=1, le=32)] = 1
     """Groups of emitters that ask and are told in turn, in a fixed order, at most one an emitter: robots have the
     terrains of the others to cross while the last robots of a group's terrains still walk."""

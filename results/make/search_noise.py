@@ -1,7 +1,7 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
-Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds. Then all elites cross two
-lots of 40 fresh episodes. The share that both put into one cell is what no search could exceed with these elites.
+Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds. Then all elites cross
+two lots of 40 fresh episodes. The share that both put into one cell is what no search could exceed with these elites.
 """
 
 from collections.abc import Sequence
@@ -37,10 +37,6 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "singles, half again, settled": {"replicas": 1, "batch_size": 220, "again": 180, "candidates": 6, "settling": 1},
     "pairs, fewer candidates": {**PAIRS, "candidates": 4},
     "pairs, learn longer": {**PAIRS, "training_steps": 1000},
-    "pairs, networks as prior": {**PAIRS, "prior_episodes": 1.5},
-    "pairs, apart from kin": {**PAIRS, "kin_margin": 0.3},
-    "pairs, failing first": {**PAIRS, "passing_weight": 0.25},
-    "pairs, prior, failing first": {**PAIRS, "prior_episodes": 1.5, "passing_weight": 0.5},
 }
 """Settings of preset wide that each design changes."""
 FINALS = ("once", "pairs, half again, settled", "threes, half again, settled")

@@ -8,7 +8,7 @@ from qd.run.checkpoint import load_checkpoint
 
 def wrap(payload: bytes) -> bytes:
     """A file with a right magic and hash around any payload, as an attacker would make it."""
-    return b"faultline search checkpoint 3\n" + hashlib.sha256(payload).digest() + payload
+    return b"faultline search checkpoint 4\n" + hashlib.sha256(payload).digest() + payload
 
 
 @pytest.mark.parametrize(
