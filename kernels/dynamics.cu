@@ -251,6 +251,7 @@ for (int n = lane; n < NV; n += LANES) {
         wp::index(robots.inertia, world, --at) = dot(get_six(motion, m), carried);
     }
     const float damping = of_model(tree.damping, n);
+    const float strength = robots.strength.shape[0] > 0 ? wp::index(robots.strength, world) : 1.0f;
     float passive = -damping * qvel[n], driven = 0.0f, slope = damping;
     if (tree.joint_type.data[joint] != FREE) {
         const int column = tree.joint_qpos.data[joint];
@@ -276,12 +277,13 @@ for (int n = lane; n < NV; n += LANES) {
                 f = wp::clamp(f, range[0], range[1]);
             }
             driven = gear * f;
-            slope -= gear * gear * steep;
+            slope -= gear * gear * steep * strength;
         }
         if (tree.joint_force_limited.data[joint]) {
             const auto range = of_model(tree.joint_force_range, joint);
             driven = wp::clamp(driven, range[0], range[1]);
         }
+        driven *= strength;
     }
     wp::index(robots.qfrc_actuator, world, n) = driven;
     wp::index(robots.qfrc_smooth, world, n) = passive - dot(s, get_six(force, body)) + driven;

@@ -85,6 +85,8 @@ class Robots:
     qpos: wp.array2d[float]
     qvel: wp.array2d[float]
     control: wp.array2d[float]
+    strength: wp.array[float]
+    """Factor of the actuators' forces and of their limits; empty where it is 1."""
     xpos: wp.array2d[wp.vec3]
     xquat: wp.array2d[wp.quat]
     """wxyz, as all quaternions here."""

@@ -72,7 +72,8 @@ def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: 
 
 
 @wp.func
-def _noise_width(noise: Noise, k: int, num_joints: int) -> float:
+def noise_width(noise: Noise, k: int, num_joints: int) -> float:
+    """Half width of the noise of column ``k`` of an observation."""
     if k < 3:
         return noise.lin_vel * LIN_VEL_SCALE
     if k < 6:
@@ -118,7 +119,7 @@ def _write_observation_kernel(
         column = last_action[env, joint - 2 * num_joints]
     else:
         column = _scan_column(joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
-    width = _noise_width(noise, k, num_joints)
+    width = noise_width(noise, k, num_joints)
     if width > 0.0:
         state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)
         column += width * wp.randf(state, -1.0, 1.0)

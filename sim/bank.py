@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from kernels.conditions import scale_friction
 from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from sim.conditions import NOMINAL
 from sim.device import host_device
 from sim.ground import GroundMaps
 from sim.spaces.base import TerrainSpace
@@ -25,10 +27,17 @@ class TerrainBank:
         heights: Node heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
         terrain: The same with their ceilings, as contacts take them.
         ground: Friction and softness; None where no terrain has any.
+        conditions: Under which each is crossed, shape (num_terrains, 12) (:class:`kernels.conditions.Condition`); None
+            where all are nominal.
     """
 
-    def __init__(self, num_terrains: int, *, device: str, with_ground: bool = False) -> None:
-        """Make flat terrains; with ``with_ground`` they have maps of friction and softness, which contacts pay for."""
+    def __init__(
+        self, num_terrains: int, *, device: str, with_ground: bool = False, with_conditions: bool = False
+    ) -> None:
+        """Make flat terrains; with ``with_ground`` they have maps of friction and softness, which contacts pay for.
+
+        With ``with_conditions`` they have these maps too, since friction is one of them.
+        """
         if num_terrains < 1:
             raise ValueError(f"a bank needs at least 1 terrain, got {num_terrains}")
         shape = num_terrains, NUM_ROWS, NUM_COLS
@@ -36,7 +45,10 @@ class TerrainBank:
         self.terrain.heights = self.heights = wp.zeros(shape, dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
         self.terrain.spacing = SPACING
+        with_ground |= with_conditions
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
+        nominal = np.tile(NOMINAL, (num_terrains, 1))
+        self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None
         self.device, self.num_terrains = device, num_terrains
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
@@ -59,6 +71,8 @@ class TerrainBank:
             ground = ground or GroundMaps.plain(len(heights))
             maps.friction.assign(np.float32(ground.friction))
             maps.time_constant.assign(np.float32(ground.time_constant_s))
+        if self.conditions is not None:
+            self.conditions[slots].assign(np.tile(NOMINAL, (len(heights), 1)))
 
     def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
         """The maps of some slots, None of a bank without any."""
@@ -83,6 +97,12 @@ class TerrainBank:
             maps.friction.fill_(1.0)
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
+        if self.conditions is not None:
+            rows = space.conditions_of(valid)
+            self.conditions[slots].assign(rows)
+            scale_friction(self.conditions[slots], maps.friction)
+        elif space.conditions:
+            raise ValueError(f"{space.name} has conditions, got a bank without: give with_conditions=True")
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""
@@ -116,7 +136,9 @@ def terrains_of(
     None.
     """
     device = device or host_device()
-    bank = TerrainBank(len(genes), device=device, with_ground=bool(space.ground))
+    bank = TerrainBank(
+        len(genes), device=device, with_ground=bool(space.ground), with_conditions=bool(space.conditions)
+    )
     with wp.ScopedDevice(device):
         bank.set_genes(genes, space)
         return np.array(bank.heights.numpy()), bank.ground_maps()

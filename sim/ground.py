@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
+from sim.conditions import KINDS as CONDITION_KINDS
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
-_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(GROUND_KINDS)}))+)$")
+_KINDS = (*GROUND_KINDS, *CONDITION_KINDS)
+_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(_KINDS)}))+)$")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,13 +77,13 @@ def check_map(kind: str, values: NDArray[np.floating]) -> None:
 
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
-    """The name of a space without its ground, and what that has maps of: ``course+friction`` is of ``course``."""
+    """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
     suffix = _SUFFIX.search(name)
     if suffix is None or suffix.start() == 0:
         return name, ()
-    return name[: suffix.start()], tuple(kind for kind in GROUND_KINDS if f"+{kind}" in suffix[1])
+    return name[: suffix.start()], tuple(kind for kind in _KINDS if f"+{kind}" in suffix[1])
 
 
 def joined_name(name: str, kinds: Sequence[str]) -> str:
-    """The name of a space whose ground has maps of some kinds."""
+    """The name of a space with ground or conditions of some kinds."""
     return "+".join((name, *kinds))

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from kernels.conditions import disturb_observation, push
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
@@ -166,7 +167,8 @@ class Rollout:
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
         from sim.simulation import Simulation  # Newton takes seconds to load: only what simulates loads it
 
-        bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground)
+        conditions = bool(self.space.conditions)
+        bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground, with_conditions=conditions)
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes
@@ -215,6 +217,8 @@ class Rollout:
         park_ended(
             self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
         )
+        if sim.disturbed is not None:
+            push(self._episode, sim.disturbed, robot.physics_dt, robot.decimation, sim.joint_qd)
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
@@ -243,11 +247,16 @@ class Rollout:
             begin_episodes(begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         sim.clear_solver(begins)
+        sim.begin_conditions(begins)
         command_goal(sim.joint_q, self._episode.outcome, self._task, self.command)
         write_observation(
             sim.joint_q, sim.joint_qd, self.command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
             sim.sensors, Noise(), self._counter, self._observation,
         )  # fmt: skip
+        if sim.disturbed is not None:
+            disturb_observation(
+                self._episode, self.robot.num_joints, self.robot.control_dt, sim.disturbed, self._observation
+            )
 
     @property
     def num_free(self) -> int:

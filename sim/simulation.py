@@ -1,18 +1,22 @@
 """Parallel robots on height grids, one world each: Newton's MuJoCo model, terrain contact and steps of our own."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
+from kernels.conditions import Condition, Disturbed, begin_conditions
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay_targets, limit_torques, tell_solver
 from kernels.ground import Ground
 from kernels.observation import Sensors
 from kernels.restart import clear_rows
+from kernels.state import make_zeros
 from sim.bank import TerrainBank
+from sim.conditions import MOST_DELAY_S, MOST_LAG_S, NoiseCfg
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.robots.compiled import robot_spec
 from sim.robots.model import builder_of
@@ -39,6 +43,7 @@ class Simulation:
             transforms of shape (num_envs, bodies_per_env).
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
         geom_of_shape: The solver's number of each.
+        disturbed: What the conditions of running episodes need; None of a bank without conditions.
         motors: Effort limit [N m], stall torque [N m] and speed limit [rad/s] of each actuator, vectors of shape
             (num_actuators,); None without DC motors.
     """
@@ -81,6 +86,7 @@ class Simulation:
             self._build_solver(cfg or SolverCfg(), of_file)
             self._build_contact(builder)
             self._build_views()
+            self._build_conditions()
 
     def _build_model(self, builder: newton.ModelBuilder) -> None:
         scene = newton.ModelBuilder(gravity=builder.gravity)
@@ -191,12 +197,34 @@ class Simulation:
             joints = self._coordinates.target_of_actuator.numpy() - 7
             motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
-        if robot.drive_delay_steps:
+        most = robot.drive_delay_steps
+        if self.bank.conditions is not None:
+            most += round(MOST_DELAY_S / robot.physics_dt)
+        if most:
             delay = self._delay = Delay()
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
             delay.age = wp.zeros((self.num_envs, 1), dtype=int)
-            delay.former = wp.zeros((self.num_envs, 1 + robot.drive_delay_steps, robot.num_joints), dtype=float)
+            delay.former = wp.zeros((self.num_envs, 1 + most, robot.num_joints), dtype=float)
             self._due_targets = wp.zeros_like(self.targets)
+
+    def _build_conditions(self) -> None:
+        self.disturbed = None
+        if self.bank.conditions is None:
+            return
+        if isinstance(self._dynamics, TheirDynamics):
+            raise ValueError(
+                f"robot '{self.robot.name}' cannot have conditions, since its model takes mujoco_warp's own step "
+                "(sim/solver.py says why): leave conditions out"
+            )
+        self._varied = self._dynamics.vary_bases()
+        most, size = round(MOST_LAG_S / self.robot.control_dt), self.robot.observation_size
+        disturbed = make_zeros(
+            Disturbed, str(self.device), row=(self.num_envs, len(Condition)), age=(self.num_envs, 1),
+            former=(self.num_envs, 1 + most, size),
+        )  # fmt: skip
+        for name, width in asdict(NoiseCfg()).items():
+            setattr(disturbed.noise, name, width)
+        self.disturbed = disturbed
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
@@ -224,6 +252,16 @@ class Simulation:
         )
         coordinates.base_com = self.sensors.base_com
         return coordinates
+
+    def begin_conditions(self, begins: Any) -> None:
+        """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""
+        if self.disturbed is not None:
+            assert self._delay is not None
+            tree, robots, nominal = self._varied
+            begin_conditions(
+                begins, self.terrain_of_env, self.bank.conditions, nominal, self.robot.drive_delay_steps,
+                self.robot.physics_dt, tree, robots, self._delay, self.disturbed,
+            )  # fmt: skip
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""

@@ -12,6 +12,7 @@ from mujoco_warp._src import types
 from numpy.typing import NDArray
 
 from kernels import dynamics, lanes, solver
+from kernels.conditions import BASE, Nominal
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, ask_forces, tell_contacts
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
@@ -134,6 +135,7 @@ class Dynamics:
     def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, parked: Any) -> None:
         """For a model that :func:`fits`, and its contacts, whose forces are written; some worlds may be parked."""
         self._tree_sizes, self._sizes, self.surfaces = tree_sizes_of(m), sizes_of(m, contacts), surfaces
+        self._num_worlds = d.nworld
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
         actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)
@@ -161,6 +163,20 @@ class Dynamics:
         robots.control, robots.inertia, robots.parked = d.ctrl, d.M, parked
         problem.contacts, problem.surfaces = contacts, surfaces
         problem.qacc_warmstart, problem.iterations, problem.overflow = d.qacc_warmstart, d.solver_niter, d.overflow
+
+    def vary_bases(self) -> tuple[Tree, Robots, Nominal]:
+        """Gives each world a base and motors of its own, for :func:`kernels.conditions.begin_conditions`."""
+        tree, robots, nominal = self._tree, self._robots, Nominal()
+        with wp.ScopedDevice(robots.qpos.device):
+            for name in ("body_mass", "subtree_mass", "body_ipos", "body_iquat", "body_inertia"):
+                array = getattr(tree, name)
+                rows = np.broadcast_to(array.numpy(), (self._num_worlds, *array.numpy().shape[1:]))
+                setattr(tree, name, wp.array(rows, dtype=array.dtype))
+            for name, of_tree in _OF_NOMINAL.items():
+                array = getattr(tree, of_tree)
+                setattr(nominal, name, wp.array(array.numpy()[:, BASE], dtype=array.dtype))
+            robots.strength = wp.ones(self._num_worlds, dtype=float)
+        return tree, robots, nominal
 
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
@@ -191,6 +207,10 @@ _OF_PROBLEM = {
     "is_ancestor": "body_isdofancestor", "inertia_row": "M_hinit_i", "inertia_col": "M_colind",
 }  # fmt: skip
 """Arrays of mujoco_warp's model by their names in :class:`Tree` and :class:`Problem`."""
+_OF_NOMINAL = {
+    "mass": "body_mass", "total_mass": "subtree_mass", "centre": "body_ipos", "frame": "body_iquat",
+    "inertia": "body_inertia",
+}  # fmt: skip
 _NOT_OVER_WORLDS = ("body_isdofancestor", "actuator_forcerange")
 """Of arrays with several dimensions: what a drive writes anew in each step may come to differ."""
 

@@ -21,6 +21,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from kernels.conditions import Condition
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import BASE, PENALTIES
@@ -28,6 +29,7 @@ from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.bank import TerrainBank, terrains_of
+from sim.conditions import NOMINAL
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
 from sim.crossing import resolved as with_contact_resolved
 from sim.ground import GroundMaps
@@ -37,9 +39,11 @@ from sim.mujoco_c.model import (
     Starts,
     crossing_model,
     goal_commands,
+    noise_widths,
     observations,
     step_penalties,
     to_mujoco,
+    vary_model,
 )
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
@@ -90,7 +94,8 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
 class Episodes:
     """States of the episodes of one terrain, stepped one by one."""
 
-    def __init__(self, robot: RobotCfg, model: Any, starts: Starts) -> None:
+    def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: NDArray[np.floating] = NOMINAL) -> None:
+        """From ``starts`` on, under ``conditions`` (12,); payload, strength and friction are the model's."""
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
         self.data = [_mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
@@ -98,11 +103,13 @@ class Episodes:
         self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
         self.warned = np.zeros(len(self.data), bool)
-        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1].copy()
+        self._strength = float(conditions[Condition.STRENGTH])
+        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1] / self._strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
-        self._delayed = deque([self._targets.copy()] * robot.drive_delay_steps)
+        steps = robot.drive_delay_steps + round(float(conditions[Condition.DELAY]) / robot.physics_dt)
+        self._delayed = deque([self._targets.copy()] * steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
         """One physics step of the numbered episodes."""
@@ -114,11 +121,18 @@ class Episodes:
             if self._motors is not None:
                 (stall, limit), effort = self._motors, self._effort
                 lost = stall * data.qvel[6 + self._joints] / limit
-                self._model.actuator_forcerange[:] = np.clip([-stall - lost, stall - lost], -effort, effort).T
+                limits = np.clip([-stall - lost, stall - lost], -effort, effort).T
+                self._model.actuator_forcerange[:] = self._strength * limits
             _mj.mj_step(self._model, data)
             self.qpos[k], self.qvel[k] = data.qpos, data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
+
+    def push(self, running: NDArray[np.intp], velocity: Array) -> None:
+        """Adds to the velocities [m/s, world frame] of the bases of the numbered episodes."""
+        for k in running:
+            self.data[k].qvel[:2] += velocity
+            self.qvel[k] = self.data[k].qvel
 
     def hold(self, running: NDArray[np.intp], targets: Array) -> None:
         """Sets the joint targets [rad] of the numbered episodes; they count after the delay of the robot's drives."""
@@ -150,14 +164,21 @@ def cross(
     *,
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
+    conditions: NDArray[np.floating] = NOMINAL,
 ) -> RolloutResult:
     """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
 
     It does not tell why an episode is invalid. Heights are those of one terrain [m], shape (nrow, ncol), and so is its
-    ground; the contact time constant is that of the robot's file if None.
+    ground; the contact time constant is that of the robot's file if None. Conditions are a row, shape (12,); noise is
+    drawn otherwise than in the parallel simulation.
     """
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
-    episodes = Episodes(robot, model, starts)
+    vary_model(model, conditions)
+    episodes = Episodes(robot, model, starts, conditions)
+    lag = round(float(conditions[Condition.LAG]) / robot.control_dt)
+    former: deque[Array] = deque(maxlen=1 + lag)
+    width = float(conditions[Condition.NOISE]) * noise_widths(robot)
+    rng, push_at = np.random.default_rng(0), float(conditions[Condition.PUSH_TIME]) / robot.physics_dt
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
@@ -178,6 +199,8 @@ def cross(
             rows[running] = observations(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )
+            former.append(rows + width * rng.uniform(-1.0, 1.0, rows.shape))
+            rows = former[0].copy()
             asked = rows if remembers else rows[running]
             action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
             action = action[running] if remembers else action
@@ -185,6 +208,8 @@ def cross(
             action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
             last_action[running] = action
             episodes.hold(running, default + robot.action_scale * action)
+            if step <= round(push_at) < step + robot.decimation:
+                episodes.push(running, conditions[[Condition.PUSH_X, Condition.PUSH_Y]].astype(np.float64))
         episodes.step(running)
         judged = _judge(robot, episodes, running, base)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT

@@ -14,7 +14,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.conditions import Condition
 from kernels.penalties import PENALTIES
+from sim.conditions import NoiseCfg
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
 from sim.maps.hfield import Margins, as_hfield
@@ -203,6 +205,41 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
     model.geom_solimp[geoms[soft]] = impedance, impedance, 0.001, 1.0, 0.5
     model.geom_priority[geoms] = 1
+
+
+def vary_model(model: Any, conditions: NDArray[np.floating]) -> None:
+    """Gives the robot of a model a payload, other motors and other friction, by a row of conditions (12,)."""
+    row, base = np.asarray(conditions, np.float64), 1
+    strength = row[Condition.STRENGTH]
+    model.actuator_gainprm[:, 0] *= strength
+    model.actuator_biasprm[:, :3] *= strength
+    model.actuator_forcerange[:] *= strength
+    model.jnt_actfrcrange[:] *= strength
+    model.geom_friction[:, 0] *= row[Condition.FRICTION]
+    added = row[Condition.PAYLOAD] * model.body_subtreemass[base]
+    if added:
+        mass, offset = model.body_mass[base], row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y, Condition.PAYLOAD_Z]]
+        moved = added / (mass + added) * offset
+        axes = rotation_matrix(model.body_iquat[base])
+        inertia = axes @ np.diag(model.body_inertia[base]) @ axes.T
+        for kilograms, d in ((mass, moved), (added, offset - moved)):
+            inertia += kilograms * (d @ d * np.eye(3) - np.outer(d, d))
+        moments, axes = np.linalg.eigh(inertia)
+        axes[:, 2] *= np.linalg.det(axes)  # right-handed
+        _mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
+        model.body_inertia[base], model.body_mass[base] = moments, mass + added
+        model.body_ipos[base] += moved
+        model.body_subtreemass[[0, base]] += added
+
+
+def noise_widths(robot: RobotCfg) -> Array:
+    """Half widths of the noise of each column of an observation, shape (observation_size,)."""
+    noise, joints = NoiseCfg(), robot.num_joints
+    groups = [
+        (3, 2.0 * noise.lin_vel), (3, 0.25 * noise.ang_vel), (3, noise.gravity), (3, 0.0), (joints, noise.joint_pos),
+        (joints, 0.05 * noise.joint_vel), (joints, 0.0), (len(robot.scan_points()[0]), 5.0 * noise.scan),
+    ]  # fmt: skip
+    return np.concatenate([np.full(count, width) for count, width in groups])
 
 
 def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:

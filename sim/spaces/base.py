@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
+from sim.conditions import NOMINAL
 from sim.terrain import Seed
 
 MOST_HEIGHT = 0.25
@@ -32,6 +33,8 @@ class TerrainSpace:
     """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
     ground: tuple[str, ...] = ()
     """What its terrains have maps of beside heights, some of :data:`sim.ground.GROUND_KINDS`."""
+    conditions: tuple[str, ...] = ()
+    """Conditions that it has genes of, some of :data:`sim.conditions.KINDS`."""
     height_share: float = 1.0
     """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
 
@@ -45,6 +48,10 @@ class TerrainSpace:
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
+
+    def conditions_of(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Rows of conditions (:class:`kernels.conditions.Condition`), shape (num_terrains, 12)."""
+        return np.tile(NOMINAL, (len(np.asarray(genes)), 1))
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""

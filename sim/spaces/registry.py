@@ -4,11 +4,12 @@ import re
 import shlex
 from dataclasses import replace
 
-from sim.ground import joined_name, split_name
+from sim.ground import GROUND_KINDS, joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
 from sim.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace
+from sim.spaces.conditions import UnderConditions
 from sim.spaces.course import COURSE
 from sim.spaces.ground import OnGround
 from sim.spaces.own import load_own
@@ -56,9 +57,12 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     root, _, height = base.rpartition("@")
     lower = root in SPACES and _HEIGHT.fullmatch(height)
     space = at_height(SPACES[root], float(height)) if lower else SPACES.get(base) or _find_loaded(base, sha256)
-    if kinds and space.ground:
-        raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(kinds)} out")
-    return OnGround(space, kinds) if kinds else space
+    ground = tuple(kind for kind in kinds if kind in GROUND_KINDS)
+    conditions = tuple(kind for kind in kinds if kind not in GROUND_KINDS)
+    if ground and space.ground:
+        raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(ground)} out")
+    space = OnGround(space, ground) if ground else space
+    return UnderConditions(space, conditions) if conditions else space
 
 
 def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:
@@ -77,6 +81,8 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
 
 def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     """A shipped space whose heights are those of a robot for which the highest bump is ``height`` [m]."""
+    if isinstance(space, UnderConditions):
+        return UnderConditions(at_height(space.inner, height), space.conditions)
     if isinstance(space, OnGround):
         return OnGround(at_height(space.inner, height), space.ground)
     if not isinstance(space, ShippedSpace):

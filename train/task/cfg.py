@@ -6,22 +6,11 @@ from typing import Annotated, Any, Self
 
 from msgspec import Meta
 
+from sim.conditions import NoiseCfg
 from sim.files.settings import Interval, NonNegativeFloat, NonNegativeInt, PositiveFloat, problems
 from sim.robots.robot import RobotCfg
 from sim.robots.training import MOST_SPREAD, TrainingCfg
 from sim.terrain import NUM_LEVELS
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoiseCfg:
-    """Half widths of the uniform observation noise, in the units of the measured quantity."""
-
-    lin_vel: NonNegativeFloat = 0.1
-    ang_vel: NonNegativeFloat = 0.2
-    gravity: NonNegativeFloat = 0.05
-    joint_pos: NonNegativeFloat = 0.01
-    joint_vel: NonNegativeFloat = 1.5
-    scan: NonNegativeFloat = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,115 @@
+"""Conditions of a crossing on the host: what there is, as genes and in words (:mod:`kernels.conditions`)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.conditions import Condition
+from sim.files.settings import NonNegativeFloat
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseCfg:
+    """Half widths of the uniform observation noise, in the units of the measured quantity: those of legged_gym."""
+
+    lin_vel: NonNegativeFloat = 0.1
+    ang_vel: NonNegativeFloat = 0.2
+    gravity: NonNegativeFloat = 0.05
+    joint_pos: NonNegativeFloat = 0.01
+    joint_vel: NonNegativeFloat = 1.5
+    scan: NonNegativeFloat = 0.1
+
+
+NOMINAL = np.array([condition in (Condition.STRENGTH, Condition.FRICTION) for condition in Condition], np.float32)
+"""A row of conditions that change nothing, shape (12,)."""
+MOST_DELAY_S = MOST_LAG_S = 0.04
+"""Longest delay of actions, beside the robot's own, and largest age of observations [s]."""
+
+
+@dataclass(frozen=True)
+class Gene:
+    """How a gene in [-1, 1] becomes a condition: ``middle`` at 0, and linear on both sides."""
+
+    condition: Condition
+    least: float
+    middle: float
+    most: float
+    absent: float = 0.0
+    """The gene that changes nothing."""
+
+    def value(self, genes: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Conditions of genes, any shape."""
+        genes = np.clip(np.asarray(genes, np.float64), -1.0, 1.0)
+        return np.where(genes < 0.0, self.middle + genes * (self.middle - self.least),
+                        self.middle + genes * (self.most - self.middle))  # fmt: skip
+
+    def gene(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Genes of conditions, any shape; outside of the limits those at the limit."""
+        values = np.asarray(values, np.float64) - self.middle
+        span = np.where(values < 0.0, self.middle - self.least, self.most - self.middle)
+        return np.clip(values / span, -1.0, 1.0)
+
+
+KINDS: dict[str, tuple[Gene, ...]] = {
+    "payload": (
+        Gene(Condition.PAYLOAD, -0.05, 0.0, 0.25),
+        Gene(Condition.PAYLOAD_X, -0.2, 0.0, 0.2),
+        Gene(Condition.PAYLOAD_Y, -0.2, 0.0, 0.2),
+    ),
+    "motors": (Gene(Condition.STRENGTH, 0.5, 1.0, 1.2),),
+    "delay": (Gene(Condition.DELAY, 0.0, MOST_DELAY_S / 2, MOST_DELAY_S, absent=-1.0),),
+    "lag": (Gene(Condition.LAG, 0.0, MOST_LAG_S / 2, MOST_LAG_S, absent=-1.0),),
+    "noise": (Gene(Condition.NOISE, 0.0, 1.5, 3.0, absent=-1.0),),
+    "push": (
+        Gene(Condition.PUSH_X, -1.0, 0.0, 1.0),
+        Gene(Condition.PUSH_Y, -1.0, 0.0, 1.0),
+        Gene(Condition.PUSH_TIME, 0.0, 8.0, 16.0),
+    ),
+    "grip": (Gene(Condition.FRICTION, 0.3, 1.0, 1.2),),
+}
+"""Conditions that a space may have, each of one to three genes."""
+
+
+def genes_of(kinds: Sequence[str]) -> tuple[Gene, ...]:
+    """Genes of some kinds, in their order."""
+    return tuple(gene for kind in kinds for gene in KINDS[kind])
+
+
+def rows_of(genes: NDArray[np.floating], kinds: Sequence[str]) -> NDArray[np.float32]:
+    """Rows of conditions, shape (N, 12), of genes of some kinds, (N, number of them)."""
+    rows = np.tile(NOMINAL, (len(genes), 1))
+    for column, gene in enumerate(genes_of(kinds)):
+        rows[:, gene.condition] = gene.value(genes[:, column])
+    return rows
+
+
+_SIDES = {(True, 1): "ahead of", (True, -1): "behind", (False, 1): "left of", (False, -1): "right of"}
+
+
+def words_of(kind: str, row: NDArray[np.float32]) -> str:
+    """One kind of a row of conditions in words; empty where it changes nothing."""
+    payload, strength, push = row[Condition.PAYLOAD], row[Condition.STRENGTH], row[[Condition.PUSH_X, Condition.PUSH_Y]]
+    if kind == "payload" and payload:
+        offsets = row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y]]
+        places = [
+            f"{abs(offset):.2f} m {_SIDES[axis == 0, 1 if offset > 0 else -1]}"
+            for axis, offset in enumerate(offsets) if abs(offset) >= 0.005
+        ]  # fmt: skip
+        where = f", {' and '.join(places)} its centre" if places else ""
+        return f"payload of {payload:.1%} of its mass{where}" if payload > 0 else f"{-payload:.1%} of its mass less"
+    if kind == "motors" and strength != 1.0:
+        return f"motors at {strength:.0%}"
+    if kind == "delay" and row[Condition.DELAY] > 0.0:
+        return f"actions {1000 * row[Condition.DELAY]:.0f} ms late"
+    if kind == "lag" and row[Condition.LAG] > 0.0:
+        return f"observations {1000 * row[Condition.LAG]:.0f} ms old"
+    if kind == "noise" and row[Condition.NOISE] > 0.0:
+        return f"noise {row[Condition.NOISE]:.1f} times legged_gym's"
+    if kind == "push" and push.any():
+        return f"pushed by {push[0]:+.1f} m/s along and {push[1]:+.1f} m/s across the way after " \
+               f"{row[Condition.PUSH_TIME]:.0f} s"  # fmt: skip
+    if kind == "grip" and row[Condition.FRICTION] != 1.0:
+        return f"friction times {row[Condition.FRICTION]:.2f}"
+    return ""

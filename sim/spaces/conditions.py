@@ -1,0 +1,90 @@
+"""Any terrain space, and some genes more for the conditions under which robots cross."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels.ground import Ground
+from sim.conditions import KINDS, genes_of, rows_of, words_of
+from sim.ground import joined_name
+from sim.spaces.base import Seed, TerrainSpace, clipped
+
+
+class UnderConditions(TerrainSpace):
+    """The terrains of a space, crossed under conditions (:mod:`sim.conditions`).
+
+    The genes of the space come first, then those of each kind of condition. A kind is a part.
+    """
+
+    def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
+        """``kinds`` are some of :data:`sim.conditions.KINDS`, in their order."""
+        self.inner, self.conditions = inner, kinds
+        self.name = joined_name(inner.name, kinds)
+        self.num_genes = inner.num_genes + len(genes_of(kinds))
+        for name in ("sha256", "sigma0", "any_spacing", "height_share", "ground"):
+            setattr(self, name, getattr(inner, name))
+        self.genes_per_part = None  # kinds have one to three genes
+
+    def _split(self, genes: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Clipped genes of terrains and of conditions."""
+        rows = clipped(genes)
+        return rows[..., : self.inner.num_genes], rows[..., self.inner.num_genes :]
+
+    def conditions_of(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Rows of conditions, shape (num_terrains, 12)."""
+        return rows_of(self._split(genes)[1], self.conditions)
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
+        """Turns genes into heights on the device, by the space."""
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into maps on the device, by the space."""
+        self.inner.lay_ground(genes[:, : self.inner.num_genes].contiguous(), ground_out)
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Hard-random terrains of the space, each condition at one of its limits."""
+        rng = np.random.default_rng(seed)
+        terrains = self.inner.hard_random(count, rng)
+        limits = rng.choice([-1.0, 1.0], (count, self.num_genes - self.inner.num_genes))
+        return np.concatenate([terrains, limits.astype(np.float32)], axis=1)
+
+    def _words(self, genes: ArrayLike) -> list[str]:
+        row = self.conditions_of(np.asarray(genes)[None])[0]
+        return [words_of(kind, row) for kind in self.conditions]
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Those of the space, then each kind of condition in words."""
+        words = [word or f"no {kind}" for kind, word in zip(self.conditions, self._words(genes), strict=True)]
+        return (*self.inner.parts(self._split(genes)[0]), *words)
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes without some parts: a condition that changes nothing is absent."""
+        changed = self.validate(genes).copy()
+        first = self.inner.num_genes
+        if len(changed):
+            count = len(self.inner.parts(changed[0, :first]))
+            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
+            for part in parts:
+                if part >= count:
+                    before = len(genes_of(self.conditions[: part - count]))
+                    absent = [gene.absent for gene in KINDS[self.conditions[part - count]]]
+                    changed[:, first + before : first + before + len(absent)] = absent
+        return changed
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes with heights scaled by the space; conditions stay as they are."""
+        rows, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(rows[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+
+    def describe(self, genes: ArrayLike) -> str:
+        """The terrain of the space in words, and the conditions in a line behind it."""
+        words = ", ".join(filter(None, self._words(genes)))
+        return "\n".join([self.inner.describe(self._split(genes)[0]), words or "nominal conditions"])
+
+    def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
+        """Those of the space."""
+        return self.inner.spans(self._split(genes)[0])

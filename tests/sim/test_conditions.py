@@ -1,0 +1,229 @@
+"""Conditions in the parallel simulation, against plain MuJoCo C and against what they mean."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.conditions import Condition
+from sim.conditions import KINDS, NOMINAL, genes_of
+from sim.crossing import CrossingCfg
+from sim.mujoco_c.crossing import cross, draw_starts
+from sim.mujoco_c.model import crossing_model, noise_widths, vary_model
+from sim.policy.loaders import load_policy
+from sim.robots.compiled import robot_spec
+from sim.rollout import Rollout
+from sim.spaces.registry import get_space, identity
+from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+
+ALL = "super_gaussian+" + "+".join(KINDS)
+SPACE = get_space(ALL)
+EPISODES = 3
+FLAT_GENES = np.zeros(SUPER_GAUSSIAN.num_genes, np.float32)
+
+
+def genes(**values: float) -> np.ndarray:
+    """A row of flat ground under some conditions by their names; the others are nominal."""
+    named = {Condition[name.upper()]: value for name, value in values.items()}
+    row = [gene.gene(named[gene.condition]) if gene.condition in named else gene.absent for gene in genes_of(KINDS)]
+    return np.concatenate([FLAT_GENES, np.float32(row)])
+
+
+CASES = {
+    "payload": {"payload": 0.15, "payload_x": -0.15, "payload_y": 0.1},
+    "motors": {"strength": 0.7},
+    "delay": {"delay": 0.02},
+    "lag": {"lag": 0.02},
+    "push": {"push_x": -0.4, "push_y": 0.6, "push_time": 0.1},
+    "grip": {"friction": 0.5},
+}
+
+
+@pytest.fixture(scope="module")
+def rollouts(anymal):
+    """Rollouts that have conditions, by the robot's name, each built once."""
+    made = {}
+
+    def of(robot, policy):
+        if robot.name not in made:
+            sizes = {"num_terrains": 1, "num_replicas": EPISODES, "device": "cpu", "space": SPACE}
+            made[robot.name] = Rollout(robot, policy, **sizes)
+        return made[robot.name]
+
+    return of
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, rollouts, case):
+    row, seconds = genes(**CASES[case]), 0.2 if case == "grip" else 0.3  # later each slips in its way
+    conditions = SPACE.conditions_of(row[None])[0]
+    for name, value in CASES[case].items():
+        assert conditions[Condition[name.upper()]] == pytest.approx(value, rel=1e-5)
+    rollout = rollouts(anymal, anymal.policy_file)
+    rollout.clear()
+    rollout.put(row[None], np.array([1000], np.uint32))
+    heights = rollout.sim.bank.heights.numpy()[0]
+    assert not heights.any()
+    for _ in range(round(seconds / anymal.control_dt)):
+        rollout.control_step()
+    order = np.argsort(rollout.episode.numpy())
+    ours = rollout.sim.joint_q.numpy()[order]
+    starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
+    plain, nominal = (crossed(anymal, heights, starts, seconds, row) for row in (conditions, NOMINAL))
+    np.testing.assert_allclose(ours[:, :3], plain[:, :3], atol=1e-3)
+    np.testing.assert_allclose(ours[:, 7:], plain[:, 7:], atol=0.02)
+    columns = [0, 1, 2, *range(7, ours.shape[1])]
+    apart, changed = np.abs(ours - plain)[:, columns], np.abs(plain - nominal)[:, columns]
+    assert apart.max() < 0.25 * changed.max()  # or nothing was tested
+
+
+def crossed(robot, heights, starts, seconds, conditions):
+    """Final states in plain MuJoCo C."""
+    seen = []
+    policy = load_policy(robot.policy_file, robot, "cpu")
+    with pytest.MonkeyPatch.context() as patch:
+        import sim.mujoco_c.crossing as module
+
+        class Seen(module.Episodes):
+            def __init__(self, *given):
+                super().__init__(*given)
+                seen.append(self)
+
+        patch.setattr(module, "Episodes", Seen)
+        cross(dataclasses.replace(robot, max_duration_s=seconds), policy, heights, starts, conditions=conditions)
+    return seen[0].qpos
+
+
+CFG = CrossingCfg(start=(10.0, 4.0))  # 3.5 m to the goal
+
+
+def test_nominal_conditions_change_no_bit(robot):
+    short = dataclasses.replace(robot, max_duration_s=0.4)
+    sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu"}
+    terrains, seeds = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32)
+    without = Rollout(short, robot.policy_file, **sizes).evaluate(terrains, seeds)
+    nominal = np.concatenate([terrains, np.tile(genes()[64:], (2, 1))], axis=1)
+    plain = Rollout(short, robot.policy_file, **sizes, space=SPACE).evaluate(nominal, seeds)
+    np.testing.assert_array_equal(plain.penalties, without.penalties)
+    np.testing.assert_array_equal(plain.final_position, without.final_position)
+
+
+def test_an_episode_depends_on_its_own_conditions_alone(anymal, device):
+    """Beside others, in another slot, by a robot that walked under other conditions before."""
+    short = dataclasses.replace(anymal, max_duration_s=1.0)
+    many = [genes(), *(genes(**case) for case in CASES.values()), genes(noise=2.0)]
+    rows, seeds = np.stack(many), np.full(len(many), 5, np.uint32)
+    sizes = {"num_replicas": 2, "device": device, "space": SPACE, "cfg": CFG}
+    alone = Rollout(short, anymal.policy_file, num_terrains=len(rows), **sizes).evaluate(rows, seeds)
+    few = Rollout(short, anymal.policy_file, num_terrains=len(rows), num_envs=3, **sizes)
+    order = np.random.default_rng(0).permutation(len(rows))
+    for _ in range(2):
+        result = few.evaluate(rows[order], seeds)
+        if device == "cpu":
+            np.testing.assert_array_equal(result.final_position, alone.final_position[order])
+            np.testing.assert_array_equal(result.penalties, alone.penalties[order])
+    ends = alone.final_position[:, 0]
+    apart = np.linalg.norm(ends[:, None] - ends, axis=2) + np.eye(len(rows))
+    assert apart.min() > 1e-4  # each condition does something
+
+
+def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(anymal, rollouts):
+    seen = {}
+    for name, row in {"none": genes(), "noise": genes(noise=2.0), "lag": genes(lag=0.04)}.items():
+        rollout = rollouts(anymal, anymal.policy_file)
+        rollout.clear()
+        rollout.put(row[None], np.array([7], np.uint32))
+        order = np.argsort(rollout.episode.numpy())
+        rows = [rollout._observation.numpy()[order].copy()]
+        for _ in range(4):
+            rollout._action.fill_(0.1)  # the same motion, whatever is seen
+            rollout.sim.launch(rollout._step_graph)
+            rollout.sim.launch(rollout._turn_graph)
+            rows.append(rollout._observation.numpy()[order].copy())
+        seen[name] = np.array(rows)
+    added, widths = seen["noise"] - seen["none"], 2.0 * noise_widths(anymal)
+    assert (np.abs(added) <= widths + 1e-5).all() and not added[..., widths == 0.0].any()
+    share = (added / np.where(widths > 0.0, widths, 1.0))[..., widths > 0.0]
+    assert share.std() == pytest.approx(1 / np.sqrt(3), rel=0.05) and abs(share.mean()) < 0.05
+    assert np.abs(np.corrcoef(share.reshape(15, -1)) - np.eye(15)).max() < 0.35  # another one in each step and episode
+    np.testing.assert_array_equal(seen["lag"][:3], np.repeat(seen["none"][:1], 3, axis=0))
+    np.testing.assert_array_equal(seen["lag"][3:], seen["none"][1:3])
+
+
+def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, device):
+    rows = np.stack([genes(), genes(strength=0.6)])
+    rollout = Rollout(anymal, anymal.policy_file, num_terrains=2, num_replicas=1, device=device, space=SPACE)
+    rollout.put(rows, np.array([3, 3], np.uint32))
+    sim, order = rollout.sim, np.argsort(rollout.episode.numpy())
+    for angle in (0.1, 50.0):  # the second asks for more than there is
+        sim.targets.assign(np.float32(np.tile([0.0] * 7 + [angle] * 12, (2, 1))))
+        with wp.ScopedDevice(device):
+            sim._dynamics.find()
+            sim.physics_step()
+        strong, weak = sim.joint_torque.numpy()[order][:, 6:]
+        if angle == 50.0:
+            limits = sim.solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
+            np.testing.assert_allclose(np.sort(np.abs(strong)), np.sort(limits), rtol=1e-5)
+            np.testing.assert_allclose(weak, 0.6 * strong, rtol=1e-5)
+        assert (np.abs(weak) < np.abs(strong)).all()
+
+
+def test_a_payload_is_a_point_mass_on_the_base(anymal):
+    row = SPACE.conditions_of(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0]
+    plain, loaded = (crossing_model(anymal, np.zeros((161, 321), np.float32)) for _ in range(2))
+    vary_model(loaded, row)
+    mass = plain.body_subtreemass[1]
+    assert loaded.body_subtreemass[1] == pytest.approx(1.2 * mass)
+    moved = loaded.body_ipos[1] - plain.body_ipos[1]
+    np.testing.assert_allclose(moved * loaded.body_mass[1], 0.2 * mass * np.array([0.1, -0.2, 0.0]), rtol=1e-5)
+    # Against MuJoCo's own sum: a body of nothing but this mass, fixed to the base.
+    spec = robot_spec(anymal)
+    base = spec.bodies[1]
+    base.add_body(
+        name="payload", pos=plain.body_ipos[1] + [0.1, -0.2, 0.0], mass=0.2 * mass, ipos=[0.0] * 3,
+        inertia=[1e-9] * 3, explicitinertial=True,
+    )  # fmt: skip
+    theirs, inertias = spec.compile(), []
+    for model in (loaded, theirs):
+        data = mujoco.MjData(model)
+        data.qpos[2:7] = 1.0, *np.array([0.5, 0.5, -0.5, 0.5])
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        inertias.append(full)
+    np.testing.assert_allclose(inertias[0], inertias[1], atol=1e-5)
+
+
+def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
+    monkeypatch.setattr("sim.solver.fits", lambda *_: False)
+    with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
+        Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=1, device="cpu", space=SPACE)
+
+
+def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing():
+    rows = SPACE.uniform_random(3, 1)
+    words = SPACE.parts(rows[0])
+    assert len(words) == 8 + len(KINDS) and SPACE.num_genes == 64 + 11
+    without = SPACE.without(rows, range(8, 8 + len(KINDS)))
+    acts = np.arange(len(Condition)) != Condition.PUSH_TIME  # which means nothing without a push
+    assert (SPACE.conditions_of(without) == NOMINAL)[:, acts].all() and (without[:, :64] == rows[:, :64]).all()
+    only = SPACE.without(rows, [8 + list(KINDS).index("push")])
+    changed = SPACE.conditions_of(only) != SPACE.conditions_of(rows)
+    assert changed[:, [Condition.PUSH_X, Condition.PUSH_Y]].all() and changed[:, : Condition.PUSH_X].sum() == 0
+    described = SPACE.describe(genes(payload=0.08, payload_x=-0.12, delay=0.02, friction=0.7)).splitlines()[-1]
+    assert described == "payload of 8.0% of its mass, 0.12 m behind its centre, actions 20 ms late, friction times 0.70"
+    assert SPACE.describe(genes()).splitlines()[-1] == "nominal conditions"
+    on_ice = get_space("course+friction+push")
+    assert (on_ice.ground, on_ice.conditions, on_ice.num_genes) == (("friction",), ("push",), 36 + 32 + 3)
+    assert identity("course+push", None) == "course+push"
+
+
+def test_values_and_genes_are_each_others_inverse():
+    for gene in genes_of(KINDS):
+        if gene.condition != Condition.PUSH_TIME:  # which means nothing without a push
+            assert gene.value(np.array([gene.absent])) == NOMINAL[gene.condition]
+        values = np.linspace(gene.least, gene.most, 9)
+        np.testing.assert_allclose(gene.value(gene.gene(values)), values, atol=1e-12)
+        np.testing.assert_allclose(gene.value(np.array([-5.0, 5.0])), [gene.least, gene.most])
