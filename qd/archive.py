@@ -58,6 +58,11 @@ class FaultCounts:
     """By them at the search's settings, shape (N, C, 4)."""
     certifier_resolved_outcomes: NDArray[np.int64]
     """By them with contact resolved, shape (N, C, 4)."""
+    varied_outcomes: NDArray[np.int64] | None = None
+    """By the controller that was searched under varied conditions (:func:`sim.conditions.varied`), shape (N, 4); None
+    where nobody has crossed so."""
+    certifier_varied_outcomes: NDArray[np.int64] | None = None
+    """By the others under the same ones, shape (N, C, 4); None likewise."""
 
     def certificates(self) -> NDArray[np.bool_]:
         """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
@@ -67,6 +72,7 @@ class FaultCounts:
 
 COUNTS = tuple(field.name for field in fields(FaultCounts) if field.name.endswith("_outcomes"))
 """Names of the arrays of counts, which have one row an elite."""
+_VARIED = tuple(name for name in COUNTS if "varied" in name)  # they may be None
 
 
 def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -167,6 +173,24 @@ class Archive(Evaluation):
         """Whether it fails an elite that another controller crosses, shape (N,)."""
         return self.failing & self.counts.certificates().any(axis=1)
 
+    @property
+    def is_fault(self) -> NDArray[np.bool_]:
+        """Whether it is a fault: confirmed and certified, shape (N,)."""
+        return self.confirmed & self.certified
+
+    @property
+    def robust(self) -> NDArray[np.bool_]:
+        """Whether a fault is one under varied conditions too, shape (N,).
+
+        The controller fails in at least half of them, and one with a certificate crosses in at least half.
+        """
+        faults = self.counts
+        if faults.varied_outcomes is None or faults.certifier_varied_outcomes is None:
+            return np.zeros(len(self), bool)
+        fails = goal_rates(faults.varied_outcomes) <= 1.0 - FAILING_GOAL_RATE
+        crosses = faults.certificates() & (goal_rates(faults.certifier_varied_outcomes) >= FAILING_GOAL_RATE)
+        return self.is_fault & fails & crosses.any(axis=1)
+
     def has_elites_of(self, other: "Archive") -> bool:
         """Whether the elites and all that was found of them are another's too, in whatever order."""
         if len(self) != len(other):
@@ -182,7 +206,9 @@ class Archive(Evaluation):
 
         known = [name for name in _JUDGED if getattr(self, name) is not None]
         fresh = None if self.fresh is None else of(self.fresh, FRESH)
-        faults = None if self.faults is None else of(self.faults, COUNTS)
+        faults = self.faults
+        if faults is not None:
+            faults = of(faults, [name for name in COUNTS if getattr(faults, name) is not None])
         return replace(of(self, (*PER_ELITE, *known)), fresh=fresh, faults=faults)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
@@ -202,7 +228,7 @@ _SHAPES = {
     **dict.fromkeys(("penalties", "scales"), "P"),
     **dict.fromkeys(_CERTIFIERS, "C"),
     "genes": "NG", "end_position": "N2", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
-    "resolved_outcomes": "N4", **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
+    **{name: "NC4" if name.startswith("certifier") else "N4" for name in COUNTS},
 }  # fmt: skip
 """Dimensions of arrays in N elites, G genes, P penalties and C certifiers; N alone of all others."""
 PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))
@@ -217,7 +243,8 @@ def write_archive(path: Path, archive: Archive) -> None:
         content |= {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
     if archive.faults is not None:
         content |= {name: np.array(getattr(archive.faults, name), dtype=np.str_) for name in _CERTIFIERS}
-        content |= {name: getattr(archive.faults, name) for name in COUNTS}
+        counts = {name: getattr(archive.faults, name) for name in COUNTS}
+        content |= {name: values for name, values in counts.items() if values is not None}
         content |= {"confirmed": archive.confirmed, "certified": archive.certified}
     write_atomically(path, npz_bytes(content))
 
@@ -233,6 +260,7 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *PER_ELITE, *_JUDGED) if name not in _OPTIONAL or name in stored]
         fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
         fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
+        fault_names = [name for name in fault_names if name not in _VARIED or name in stored]
         arrays = read_arrays(file, [*names, *fresh_names, *fault_names])
         _check_shapes(arrays)
         fresh = {name.removeprefix(_PREFIX): arrays[name] for name in fresh_names}

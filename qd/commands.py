@@ -167,8 +167,10 @@ class Judge(_OnRun):
     kept, so the same command goes on after Ctrl-C.
     """
 
-    stages: tuple[Literal["fresh", "resolved", "others"], ...] = ("fresh", "resolved", "others")
-    """What to do, in this order."""
+    stages: tuple[Literal["fresh", "resolved", "others", "varied"], ...] = ("fresh", "resolved", "others")
+    """What to do, in this order. varied: faults are crossed again under 20 draws of moderate conditions: payload, motor
+    strength, delay, noise and friction. A fault is robust if the controller still fails in half of them, and another
+    still crosses."""
 
     def execute(self) -> None:
         """Judges the run."""

@@ -2,7 +2,8 @@
 
 An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
 controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
-certificate is not known to be passable.
+certificate is not known to be passable. A fault is robust if it is one under varied conditions too
+(:func:`sim.conditions.varied`).
 """
 
 from collections.abc import Container
@@ -85,6 +86,9 @@ def fault_numbers(
             numbers["faults_unseen"] = int((confirmed & (certificates & ~seen).any(axis=1)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
+        if faults.varied_outcomes is not None:
+            numbers["crossed_varied"] = int((is_fault & faults.varied_outcomes.any(axis=1)).sum())
+            numbers["robust"] = int(archive.robust.sum())
     return numbers
 
 
@@ -109,9 +113,13 @@ def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
     """Further episodes on an elite that reached the goal, and valid ones, by who crossed it how, in words."""
     faults = archive.counts
     counts = {"With contact resolved (steps of 1 ms)": faults.resolved_outcomes[number]}
+    if faults.varied_outcomes is not None:
+        counts["Under varied conditions"] = faults.varied_outcomes[number]
     for column, name in enumerate(faults.certifiers):
         counts[name] = faults.certifier_outcomes[number, column]
         counts[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, column]
+        if faults.certifier_varied_outcomes is not None:
+            counts[f"{name} under varied conditions"] = faults.certifier_varied_outcomes[number, column]
     return {who: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for who, ends in counts.items() if ends.any()}
 
 
@@ -125,7 +133,8 @@ def elite_words(archive: Archive, number: int) -> list[str]:
     if not archive.failing[number]:
         sentences.append("It does not fail by its fresh episodes.")
     elif crossers:
-        kind = "a fault" if archive.confirmed[number] else "certified but not confirmed"
+        robust = "a robust" if archive.robust[number] else "a"
+        kind = f"{robust} fault" if archive.confirmed[number] else "certified but not confirmed"
         crosses = f"{' and '.join(crossers)} cross{'es' * (len(crossers) == 1)}"
         sentences.append(f"It is {kind}: a terrain that {crosses} and this controller does not.")
     else:
@@ -154,12 +163,16 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None of what nobody looked at.
 
     ``resolved`` is the rate with contact resolved; ``certificates`` has of each controller that certifies it name,
-    hash, and rates at the ``searched`` settings and with contact ``resolved``.
+    hash, and rates at the ``searched`` settings and with contact ``resolved``. ``varied`` is that under varied
+    conditions of one that was crossed so, its own and its certifiers'.
     """
     faults = archive.counts
-    resolved = faults.resolved_outcomes[number]
+    resolved, varied = faults.resolved_outcomes[number], faults.varied_outcomes
     kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
-    return {
+    if faults.certifier_varied_outcomes is not None:
+        kinds["varied"] = faults.certifier_varied_outcomes
+    under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_of(varied[number])}
+    return under_varied | {
         "resolved": rate_of(resolved) if resolved.any() else None,
         "certificates": [
             {"controller": name, "policy_sha256": digest}

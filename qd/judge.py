@@ -30,10 +30,12 @@ from sim.policy.spec import ControllerSpec, controller_hash, spec_of, weights_fi
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
+from sim.spaces.conditions import varied_genes, varied_name
 from sim.spaces.registry import get_space, load_space
 
-Stage = Literal["fresh", "resolved", "others"]
-"""Fresh episodes of all elites; of those that fail, crossings with contact resolved, and by other controllers."""
+Stage = Literal["fresh", "resolved", "others", "varied"]
+"""Fresh episodes of all elites; of those that fail, crossings with contact resolved, and by other controllers; of
+faults, crossings under varied conditions."""
 CROSSINGS_FOLDER = "crossings"
 """Folder of a run that keeps what was crossed to judge it."""
 CERTIFIERS_FOLDER = "certifiers"
@@ -41,7 +43,7 @@ CERTIFIERS_FOLDER = "certifiers"
 
 FRESH_STREAM = 1
 """Of the seeds of fresh episodes."""
-_CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM = 5, 6, 7
+_CONFIRM_STREAM, _CERTIFY_STREAM, _CERTIFY_RESOLVED_STREAM, _VARY_STREAM = 5, 6, 7, 8
 
 
 def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
@@ -158,6 +160,7 @@ def certify(
         digest = str(controller_hash(policy))
         if hashes.get(name) != digest:
             searched[name] = resolved[name] = np.zeros_like(faults.resolved_outcomes)
+            faults = replace(faults, varied_outcomes=None, certifier_varied_outcomes=None)  # of other columns
         counts = _cross(archive, rows, search, crossings, policy, "searched", _CERTIFY_STREAM, name)
         crossed = rows[goal_rates(counts) >= FAILING_GOAL_RATE]
         label = f"{name}, contact resolved"
@@ -173,6 +176,34 @@ def certify(
             certifier_resolved_outcomes=np.stack([*resolved.values()], axis=1),
         )
     return replace(archive, faults=faults)
+
+
+def vary(archive: Archive, certifiers: Mapping[str, str], search: Search, crossings: Crossings) -> Archive:
+    """The archive after its controller, and those that certify them, have crossed its faults under varied conditions.
+
+    All cross each fault under the same 20 draws, an episode each.
+    """
+    faults, space = archive.counts, get_space(search.cfg.space, search.cfg.space_sha256)
+    under = load_space(varied_name(space))
+
+    def counts_of(policy: str, rows: NDArray[np.int64], label: str) -> NDArray[np.int64]:
+        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=_VARY_STREAM).reshape(-1, EPISODES)[rows]
+        genes = [varied_genes(space, archive.genes[row], of_row) for row, of_row in zip(rows, seeds, strict=True)]
+        result = crossings.cross(
+            policy, np.concatenate([np.zeros((0, under.num_genes), np.float32), *genes]), seeds.ravel(), replicas=1,
+            space=under.name, label=f"{label}, varied conditions", invalid_ok=True,
+        )  # fmt: skip
+        return outcome_counts(result).reshape(-1, EPISODES, 4).sum(axis=1)
+
+    rows = np.flatnonzero(archive.is_fault)
+    by_searched = _put(np.zeros_like(faults.resolved_outcomes), rows, counts_of(search.policy, rows, "searched"))
+    by_others = np.zeros_like(faults.certifier_outcomes)
+    for column, name in enumerate(faults.certifiers):
+        certified = rows[faults.certificates()[rows, column]]
+        if len(certified) and name in certifiers:
+            by_others[certified, column] = counts_of(certifiers[name], certified, name)
+    varied = replace(faults, varied_outcomes=by_searched, certifier_varied_outcomes=by_others)
+    return replace(archive, faults=varied)
 
 
 def _cross(
@@ -228,9 +259,10 @@ def judge(
     search = find_search(run, robot=robot, policy=policy, space=space)
     check_policy(search.policy, search.robot, compute.device)
     certifiers = certifiers_of(search) if certifiers is None else certifiers
-    if "others" in stages:
+    if {"others", "varied"} & {*stages}:
         check_certifiers(certifiers, search, compute.device)
-    calls = sum(2 * len(certifiers) if stage == "others" else 1 for stage in stages)
+    calls_of = {"others": 2 * len(certifiers), "varied": 1 + len(certifiers)}
+    calls = sum(calls_of.get(stage, 1) for stage in stages)
     with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crossings:
         archive = search.read_archive()
         if archive.fresh is None and "fresh" not in stages:
@@ -249,6 +281,10 @@ def judge(
                     print(f"Elites of {run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)
             elif stage == "others":
                 archive = certify(archive, failing, certifiers, search, crossings)
+            elif stage == "varied":
+                if archive.faults is None:
+                    raise ValueError(f"{run} must have faults, got none judged: begin with the stages resolved, others")
+                archive = vary(archive, certifiers, search, crossings)
             else:
                 archive = confirm(archive, failing, search, crossings)
             if families is None or stage == "fresh":

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
 from sim.conditions import KINDS, genes_of, rows_of, words_of
-from sim.ground import joined_name
+from sim.ground import joined_name, split_name
 from sim.spaces.base import Seed, TerrainSpace, clipped
 
 
@@ -88,3 +88,43 @@ class UnderConditions(TerrainSpace):
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Those of the space."""
         return self.inner.spans(self._split(genes)[0])
+
+
+VARIED: dict[str, tuple[float, float]] = {
+    "payload": (-0.01, 0.03), "motors": (0.9, 1.1), "delay": (0.0, 0.02), "noise": (1.0, 1.0), "grip": (0.7, 1.2),
+}  # fmt: skip
+"""Limits between which the first number of a kind is drawn, uniformly, for varied conditions; the others are nominal.
+
+They are what controllers are usually trained for: a payload in the middle of the base over the robot's mass, factors of
+torques and of friction, a delay of actions [s], and legged_gym's noise.
+"""
+
+
+def varied_name(space: TerrainSpace) -> str:
+    """The name of the space whose terrains are those of another one under varied conditions."""
+    base, kinds = split_name(space.name)
+    ground = [kind for kind in kinds if kind not in KINDS]
+    return joined_name(base, [*ground, *(kind for kind in KINDS if kind in kinds or kind in VARIED)])
+
+
+def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Genes of a terrain, (num_genes,), under conditions drawn by each seed, for the space of :func:`varied_name`.
+
+    Conditions that the space has genes of stay as they are. Shape (number of seeds, its num_genes).
+    """
+    own, first = {}, space.num_genes - len(genes_of(space.conditions))
+    for kind in space.conditions:
+        number = sum(len(KINDS[other]) for other in own)
+        own[kind] = genes[first + number : first + number + len(KINDS[kind])]
+    rows = []
+    for seed in seeds.tolist():
+        rng, row = np.random.default_rng(seed), [genes[:first]]
+        for kind in KINDS:
+            if kind in own:
+                row.append(own[kind])
+            elif kind in VARIED:
+                drawn, *others = KINDS[kind]
+                absent = [other.absent for other in others]
+                row.append(np.float32([drawn.gene(np.array(rng.uniform(*VARIED[kind]))), *absent]))
+        rows.append(np.concatenate(row))
+    return np.stack(rows)

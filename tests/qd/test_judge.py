@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kernels.conditions import Condition
 from qd import judge as judging
 from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg
@@ -17,6 +18,7 @@ from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
+from sim.spaces.registry import get_space
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
 from tests.qd.robots import OTHER, Robots
@@ -148,6 +150,31 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     content = (path / "archive.npz").read_bytes()
     judged(path, Robots(result_of, stop_after=0))  # nothing is crossed twice, and nothing adds up
     assert (path / "archive.npz").read_bytes() == content
+
+
+def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
+    before, crossed = judged(path), {SHIPPED: [], OTHER["C-G"]: []}
+    rows = np.flatnonzero(before.is_fault)
+    fragile = before.genes[rows[0]]  # the controller crosses it under most conditions
+
+    def rule(cfg, genes, seeds):
+        crossed[cfg.policy] += [*genes]
+        weak = space.conditions_of(genes)[:, Condition.STRENGTH] < 0.92
+        return (weak | (genes[:, :64] != fragile).any(axis=1)) & (cfg.policy == SHIPPED)
+
+    space, robots = get_space("super_gaussian+payload+motors+delay+noise+grip"), Robots(rule)
+    archive = judged(path, robots, stages=("varied",))
+    assert archive.faults.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
+    assert 0 < archive.faults.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
+    assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
+    assert numbers_in(path)["robust"] == numbers_in(path)["crossed_varied"] - 1 == len(rows) - 1 > 0
+    assert np.array_equal(read_archive(path).robust, archive.robust)
+    # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
+    assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
+    assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)
+    # With other certificates nobody knows any more.
+    weak = str(ROBOTS["anymal"].panel / "S.pt")
+    assert not judged(path, stages=("others",), certifiers={"C-G": weak}).robust.any()
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):

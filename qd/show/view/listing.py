@@ -71,13 +71,15 @@ class Listing:
         )
 
     def columns(self, number: int) -> Sequence[Column]:
-        """What is known of the whole terrain: fresh episodes, finer contact, and the best certifier."""
+        """What is known of the whole terrain: fresh episodes, finer contact, varied conditions, the best certifier."""
         elites, faults = self.ranking.elites, self.archive.faults
         count = int(elites.counted[number])
         head = "fresh" if elites.fresh[number] else "as found"
         columns: list[Column] = [(head, count, {name: elites.hits(name, number) for name in RATES})]
         if faults is not None:
             counts = {"finer contact": faults.resolved_outcomes[number]}
+            if faults.varied_outcomes is not None:
+                counts["varied"] = faults.varied_outcomes[number]
             if name := certifier_of(self.archive, number):
                 counts[name] = faults.certifier_outcomes[number, faults.certifiers.index(name)]
             for head, outcomes in counts.items():
