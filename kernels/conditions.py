@@ -196,17 +196,3 @@ def disturb_observation(
     device = observation_out.device
     wp.launch(_disturb_observation_kernel, observation_out.shape, inputs, outputs=outputs, device=device)
     wp.launch(_grow_older_kernel, observation_out.shape[0], outputs=[disturbed_out], device=device)
-
-
-@wp.kernel
-def _scale_friction_kernel(conditions: wp.array2d[float], friction_out: wp.array3d[float]):
-    """Grid (num_terrains, 4, 8)."""
-    t, row, col = wp.tid()
-    friction_out[t, row, col] *= conditions[t, int(Condition.FRICTION)]
-
-
-def scale_friction(conditions: Any, friction_out: Any) -> None:
-    """Multiply maps of friction, shape (num_terrains, 4, 8), by what conditions, (num_terrains, 12), say of it."""
-    wp.launch(
-        _scale_friction_kernel, friction_out.shape, [conditions], outputs=[friction_out], device=conditions.device
-    )

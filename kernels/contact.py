@@ -96,7 +96,7 @@ def _write_contact(
         time_constant = FIRM
         if ground.friction.shape[0] > 0:
             patch = patch_at(touched[0], touched[1])
-            factor = ground.friction[t, patch[0], patch[1]]
+            factor = ground.factor[t] * ground.friction[t, patch[0], patch[1]]
             time_constant = ground.time_constant[t, patch[0], patch[1]]
         contacts.friction[env, slot] = factor
         contacts.time_constant[env, slot] = time_constant

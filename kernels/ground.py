@@ -34,6 +34,8 @@ class Ground:
     """Factor of the friction, shape (num_terrains, 4, 8)."""
     time_constant: wp.array3d[float]
     """Contact time constant [s], ``FIRM`` for the robot's own; shape (num_terrains, 4, 8)."""
+    factor: wp.array[float]
+    """Factor of all friction on a terrain, shape (num_terrains,)."""
 
 
 @wp.func
@@ -93,4 +95,5 @@ def make_ground(num_terrains: int, device: str) -> Ground:
     ground = Ground()
     ground.friction = wp.ones((num_terrains, ROWS, COLS), dtype=float, device=device)
     ground.time_constant = wp.zeros((num_terrains, ROWS, COLS), dtype=float, device=device)
+    ground.factor = wp.ones(num_terrains, dtype=float, device=device)
     return ground

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.conditions import scale_friction
+from kernels.conditions import Condition
 from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from sim.conditions import NOMINAL
@@ -71,8 +71,19 @@ class TerrainBank:
             ground = ground or GroundMaps.plain(len(heights))
             maps.friction.assign(np.float32(ground.friction))
             maps.time_constant.assign(np.float32(ground.time_constant_s))
-        if self.conditions is not None:
-            self.conditions[slots].assign(np.tile(NOMINAL, (len(heights), 1)))
+        self._set_conditions(None if ground is None else ground.conditions, slots)
+
+    def _set_conditions(self, rows: np.ndarray | None, slots: slice) -> None:
+        """Conditions of the terrains of some slots, (number of slots, 12), nominal ones if None."""
+        if self.conditions is None:
+            if rows is not None:
+                raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
+            return
+        replaced = self.conditions[slots]
+        rows = np.tile(NOMINAL, (len(replaced), 1)) if rows is None else rows
+        replaced.assign(np.float32(rows))
+        assert self.ground is not None
+        self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
 
     def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
         """The maps of some slots, None of a bank without any."""
@@ -82,6 +93,7 @@ class TerrainBank:
             return None
         maps = Ground()
         maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
+        maps.factor = self.ground.factor[slots]
         return maps
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
@@ -97,19 +109,15 @@ class TerrainBank:
             maps.friction.fill_(1.0)
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
-        if self.conditions is not None:
-            rows = space.conditions_of(valid)
-            self.conditions[slots].assign(rows)
-            scale_friction(self.conditions[slots], maps.friction)
-        elif space.conditions:
-            raise ValueError(f"{space.name} has conditions, got a bank without: give with_conditions=True")
+        self._set_conditions(space.conditions_of(valid) if space.conditions else None, slots)
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""
         if self.ground is None:
             return None
         friction, time_constant_s = self.ground.friction.numpy(), self.ground.time_constant.numpy()
-        return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy())
+        conditions = None if self.conditions is None else self.conditions.numpy().copy()
+        return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy(), conditions=conditions)
 
 
 def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:

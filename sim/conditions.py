@@ -72,6 +72,21 @@ KINDS: dict[str, tuple[Gene, ...]] = {
 """Conditions that a space may have, each of one to three genes."""
 
 
+def check_conditions(rows: NDArray[np.floating], count: int) -> None:
+    """That rows are conditions of so many terrains that can be simulated."""
+    if rows.shape != (count, len(Condition)):
+        raise ValueError(f"conditions must have shape ({count}, {len(Condition)}), got {rows.shape}")
+    limits = {Condition.DELAY: (0.0, MOST_DELAY_S), Condition.LAG: (0.0, MOST_LAG_S)}
+    limits |= {Condition.STRENGTH: (1e-3, 10.0), Condition.FRICTION: (1e-3, 10.0), Condition.NOISE: (0.0, 100.0)}
+    for condition in Condition:
+        least, most = limits.get(condition, (-100.0, 100.0))
+        wrong = ~((rows[:, condition] >= least - 1e-6) & (rows[:, condition] <= most + 1e-6))
+        if wrong.any():
+            raise ValueError(
+                f"the condition {condition.name} must lie in {least:g} to {most:g}, got {rows[wrong][0, condition]:g}"
+            )
+
+
 def genes_of(kinds: Sequence[str]) -> tuple[Gene, ...]:
     """Genes of some kinds, in their order."""
     return tuple(gene for kind in kinds for gene in KINDS[kind])

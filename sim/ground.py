@@ -1,4 +1,7 @@
-"""Friction and softness of the ground on the host: maps of patches, and the names of spaces that have them."""
+"""Friction and softness of the ground on the host: maps of patches, and the names of spaces that have them.
+
+The conditions of a crossing go with them.
+"""
 
 import re
 from collections.abc import Sequence
@@ -9,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
 from sim.conditions import KINDS as CONDITION_KINDS
+from sim.conditions import NOMINAL, check_conditions
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
@@ -18,12 +22,17 @@ _SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(_KINDS)}))+)$")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundMaps:
-    """Friction and softness of the patches of T terrains; docs/terrains.md says what the numbers do."""
+    """Friction and softness of the patches of T terrains, and the conditions under which each is crossed.
+
+    docs/terrains.md says what the numbers do.
+    """
 
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
     time_constant_s: NDArray[np.float32]
     """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
+    conditions: NDArray[np.float32] | None = None
+    """Under which each is crossed (:class:`kernels.conditions.Condition`), shape (T, 12); nominal ones if None."""
 
     def __post_init__(self) -> None:
         check_map("friction", self.friction)
@@ -33,12 +42,22 @@ class GroundMaps:
                 f"maps must be of as many terrains, got {len(self.friction)} of friction and "
                 f"{len(self.time_constant_s)} of softness"
             )
+        if self.conditions is not None:
+            check_conditions(self.conditions, len(self))
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """Conditions of all, shape (T, 12)."""
+        return np.tile(NOMINAL, (len(self), 1)) if self.conditions is None else self.conditions
 
     def __len__(self) -> int:
         return len(self.friction)
 
     def __getitem__(self, rows: slice) -> "GroundMaps":
-        return GroundMaps(friction=self.friction[rows], time_constant_s=self.time_constant_s[rows])
+        conditions = None if self.conditions is None else self.conditions[rows]
+        return GroundMaps(
+            friction=self.friction[rows], time_constant_s=self.time_constant_s[rows], conditions=conditions
+        )
 
     @classmethod
     def plain(cls, num_terrains: int) -> "GroundMaps":
@@ -48,9 +67,11 @@ class GroundMaps:
 
     def joined(self, other: "GroundMaps") -> "GroundMaps":
         """These terrains, and others behind them."""
+        nominal = self.conditions is None and other.conditions is None
         return GroundMaps(
             friction=np.concatenate([self.friction, other.friction]),
             time_constant_s=np.concatenate([self.time_constant_s, other.time_constant_s]),
+            conditions=None if nominal else np.concatenate([self.rows, other.rows]),
         )
 
 

@@ -134,12 +134,14 @@ class Rollout:
         solver: SolverCfg | None = None,
         space: TerrainSpace = SUPER_GAUSSIAN,
         with_ground: bool = False,
+        with_conditions: bool = False,
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
         The policy is a file, ``module:callable`` or a callable on device tensors. ``num_terrains`` may be under way at
         once, with ``num_replicas`` episodes on each, run by ``num_envs`` robots: one an episode if None, and never
-        more. Heights may come with maps of the ground if ``with_ground``; with genes the space decides.
+        more. Heights may come with maps of the ground if ``with_ground``, and with conditions if ``with_conditions``;
+        with genes the space decides.
         """
         if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
@@ -150,6 +152,7 @@ class Rollout:
         self.num_terrains, self.num_replicas = num_terrains, num_replicas
         self.num_envs = min(num_envs or num_terrains * num_replicas, num_terrains * num_replicas)
         self.space, self._with_ground = space, with_ground or bool(space.ground)
+        self._with_conditions = with_conditions or bool(space.conditions)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
@@ -167,8 +170,9 @@ class Rollout:
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
         from sim.simulation import Simulation  # Newton takes seconds to load: only what simulates loads it
 
-        conditions = bool(self.space.conditions)
-        bank = TerrainBank(self.num_terrains, device=device, with_ground=self._with_ground, with_conditions=conditions)
+        bank = TerrainBank(
+            self.num_terrains, device=device, with_ground=self._with_ground, with_conditions=self._with_conditions
+        )
         self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes

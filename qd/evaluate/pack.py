@@ -170,8 +170,10 @@ def make_pack(
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
     print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
-    if drawn_in.ground:
-        raise ValueError(f"a pack holds heights alone, got terrains of {drawn_in.name}, which have ground of their own")
+    if drawn_in.ground or drawn_in.conditions:
+        raise ValueError(
+            f"a pack holds heights alone, got terrains of {drawn_in.name}, which have ground or conditions of their own"
+        )
     genes = np.array([genes for _, genes in chosen], np.float32)
     heights = round_heights(heights_of(genes, drawn_in))
     out = out or RUNS / f"{body.name}-pack"

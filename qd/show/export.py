@@ -47,6 +47,12 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | Non
     minima = read_minimal(opened_run.folder, archive)
     ranking = rank(archive, space, minima, numbers=[terrain.number for terrain in terrains])
 
+    if space.conditions:
+        raise ValueError(
+            f"a terrain file holds heights and ground, got terrains of {archive.space}, which are crossed under "
+            "conditions: replay or film them instead"
+        )
+
     def rasterised() -> Iterator[ExportedTerrain]:
         for _, genes, name, *_ in terrains:
             (heights,), ground = terrains_of(genes[None], space)

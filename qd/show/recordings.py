@@ -106,6 +106,7 @@ class Simulation:
             self._rollouts[key] = Rollout(
                 self._robot, first.policy, num_terrains=len(wanted), num_replicas=first.replicas, device=self._device,
                 space=load_space(first.space), with_ground=first.ground is not None,
+                with_conditions=first.ground is not None and first.ground.conditions is not None,
             )  # fmt: skip
         grounds = [crossing.ground for crossing in wanted if crossing.ground is not None]
         recording = record(

@@ -164,14 +164,14 @@ def cross(
     *,
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
-    conditions: NDArray[np.floating] = NOMINAL,
 ) -> RolloutResult:
     """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
 
     It does not tell why an episode is invalid. Heights are those of one terrain [m], shape (nrow, ncol), and so is its
-    ground; the contact time constant is that of the robot's file if None. Conditions are a row, shape (12,); noise is
-    drawn otherwise than in the parallel simulation.
+    ground with its conditions; the contact time constant is that of the robot's file if None. Noise is drawn otherwise
+    than in the parallel simulation.
     """
+    conditions = NOMINAL if ground is None else ground.rows[0]
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     vary_model(model, conditions)
     episodes = Episodes(robot, model, starts, conditions)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.conditions import Condition
+from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.conditions import NoiseCfg
 from sim.crossing import GROUND_FRICTION, CrossingCfg
@@ -83,7 +84,8 @@ def crossing_model(
     option.timestep, option.iterations, option.ls_iterations = robot.physics_dt, 100, 50
     option.integrator, option.cone = _mj.mjtIntegrator.mjINT_IMPLICITFAST, _mj.mjtCone.mjCONE_ELLIPTIC
     option.disableflags = _mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
-    patches = [] if ground is None else _patches_of(ground)
+    plain = ground is None or ((ground.friction == 1.0).all() and (ground.time_constant_s == FIRM).all())
+    patches = [] if ground is None or plain else _patches_of(ground)
     if patches:
         _add_patches(spec, heights, patches)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside

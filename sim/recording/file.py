@@ -22,6 +22,7 @@ from sim.spaces.registry import get_space, is_own
 
 FORMAT = "faultline recording 3"
 """Name and version in every file."""
+_OF_GROUND = tuple(field.name for field in fields(GroundMaps))
 
 
 def write_recording(path: Path, recording: Recording) -> None:
@@ -58,7 +59,7 @@ def _read(path: Path) -> Recording:
         if array.dtype.kind == "U":
             values[name] = tuple(array.tolist()) if array.ndim else str(array)
     origin = values["origin"] = json.loads(values["origin"])
-    if maps := {name: values.pop(name) for name in ("friction", "time_constant_s") if name in content}:
+    if maps := {name: values.pop(name) for name in _OF_GROUND if name in content}:
         values["ground"] = GroundMaps(**maps)
     if "heights" not in content:
         values["heights"] = heights_of(content["genes"], get_space(origin["space"]))

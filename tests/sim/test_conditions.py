@@ -8,8 +8,10 @@ import pytest
 import warp as wp
 
 from kernels.conditions import Condition
+from sim.bank import terrains_of
 from sim.conditions import KINDS, NOMINAL, genes_of
 from sim.crossing import CrossingCfg
+from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.mujoco_c.model import crossing_model, noise_widths, vary_model
 from sim.policy.loaders import load_policy
@@ -17,6 +19,7 @@ from sim.robots.compiled import robot_spec
 from sim.rollout import Rollout
 from sim.spaces.registry import get_space, identity
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrain import NUM_COLS, NUM_ROWS
 
 ALL = "super_gaussian+" + "+".join(KINDS)
 SPACE = get_space(ALL)
@@ -79,6 +82,10 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, roll
     assert apart.max() < 0.25 * changed.max()  # or nothing was tested
 
 
+def under(conditions):
+    return dataclasses.replace(GroundMaps.plain(1), conditions=conditions[None])
+
+
 def crossed(robot, heights, starts, seconds, conditions):
     """Final states in plain MuJoCo C."""
     seen = []
@@ -92,7 +99,7 @@ def crossed(robot, heights, starts, seconds, conditions):
                 seen.append(self)
 
         patch.setattr(module, "Episodes", Seen)
-        cross(dataclasses.replace(robot, max_duration_s=seconds), policy, heights, starts, conditions=conditions)
+        cross(dataclasses.replace(robot, max_duration_s=seconds), policy, heights, starts, ground=under(conditions))
     return seen[0].qpos
 
 
@@ -127,6 +134,32 @@ def test_an_episode_depends_on_its_own_conditions_alone(anymal, device):
     ends = alone.final_position[:, 0]
     apart = np.linalg.norm(ends[:, None] - ends, axis=2) + np.eye(len(rows))
     assert apart.min() > 1e-4  # each condition does something
+
+
+def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts):
+    row = genes(payload=0.2, push_x=-0.5, push_time=0.2, friction=0.5)
+    seeds, heights = np.array([3], np.uint32), np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
+    short = dataclasses.replace(anymal, max_duration_s=0.5)
+    sizes = {"num_terrains": 1, "num_replicas": EPISODES, "device": "cpu"}
+    by_genes = Rollout(short, anymal.policy_file, **sizes, space=SPACE).evaluate(row[None], seeds)
+    rollout = Rollout(short, anymal.policy_file, **sizes, with_conditions=True)
+    ground = under(SPACE.conditions_of(row[None])[0])
+    np.testing.assert_array_equal(rollout.evaluate(heights, seeds, ground=ground).penalties, by_genes.penalties)
+    assert (rollout.evaluate(heights, seeds).penalties != by_genes.penalties).any()
+    again = terrains_of(row[None], SPACE)[1]
+    np.testing.assert_array_equal(again.rows, ground.rows)
+    assert (again.friction == 1.0).all()  # the factor is a condition, and no patch's
+    joined = again.joined(GroundMaps.plain(2))
+    np.testing.assert_array_equal(joined.rows, [again.rows[0], NOMINAL, NOMINAL])
+    np.testing.assert_array_equal(joined[1:].rows, [NOMINAL, NOMINAL])
+    plain = Rollout(short, anymal.policy_file, **sizes, with_ground=True)
+    with pytest.raises(ValueError, match="terrains have conditions"):
+        plain.evaluate(heights, seeds, ground=ground)
+    for wrong in ({"delay": 0.5}, {"strength": 0.0}, {"noise": -1.0}):
+        with pytest.raises(ValueError, match=f"condition {next(iter(wrong)).upper()} must lie"):
+            changed = NOMINAL.copy()
+            changed[Condition[next(iter(wrong)).upper()]] = next(iter(wrong.values()))
+            under(changed)
 
 
 def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(anymal, rollouts):

@@ -1,6 +1,6 @@
 """Which terrains a controller is fine-tuned on: half of one kind and half of another, exchanged every so often."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -119,7 +119,11 @@ class Mix:
     def _elites(self) -> tuple[NDArray[np.float32], GroundMaps | None]:
         """Heights of the present elites, shape (rows, NUM_ROWS, NUM_COLS), and their ground if any space has maps."""
         heights = np.empty((len(self.rows), NUM_ROWS, NUM_COLS), np.float32)
-        ground = GroundMaps.plain(len(self.rows)) if any(space.ground for space in self.spaces) else None
+        ground = None
+        if any(space.ground or space.conditions for space in self.spaces):
+            ground = GroundMaps.plain(len(self.rows))
+            if any(space.conditions for space in self.spaces):
+                ground = replace(ground, conditions=ground.rows)
         first = 0
         for genes, space in zip(self.genes, self.spaces, strict=True):
             (places,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
@@ -127,6 +131,8 @@ class Mix:
                 heights[places], maps = terrains_of(genes[self.rows[places] - first], space, device=self.device)
                 if ground is not None and maps is not None:
                     ground.friction[places], ground.time_constant_s[places] = maps.friction, maps.time_constant_s
+                    if ground.conditions is not None:
+                        ground.conditions[places] = maps.rows
             first += len(genes)
         return heights, ground
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from kernels.conditions import disturb_observation, push
 from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import StartRanges, restart_episodes
@@ -104,7 +105,11 @@ class CommandTask:
 
     def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
         tiles = self.tiles
-        bank = TerrainBank(len(tiles.heights), device=self.device, with_ground=tiles.ground is not None)
+        ground = tiles.ground
+        bank = TerrainBank(
+            len(tiles.heights), device=self.device, with_ground=ground is not None,
+            with_conditions=ground is not None and ground.conditions is not None,
+        )  # fmt: skip
         bank.set_heights(tiles.heights, ground=tiles.ground)
         return Simulation(
             self.robot,
@@ -167,6 +172,8 @@ class CommandTask:
     def _control_step(self) -> None:
         sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
+        if sim.disturbed is not None:
+            push(episodes, sim.disturbed, self.robot.control_dt, 1, sim.joint_qd)  # whose steps are control steps
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
             # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
@@ -194,11 +201,16 @@ class CommandTask:
             training.last_action, episodes, self._reward.state,
         )  # fmt: skip
         sim.clear_solver(training.ended)
+        sim.begin_conditions(training.ended)
         command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)
         write_observation(
             sim.joint_q, sim.joint_qd, training.command, training.last_action, sim.terrain_of_env, terrain,
             sim.sensors, self._noise, training.counter, training.observation,
         )  # fmt: skip
+        if sim.disturbed is not None:
+            disturb_observation(
+                episodes, self.robot.num_joints, self.robot.control_dt, sim.disturbed, training.observation
+            )
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 
