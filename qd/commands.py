@@ -331,9 +331,10 @@ class Dose(RobotFlag, WorkerFlags):
     """Measure which real obstacle at which size stops a controller.
 
     One obstacle stands alone on flat ground, and one of its sizes grows: the rise of stairs, the width of a ditch; or
-    the ground is level and its friction falls. For each value the command measures how many robots reach the goal.
-    Terrains of a value differ in where the obstacle begins, evenly over 1 m, and in the seeds of their episodes. All
-    values and controllers have the same places and seeds. Crossings are stored: the same command goes on.
+    the ground is level and its friction falls, or the robot's payload grows. For each value the command measures how
+    many robots reach the goal. Terrains of a value differ in where the obstacle begins, evenly over 1 m, and in the
+    seeds of their episodes. All values and controllers have the same places and seeds. Crossings are stored: the same
+    command goes on.
     """
 
     policies: tuple[str, ...] = ()
@@ -341,8 +342,9 @@ class Dose(RobotFlag, WorkerFlags):
     out."""
     elements: tuple[str, ...] = ()
     """Obstacles: stairs_up, stairs_down, step_up, step_down, sill, rail, pallet, ramp_up, ramp_down, cross_slope,
-    ditch, beam, stones, rubble; grounds: friction, softness. All of them if left out. With other values as
-    stairs_up=0.15,0.2,0.25; they may lie beyond what the space course has."""
+    ditch, beam, stones, rubble; grounds: friction, softness; conditions on level ground: payload, motors, delay, lag,
+    noise, push. All of them if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond what the
+    space course has."""
     at: tuple[str, ...] = ()
     """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
     resolved: bool = False

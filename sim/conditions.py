@@ -24,7 +24,7 @@ class NoiseCfg:
 
 NOMINAL = np.array([condition in (Condition.STRENGTH, Condition.FRICTION) for condition in Condition], np.float32)
 """A row of conditions that change nothing, shape (12,)."""
-MOST_DELAY_S = MOST_LAG_S = 0.04
+MOST_DELAY_S = MOST_LAG_S = 0.06
 """Longest delay of actions, beside the robot's own, and largest age of observations [s]."""
 
 
@@ -54,20 +54,20 @@ class Gene:
 
 KINDS: dict[str, tuple[Gene, ...]] = {
     "payload": (
-        Gene(Condition.PAYLOAD, -0.05, 0.0, 0.25),
+        Gene(Condition.PAYLOAD, -0.05, 0.0, 0.4),
         Gene(Condition.PAYLOAD_X, -0.2, 0.0, 0.2),
         Gene(Condition.PAYLOAD_Y, -0.2, 0.0, 0.2),
     ),
-    "motors": (Gene(Condition.STRENGTH, 0.5, 1.0, 1.2),),
+    "motors": (Gene(Condition.STRENGTH, 0.4, 1.0, 1.2),),
     "delay": (Gene(Condition.DELAY, 0.0, MOST_DELAY_S / 2, MOST_DELAY_S, absent=-1.0),),
     "lag": (Gene(Condition.LAG, 0.0, MOST_LAG_S / 2, MOST_LAG_S, absent=-1.0),),
-    "noise": (Gene(Condition.NOISE, 0.0, 1.5, 3.0, absent=-1.0),),
+    "noise": (Gene(Condition.NOISE, 0.0, 2.0, 4.0, absent=-1.0),),
     "push": (
-        Gene(Condition.PUSH_X, -1.0, 0.0, 1.0),
-        Gene(Condition.PUSH_Y, -1.0, 0.0, 1.0),
+        Gene(Condition.PUSH_X, -2.0, 0.0, 2.0),
+        Gene(Condition.PUSH_Y, -2.0, 0.0, 2.0),
         Gene(Condition.PUSH_TIME, 0.0, 8.0, 16.0),
     ),
-    "grip": (Gene(Condition.FRICTION, 0.3, 1.0, 1.2),),
+    "grip": (Gene(Condition.FRICTION, 0.2, 1.0, 1.2),),
 }
 """Conditions that a space may have, each of one to three genes."""
 

@@ -23,8 +23,7 @@ from sim.policy.spec import about_controllers
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.dose import LEVEL_SPACE, Dose
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.spaces.dose import Dose
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
@@ -95,7 +94,7 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
         terrains=dose.terrains(num_terrains, rng),
         seeds=seeds,
         numbers=np.arange(len(seeds)),
-        space=LEVEL_SPACE if dose.kind is None else SUPER_GAUSSIAN.name,  # the latter does not matter to heights
+        space=dose.space,
     )
 
 

@@ -12,8 +12,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels import course
+from kernels.conditions import Condition
 from kernels.course import SPACING, Element, Kind
 from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
+from sim.conditions import KINDS, genes_of
 from sim.device import host_device
 from sim.ground import GROUND_KINDS, joined_name
 from sim.spaces.ground import gene_of
@@ -25,6 +27,14 @@ FIRST_COL, NUM_PLACES = 100, 20
 """An obstacle begins at one of so many neighbouring nodes, from x = 5 m on: over 1 m, more than a stride."""
 LEVEL_SPACE = joined_name(SUPER_GAUSSIAN.name, GROUND_KINDS)
 """Space of level ground whose friction or softness is the dose."""
+CONDITIONS_SPACE = joined_name(SUPER_GAUSSIAN.name, KINDS)
+"""Space of level ground that is crossed under a condition, which is the dose."""
+_CONDITIONS = {
+    "payload": Condition.PAYLOAD, "motors": Condition.STRENGTH, "delay": Condition.DELAY, "lag": Condition.LAG,
+    "noise": Condition.NOISE, "push": Condition.PUSH_Y,
+}  # fmt: skip
+"""Conditions that are doses; a push is to the left, after 5 s."""
+_PUSH_TIME_S = 5.0
 
 
 class Quantity(NamedTuple):
@@ -73,7 +83,12 @@ QUANTITIES: dict[Kind, dict[str, Quantity]] = {
     Kind.RUBBLE: _HEIGHT | _LENGTH | {"side": Quantity("detail", 0.05, 1.0, cells=1)},
 }
 """Parameters of the kinds of obstacles, and how far terrains can follow them."""
+_OF_CONDITION = {gene.condition: gene for gene in genes_of(tuple(KINDS))}
+_UNITS = {"delay": "s", "lag": "s", "push": "m/s"}
 _GROUND = {
+    name: Quantity("", _OF_CONDITION[condition].least, _OF_CONDITION[condition].most, _UNITS.get(name, ""))
+    for name, condition in _CONDITIONS.items()
+} | {
     "friction": Quantity("", LEAST_FRICTION, 1.0, ""),
     "softness": Quantity("", 1.1 * LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, "s"),
 }
@@ -85,7 +100,7 @@ class Dose:
 
     title: str
     kind: Kind | None
-    """None: the ground, level everywhere, whose map the parameter is."""
+    """None: the ground, level everywhere, whose map or condition the parameter is."""
     parameter: str
     values: tuple[float, ...]
     """Of the parameter, the easiest first."""
@@ -105,9 +120,16 @@ class Dose:
         return self.quantities[self.parameter].unit
 
     @property
+    def space(self) -> str:
+        """Terrain space of its genes; of heights any."""
+        if self.kind is not None:
+            return SUPER_GAUSSIAN.name
+        return CONDITIONS_SPACE if self.parameter in _CONDITIONS else LEVEL_SPACE
+
+    @property
     def harder_up(self) -> bool:
         """Whether larger values are harder."""
-        return (self.parameter, self.kind) not in (("friction", None), ("width", Kind.BRIDGE))
+        return (self.parameter, self.kind) not in (("friction", None), ("motors", None), ("width", Kind.BRIDGE))
 
     def describe(self) -> str:
         """The obstacle and its other parameters in words: ``stairs up, tread 0.30 m, flight 5 steps``."""
@@ -137,7 +159,7 @@ class Dose:
         drawn for each place, rubble is another one at each. All else is the same, and equal for all values.
 
         Returns:
-            Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :data:`LEVEL_SPACE`.
+            Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
         """
         if self.kind is None:
             return np.tile(self._level(), (count, 1))
@@ -161,9 +183,15 @@ class Dose:
 
     def _level(self) -> NDArray[np.float32]:
         """Genes of level ground of each value, shape (num_values, num_genes)."""
-        space = get_space(LEVEL_SPACE)
+        space = get_space(self.space)
         zeros = np.zeros((len(self.values), space.num_genes), np.float32)
         genes = space.without(zeros, range(len(space.parts(zeros[0]))))
+        if self.parameter in _CONDITIONS:
+            values = {_CONDITIONS[self.parameter]: np.array(self.values), Condition.PUSH_TIME: np.array(_PUSH_TIME_S)}
+            for column, gene in enumerate(genes_of(tuple(KINDS)), SUPER_GAUSSIAN.num_genes):
+                if gene.condition in values:
+                    genes[:, column] = gene.gene(values[gene.condition])
+            return genes
         maps = genes[:, SUPER_GAUSSIAN.num_genes :].reshape(len(genes), len(GROUND_KINDS), -1)
         maps[:, GROUND_KINDS.index(self.parameter)] = gene_of(self.parameter, np.array(self.values))[:, None]
         return genes
@@ -204,6 +232,12 @@ DOSES: dict[str, Dose] = {
     "rubble": Dose("rubble", Kind.RUBBLE, "height", _LOW, others={"side": 0.20, "length": 2.00}),
     "friction": Dose("level ground", None, "friction", _FRICTIONS),
     "softness": Dose("level ground", None, "softness", (0.015, 0.02, 0.03, 0.04, 0.05, 0.06)),
+    "payload": Dose("payload over the mass", None, "payload", (0.0, 0.1, 0.2, 0.3, 0.4)),
+    "motors": Dose("strength of motors", None, "motors", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)),
+    "delay": Dose("delay of actions", None, "delay", (0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06)),
+    "lag": Dose("age of observations", None, "lag", (0.0, 0.02, 0.04, 0.06)),
+    "noise": Dose("noise over legged_gym's", None, "noise", (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)),
+    "push": Dose("push to the side", None, "push", (0.0, 0.5, 1.0, 1.5, 2.0)),
 }
 """Every dose by its name."""
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sim.bank import terrains_of
+from sim.conditions import NOMINAL
 from sim.spaces.course import COURSE
 from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -145,3 +146,16 @@ def test_elites_of_several_spaces_are_drawn_together_each_with_its_own_ground():
     np.testing.assert_array_equal(slips, mix.rows < 3)
     np.testing.assert_array_equal(sinks, mix.rows >= 7)
     np.testing.assert_array_equal(tiles.ground.friction[9:][slips], whole[0][1].friction[mix.rows[slips]])
+
+
+def test_elites_that_fail_under_conditions_are_trained_on_under_them():
+    spaces = get_space("super_gaussian+payload+push"), COURSE
+    genes = spaces[0].hard_random(3, 1), COURSE.hard_random(2, 1)
+    tiles = make_mix(terrains=10, genes=genes, spaces=spaces).next()
+    expected = np.concatenate([spaces[0].conditions_of(genes[0]), COURSE.conditions_of(genes[1])])
+    mix = make_mix(terrains=10, genes=genes, spaces=spaces)
+    mix.next()
+    np.testing.assert_array_equal(tiles.ground.rows[5:], expected[mix.rows])
+    np.testing.assert_array_equal(
+        tiles.ground.rows[:5], COURSE.conditions_of(np.zeros((5, 36)))
+    )  # hand-crafted: nominal

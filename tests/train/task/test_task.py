@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from kernels.conditions import Condition
 from kernels.episode import Outcome
+from sim.conditions import NOMINAL
+from sim.ground import GroundMaps
 from sim.robots.find import get_robot
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
 from train.task.cfg import NoiseCfg, TaskCfg, task_problems
+from train.task.curriculum import Tiles
 from train.task.task import CommandTask
 from train.task.vec_env import CommandVecEnv
 
@@ -172,6 +176,26 @@ def test_crossings_begin_along_the_way_with_the_goal_where_it_is(make_task):
     assert task.end[0] == int(Outcome.GOAL) and (task.end[1:] == 0).all()
     assert extras["time_outs"].tolist() == [True] + [False] * 11  # no failure: its value goes on
     assert joint_q(task)[0, 0] <= 10.1  # it began anew, along the way
+
+
+def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
+    rows = np.tile(NOMINAL, (2, 1))
+    rows[1, [Condition.PAYLOAD, Condition.PUSH_Y, Condition.PUSH_TIME]] = 0.2, 1.5, 0.1
+    ground = GroundMaps(**vars(GroundMaps.plain(2)) | {"conditions": rows})
+    tiles = Tiles(heights=np.zeros((2, 161, 321), np.float32), type_of_column=("a", "b"), ground=ground)
+    cfg = TaskCfg(curriculum=CURRICULUM, push_interval_s=1e6, added_base_mass=(5.0, 5.0), friction=(1.0, 1.0))
+    task = CommandTask(get_robot("anymal"), cfg, num_envs=4, device=device, seed=0, tiles=tiles)
+    masses = task.sim._dynamics._tree.body_mass.numpy()[:, 1]
+    whole = task.sim.solver.mjw_model.body_subtreemass.numpy()[0, 1]
+    assert masses[:2] == pytest.approx(masses[0]) and masses[2:] == pytest.approx(masses[0] + 0.2 * whole)
+    sideways = []
+    for _ in range(10):
+        sideways.append(torch.from_dlpack(task.sim.joint_qd)[:, 1].clone())
+        task.step(torch.zeros(4, 12, device=task.device))
+    jump = torch.stack(sideways).diff(dim=0)
+    assert (jump[5, 2:] > 0.7).all() and (jump[:5].abs() < 0.5).all() and (jump[5, :2].abs() < 0.5).all()
+    task.exchange(Tiles(heights=tiles.heights, type_of_column=("a", "b")))
+    assert task.sim._dynamics._tree.body_mass.numpy()[:, 1] == pytest.approx(masses[0])
 
 
 def test_what_no_task_can_do_is_refused(shared_task):
