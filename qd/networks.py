@@ -10,13 +10,11 @@ from sim.corridor import SHAPE
 
 MEMBERS = 4
 """Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
-_CONVOLUTIONS = ((5, (3, 3), 24), (3, (2, 2), 48), (3, (2, 1), 64))  # size, strides across and along the way, channels
+_CONVOLUTIONS = ((5, (3, 3), 12), (3, (2, 2), 24), (3, (2, 1), 32))  # size, strides across and along the way, channels
 _FEATURES = 64  # of each place along the way
-_HAZARDS = 4  # ways to come to an end
-_SAFE = -3.0  # is added to what a place says of a hazard, so that at first most of the way is survived
 _WAVES = 4  # cosines by which a place is known
 _EAGER_STEPS = 3  # before the capture: they allocate the optimiser's state and choose the convolutions' kernels
-_LEARNING_RATE, _WEIGHT_DECAY = 2e-3, 1e-2
+_LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
 
 Moments = list[dict[str, Tensor]]
@@ -27,14 +25,10 @@ _Layers = tuple[tuple[Tensor, Tensor], ...]
 class Networks(nn.Module):
     """Small convolutional networks side by side, as groups of channels.
 
-    They slide along the way, so that an obstacle is the same wherever it lies. What depends on where it lies can be
-    learned, too: the last convolution that slides also sees how far along the way each place lies, as cosines. These
-    separate parts of the way in fewer steps of training than one coordinate does.
-
-    A robot that fails at a place sees nothing behind it. So each place has hazards, by which the way ends there if it
-    was survived so far, as in the analysis of survival times. What counts of the places is their features where the way
-    ends by each hazard; of the first hazard also their mean and maximum as far as it is survived, and the chances to
-    survive all. Of ``num_maps`` maps of a terrain each network says ``num_out`` numbers by these.
+    They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
+    depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
+    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does. Of
+    ``num_maps`` maps of a terrain each network says ``num_out`` numbers.
 
     Parameters are weights and biases of each layer in turn, all zero, of shapes (MEMBERS * out, in, *size) and
     (MEMBERS * out,). Weights lie in memory as convolutions are fastest, on the CPU and on CUDA.
@@ -47,8 +41,7 @@ class Networks(nn.Module):
         for size, strides, channels_out in _CONVOLUTIONS:
             layers.append((channels_out, channels, size, size))
             rows, cols, channels = -(-rows // strides[0]), -(-cols // strides[1]), channels_out
-        layers += [(_FEATURES, channels + _WAVES, rows, 3), (_HAZARDS, _FEATURES, 1, 1)]
-        for out, *shape in (*layers, (num_out, (_HAZARDS + 2) * _FEATURES + _HAZARDS, 1, 1)):
+        for out, *shape in (*layers, (_FEATURES, channels + _WAVES, rows, 3), (num_out, 2 * _FEATURES, 1, 1)):
             weights = torch.zeros(MEMBERS * out, *shape).contiguous(memory_format=torch.channels_last)
             self._weights.extend([weights, torch.zeros(MEMBERS * out)])
         waves = math.pi * torch.arange(1, _WAVES + 1)[:, None] * torch.linspace(0.0, 1.0, cols)  # from start to goal
@@ -86,19 +79,12 @@ class Networks(nn.Module):
             alike = rows.shape[1] == weight.shape[2]  # all networks see the same
             weight = weight.flatten(0, 1) if alike else _block_diagonal(weight)
             rows = _activated(rows, weight.to(rows.dtype), bias.flatten().to(rows.dtype), strides, size // 2)
-        (weight, bias), (hazard_weight, hazard_bias), (last_weight, last_bias) = layers[-3:]
+        (weight, bias), (last_weight, last_bias) = layers[-2:]
         weight, of_places = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
         places = of_places.flatten(2) @ self.get_buffer("_places") + bias[..., None]  # the same in every row
         rows = nn.functional.conv2d(rows, _block_diagonal(weight).to(rows.dtype), padding=(0, 1))
         rows = (rows.reshape(len(rows), *places.shape) + places.to(rows.dtype)).relu()
-        rows = rows.float()
-        hazard = torch.einsum("bnfx,nhf->bnhx", rows, hazard_weight.flatten(2)) + hazard_bias[..., None]
-        hazard = nn.functional.softplus(hazard + _SAFE)
-        passed = hazard.cumsum(-1)
-        survived = (hazard - passed).exp()  # up to a place
-        ends = torch.einsum("bnhx,bnfx->bnhf", survived * (1.0 - (-hazard).exp()), rows).flatten(2)
-        on_the_way = survived[:, :, :1] * rows
-        pooled = torch.cat([ends, on_the_way.mean(-1), on_the_way.amax(-1), -passed[..., -1]], dim=2)
+        pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2).float()
         return torch.einsum("bni,noi->bno", pooled, last_weight.flatten(2)) + last_bias
 
 

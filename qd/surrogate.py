@@ -17,7 +17,7 @@ from qd.descriptors import Cells
 from qd.fitness import FITNESS_FLOOR, Evaluation
 from qd.networks import MEMBERS, Moments, Networks, Training
 from qd.run.presets import SchedulerCfg
-from sim.corridor import SHAPE, corridor_ground, corridor_heights
+from sim.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
 from sim.policy.loaders import on_stream, prepare_torch
 from sim.spaces.base import TerrainSpace, clipped
 from sim.spaces.registry import get_space
@@ -76,7 +76,7 @@ class Surrogate:
         self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
         self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
-        self._networks = Networks(1 + len(space.ground), self._targets.shape[1])
+        self._networks = Networks(1 + num_maps(space), self._targets.shape[1])
         for weights in self._networks.parameters():
             drawn = self._rng.normal(size=weights.shape) * np.sqrt(2.0 / max(1, weights[0].numel()))
             values = drawn if weights.ndim > 1 else np.zeros(weights.shape)
@@ -146,14 +146,14 @@ class Surrogate:
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
     def _map_genes(self, genes: Tensor) -> Tensor:
-        """Heights over their scale, and ground, shape (N, *SHAPE, num_maps)."""
+        """Heights over their scale, ground and conditions, shape (N, *SHAPE, num_maps)."""
         heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
-        return torch.cat([heights[..., None], corridor_ground(genes, self.space).movedim(1, -1)], dim=-1)
+        return torch.cat([heights[..., None], corridor_maps(genes, self.space).movedim(1, -1)], dim=-1)
 
     def _map_new(self) -> tuple[Tensor, Tensor]:
         """The ring of maps, once it has those of all terrains, and the place of each terrain in it."""
         if self._maps is None:
-            shape = MOST, *SHAPE, 1 + len(self.space.ground)
+            shape = MOST, *SHAPE, 1 + num_maps(self.space)
             self._maps = torch.empty(shape, dtype=torch.half, device=self.device)
         self._num_mapped += self._num_unmapped
         places = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
@@ -322,7 +322,7 @@ class Surrogate:
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets = state["rng"], state["genes"], state["targets"]
         self._scale, self.squared_error = state["scale"], state["squared_error"]
-        self._networks = Networks(1 + len(self.space.ground), self._targets.shape[1])
+        self._networks = Networks(1 + num_maps(self.space), self._targets.shape[1])
         moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state["learned"]]
         for weights, tensors in zip(self._networks.parameters(), moments, strict=True):
             weights.data.copy_(tensors.pop("weights"))

@@ -4,7 +4,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from kernels.conditions import Condition
 from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
+from sim.conditions import genes_of
 from sim.ground import patches_at
 from sim.spaces.base import TerrainSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
@@ -17,6 +19,7 @@ NODE_SPACING = 0.1
 """Distance of neighbouring nodes of the corridor [m]."""
 SHAPE = tuple(round((high - low) / NODE_SPACING) + 1 for low, high in (Y, X))
 """Nodes along y and x."""
+_OF_A_SIDE = (Condition.PAYLOAD_Y, Condition.PUSH_Y)
 _AT_ONCE = 2048  # terrains, whole grids of which take 420 MB
 
 
@@ -41,12 +44,28 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     return heights
 
 
-def corridor_ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    """What :attr:`TerrainSpace.ground` names, on the nodes of :func:`corridor_heights`, which has the same arguments.
+def num_maps(space: TerrainSpace) -> int:
+    """Maps of :func:`corridor_maps`."""
+    return len(space.ground) + len(genes_of(space.conditions))
+
+
+def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
+    """Ground and conditions on the nodes of :func:`corridor_heights`, which has the same arguments.
 
     Float32 tensor on their device, shape (num_terrains, num_maps, 41, 121), 0 where ground is as always: the friction
-    that is missing, and the time constant over that of the softest ground.
+    that is missing, and the time constant over that of the softest ground. A gene of a condition is the same
+    everywhere, but where it is of a side: it then grows from minus itself on the right to itself on the left, so that
+    mirrored maps are those of mirrored conditions.
     """
+    kinds, across = genes_of(space.conditions), torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
+    profiles = [across if gene.condition in _OF_A_SIDE else torch.ones_like(across) for gene in kinds]
+    conditions = genes[:, space.num_genes - len(kinds) :, None, None].expand(-1, -1, *SHAPE)
+    if kinds:
+        conditions = conditions * torch.stack(profiles)[:, :, None]
+    return torch.cat([_ground(genes, space), conditions], dim=1)
+
+
+def _ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     if not space.ground:
         return genes.new_empty(len(genes), 0, *SHAPE)
     device = str(wp.device_from_torch(genes.device))

@@ -14,7 +14,7 @@ from qd.run.presets import SchedulerCfg
 from qd.surrogate import Surrogate, vary_elites
 from sim.corridor import SHAPE, corridor_heights
 from sim.spaces.base import clipped
-from sim.spaces.registry import load_space
+from sim.spaces.registry import get_space, load_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.sim.spaces.spaces import write_ridges
@@ -79,6 +79,25 @@ def test_what_it_learned_holds_for_other_terrains(learned):
     assert prediction["collided"].mean() < 0.1  # none of the stand-in's robots collides
 
 
+def test_it_learns_from_a_payload_alone():
+    """On one terrain for all, penalties follow from the payload."""
+    space = get_space("super_gaussian+payload")
+    search = Surrogate(CFG, CELLS, space, np.random.SeedSequence(0))
+
+    def loaded(count, seed):
+        genes = np.tile(space.hard_random(1, 0), (count, 1))
+        genes[:, 64] = np.random.default_rng(seed).uniform(-1.0, 1.0, count)
+        shares = np.full((count, 4, 6), 1.0)
+        shares[..., 0] += 4.0 * (1.0 + genes[:, 64, None])
+        return genes, evaluation_of(stand_in.make_result(shares * stand_in.SCALES), CELLS, FITNESS)
+
+    for seed in range(6):
+        search.learn(*loaded(64, seed))
+    genes, truth = loaded(100, 9)
+    ratios = predicted(search, genes)["ratios"].mean(axis=0)[:, 0]
+    assert np.corrcoef(ratios, truth.ratios[:, 0])[0, 1] > 0.9
+
+
 def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
     """Weights of networks after a step on given maps, all or none of them mirrored."""
     torch.manual_seed(0)
@@ -123,7 +142,7 @@ def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeyp
     np.testing.assert_allclose(values["ratios"], expected["ratios"], rtol=0.0, atol=tolerance)
 
 
-@pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness"])
+@pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness+push+delay"])
 def test_it_learns_and_proposes_on_every_device(device, name, tmp_path):
     space = load_space(name.format(own=write_ridges(tmp_path)))
     cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2, candidates=8, generations=2)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sim.bank import terrains_of
-from sim.conditions import NOMINAL
 from sim.spaces.course import COURSE
 from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
