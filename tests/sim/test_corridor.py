@@ -39,7 +39,8 @@ def test_conditions_are_maps_whose_mirror_images_are_those_of_mirrored_condition
     mirrored[:, [64 + 32 + 2, 64 + 32 + 5]] *= -1.0  # payload and push to the side
     maps, others = corridor_maps(genes, space), corridor_maps(mirrored, space)
     assert maps.shape == (2, 1 + 7, *SHAPE) and num_maps(space) == 8
-    assert torch.equal(maps[:, 1:].flip(2), others[:, 1:]) and not torch.equal(maps[:, 1:], others[:, 1:])
+    torch.testing.assert_close(maps[:, 1:].flip(2), others[:, 1:])
+    assert not torch.equal(maps[:, 1:], others[:, 1:])
     assert torch.equal(maps[:, 1], genes[:, 96, None, None].expand(-1, *SHAPE))
     assert torch.equal(maps[:, 3, -1], genes[:, 98, None].expand(-1, SHAPE[1]))  # in full on the left
     assert torch.equal(maps[:, :1], corridor_maps(genes[:, :96], get_space("super_gaussian+friction")))
