@@ -14,7 +14,8 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.episode import Outcome
+from kernels.conditions import disturb_observation, push
+from kernels.episode import Outcome, make_episodes
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
@@ -70,8 +71,11 @@ def record_segments(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.
 class Motion:
     """Recorded segments that are replayed in one simulation, by a captured graph of the physics of a control step."""
 
-    def __init__(self, sim: Simulation, segments: list[Segment]) -> None:
-        """Captures the graph and replays two segments, so that the kernels are loaded."""
+    def __init__(self, sim: Simulation, segments: list[Segment], beside: Callable[[], None] | None = None) -> None:
+        """Captures the graph and replays two segments, so that the kernels are loaded.
+
+        ``beside`` launches what a control step has beside its physics.
+        """
         self.sim, self.segments = sim, segments
         self.robot_steps = sim.robot.decimation * sum(part.num_running * len(part.targets) for part in segments)
         """Physics steps of the robots that are not left out, in one replay of all segments."""
@@ -79,6 +83,8 @@ class Motion:
         def control_step() -> None:
             for _ in range(sim.robot.decimation):
                 sim.physics_step()
+            if beside is not None:
+                beside()
 
         with wp.ScopedDevice(sim.device):
             self._graph: Any = sim.capture(control_step)
@@ -126,8 +132,9 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
     """Physics steps a second, over all robots that have an episode, of contacts and solver alone.
 
     Returns:
-        ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and
-        ``ground``, in the motion of the crossings on ground with maps of friction and softness that change nothing.
+        ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
+        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and
+        ``conditions``, under conditions that change nothing on such ground.
     """
     sim, robot = rollout.sim, rollout.robot
     segments = record_segments(rollout, terrains, seeds)
@@ -135,8 +142,28 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
     bank.set_heights(sim.bank.heights.numpy())
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
-    walking, ground = replay_rates([motion, with_maps], rounds)
-    return {"walking": walking, "standing": standing_rate(rollout, motion, terrains, seeds), "ground": ground}
+    walking, ground, conditions = replay_rates([motion, with_maps, motion_under_conditions(sim, segments)], rounds)
+    standing = standing_rate(rollout, motion, terrains, seeds)
+    return {"walking": walking, "standing": standing, "ground": ground, "conditions": conditions}
+
+
+def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
+    """The same motion of robots that have conditions, which change nothing."""
+    robot = sim.robot
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
+    bank.set_heights(sim.bank.heights.numpy())
+    with wp.ScopedDevice(sim.device):
+        varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
+        varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
+        observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
+    disturbed = varied.disturbed
+    assert disturbed is not None
+
+    def beside() -> None:
+        push(episodes, disturbed, robot.physics_dt, robot.decimation, varied.joint_qd)
+        disturb_observation(episodes, robot.num_joints, robot.control_dt, disturbed, observation)
+
+    return Motion(varied, segments, beside)
 
 
 def standing_rate(rollout: Rollout, motion: Motion, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> float:

@@ -92,7 +92,7 @@ def time_iteration(script: Script) -> dict[str, Any]:
         "bare_physics_ratio": rate / bare["walking"],
         "bare_physics_ratio_standing": rate / bare["standing"],
         "ground_step_ratio": bare["walking"] / bare["ground"],
-        "conditions_step_ratio": None,
+        "conditions_step_ratio": bare["ground"] / bare["conditions"],
     }
 
 
