@@ -31,6 +31,7 @@ for robot in "${robots[@]}"; do
   make_file "$folder/rounds.json" rounds "$robot"                     # 120 min
   make_file "$folder/dose.json" dose "$robot"                         # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
+  make_file "$folder/conditions.json" conditions "$robot"             # 8 min
   make_file "sim/robots/$robot/pack/pack.json" pack "$robot"          # 2 min
   make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min; with MJLAB results.make.peer too, 3 min
   if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then

@@ -38,7 +38,7 @@ def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
     archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)
     if archive.failing.any():
         train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot), RunCfg(device=script.device))
-    judge(run, stages=("others",), compute=script.compute)
+    judge(run, stages=("others", "varied"), compute=script.compute)
     return RunDirectory(run).read_summary()
 
 

@@ -21,7 +21,19 @@ from tests.qd.searches import without_figures
 from tests.qd.stand_in import Stub, make_result
 
 MAKE = Path(common.__file__).parent
-SCRIPTS = ("base", "dose", "minimal", "pack", "penalty_ratios", "search", "search_noise", "spaces", "speed", "tables")
+SCRIPTS = (
+    "base",
+    "conditions",
+    "dose",
+    "minimal",
+    "pack",
+    "penalty_ratios",
+    "search",
+    "search_noise",
+    "spaces",
+    "speed",
+    "tables",
+)
 """Those that call all that the others call."""
 FILES = {name: f"{name}.json" for name in SCRIPTS} | {"minimal": "archive/minimal.json", "pack": "pack/pack.json"}
 
