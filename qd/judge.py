@@ -29,7 +29,7 @@ from sim.files.records import identity
 from sim.policy.spec import ControllerSpec, controller_hash, spec_of, weights_file
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
-from sim.rollout import RolloutResult
+from sim.rollout import Rollout, RolloutResult
 from sim.spaces.conditions import varied_genes, varied_name
 from sim.spaces.registry import get_space, load_space
 
@@ -134,6 +134,12 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
             check_policy(policy, search.robot, device)
         except ValueError as error:
             raise ValueError(f"certifier {name} does not fit {search.robot.name}: {error}") from error
+
+
+def check_varied(search: Search, device: str) -> None:
+    """Builds a simulation of one robot under varied conditions; a ValueError if it cannot have any."""
+    under = load_space(varied_name(get_space(search.cfg.space, search.cfg.space_sha256)))
+    Rollout(search.robot, search.policy, num_terrains=1, num_replicas=1, device=device, space=under)
 
 
 def confirm(archive: Archive, rows: NDArray[np.int64], search: Search, crossings: Crossings) -> Archive:
@@ -261,6 +267,8 @@ def judge(
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if {"others", "varied"} & {*stages}:
         check_certifiers(certifiers, search, compute.device)
+    if "varied" in stages and len(stages) > 1:  # or it would be found out after hours
+        check_varied(search, compute.device)
     calls_of = {"others": 2 * len(certifiers), "varied": 1 + len(certifiers)}
     calls = sum(calls_of.get(stage, 1) for stage in stages)
     with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crossings:

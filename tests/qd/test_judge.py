@@ -177,6 +177,15 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
     assert not judged(path, stages=("others",), certifiers={"C-G": weak}).robust.any()
 
 
+def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):
+    monkeypatch.setattr("sim.solver.fits", lambda *_: False)
+    nobody = Robots(result_of, stop_after=0)
+    with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
+        judged(path, nobody, stages=("fresh", "resolved", "others", "varied"))
+    with pytest.raises(ValueError, match="begin with the stages resolved, others"):
+        judged(path, nobody, stages=("varied",))
+
+
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
     first = judged(path)
     copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), str(ROBOTS["anymal"].panel / "S.pt")
