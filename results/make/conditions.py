@@ -24,7 +24,7 @@ from sim.ground import joined_name
 from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
-SPACE = joined_name(SUPER_GAUSSIAN.name, KINDS)
+SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(KINDS))
 EPISODES_SEARCHED = 400_000
 _STREAM = 2000
 _EXAMPLES = 10

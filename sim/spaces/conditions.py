@@ -112,19 +112,22 @@ def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray
 
     Conditions that the space has genes of stay as they are. Shape (number of seeds, its num_genes).
     """
-    own, first = {}, space.num_genes - len(genes_of(space.conditions))
-    for kind in space.conditions:
-        number = sum(len(KINDS[other]) for other in own)
-        own[kind] = genes[first + number : first + number + len(KINDS[kind])]
+    first = space.num_genes - len(genes_of(space.conditions))
+    own = dict(zip(space.conditions, _kinds_of(genes[first:], space.conditions), strict=True))
     rows = []
     for seed in seeds.tolist():
-        rng, row = np.random.default_rng(seed), [genes[:first]]
+        rng, parts = np.random.default_rng(seed), [genes[:first]]
         for kind in KINDS:
             if kind in own:
-                row.append(own[kind])
+                parts.append(own[kind])
             elif kind in VARIED:
                 drawn, *others = KINDS[kind]
-                absent = [other.absent for other in others]
-                row.append(np.float32([drawn.gene(np.array(rng.uniform(*VARIED[kind]))), *absent]))
-        rows.append(np.concatenate(row))
+                value = float(drawn.gene(np.array(rng.uniform(*VARIED[kind]))))
+                parts.append(np.array([value, *(other.absent for other in others)], np.float32))
+        rows.append(np.concatenate(parts))
     return np.stack(rows)
+
+
+def _kinds_of(genes: NDArray[np.float32], kinds: Sequence[str]) -> list[NDArray[np.float32]]:
+    """Genes of each kind, of a row of all."""
+    return np.split(genes, np.cumsum([len(KINDS[kind]) for kind in kinds])[:-1]) if kinds else []

@@ -27,7 +27,7 @@ FIRST_COL, NUM_PLACES = 100, 20
 """An obstacle begins at one of so many neighbouring nodes, from x = 5 m on: over 1 m, more than a stride."""
 LEVEL_SPACE = joined_name(SUPER_GAUSSIAN.name, GROUND_KINDS)
 """Space of level ground whose friction or softness is the dose."""
-CONDITIONS_SPACE = joined_name(SUPER_GAUSSIAN.name, KINDS)
+CONDITIONS_SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(KINDS))
 """Space of level ground that is crossed under a condition, which is the dose."""
 _CONDITIONS = {
     "payload": Condition.PAYLOAD, "motors": Condition.STRENGTH, "delay": Condition.DELAY, "lag": Condition.LAG,
