@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
+from sim.conditions import KINDS
 from sim.files.intervals import value_words
 
 ROOT = Path(__file__).parents[2]
@@ -102,6 +103,7 @@ def archives() -> str:
         "*faults*: confirmed, and another controller crosses it": "faults",
         "... of them by the panel alone": "faults_panel",
         "... by controllers that trained on no such terrain": "faults_unseen",
+        "*robust*: faults under varied conditions, too": "robust",
         "minutes on one GPU": shown("wall_s", factor=1 / 60),
     }
     return table({name: numbers for name, numbers in found.items() if numbers}, columns, upright=True)
@@ -167,6 +169,39 @@ def methods(robot: str) -> str:
     names = ("seeds", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
     named = {f"{name}, {one['episodes']:,.0f} episodes": one for name, one in rows}
     return table(named, {name.replace("_", " "): name for name in names})
+
+
+def noise(robot: str) -> str:
+    """Designs of a search under noise: each with the screening's seed, and means over the seeds of the finals."""
+    searches: dict[tuple[str, float], list[Any]] = {}
+    for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
+        searches.setdefault((row["design"], round(row["episodes"], -5)), []).append(row)
+    rows = {
+        f"{design}, {episodes:,.0f} episodes": {"seeds": len(rows), **mean_of(rows)}
+        for (design, episodes), rows in sorted(searches.items(), key=lambda one: one[0][1])
+    }
+    names = ("seeds", "elites", "corrected_elites", "failing", "families")
+    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
+    columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
+    columns["at most"] = shown("same_cell_ceiling", ".2f")
+    return table(rows, columns)
+
+
+def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The mean of each number that all rows have."""
+    names = [name for name, value in rows[0].items() if isinstance(value, int | float)]
+    return {name: sum(row[name] for row in rows) / len(rows) for name in names}
+
+
+def conditions() -> str:
+    """Searches of terrains and conditions, and which of their failing elites need a condition."""
+    rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
+            for words, numbers in of_robots("results/{}/conditions.json").items() if numbers}  # fmt: skip
+    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "faults")
+    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
+    columns["failing, and crossed under nominal conditions"] = "nominal_passes"
+    columns |= {f"... without {kind}": kind for kind in KINDS}
+    return table(rows, columns, upright=True)
 
 
 def hardening() -> str:
@@ -339,7 +374,7 @@ def kernels() -> str:
 
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
     archives, archive_details, training, goals, collisions, beside_paper, methods, hardening, spaces, sizes, agreement,
-    minimal, packs, public_controllers, speed, kernels)}  # fmt: skip
+    minimal, packs, public_controllers, speed, kernels, noise, conditions)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:
