@@ -41,15 +41,11 @@ class Gene:
 
     def value(self, genes: NDArray[np.floating]) -> NDArray[np.float64]:
         """Conditions of genes, any shape."""
-        genes = np.clip(np.asarray(genes, np.float64), -1.0, 1.0)
-        return np.where(genes < 0.0, self.middle + genes * (self.middle - self.least),
-                        self.middle + genes * (self.most - self.middle))  # fmt: skip
+        return np.interp(genes, (-1.0, 0.0, 1.0), (self.least, self.middle, self.most))
 
     def gene(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Genes of conditions, any shape; outside of the limits those at the limit."""
-        values = np.asarray(values, np.float64) - self.middle
-        span = np.where(values < 0.0, self.middle - self.least, self.most - self.middle)
-        return np.clip(values / span, -1.0, 1.0)
+        return np.interp(values, (self.least, self.middle, self.most), (-1.0, 0.0, 1.0))
 
 
 KINDS: dict[str, tuple[Gene, ...]] = {
@@ -77,7 +73,8 @@ def check_conditions(rows: NDArray[np.floating], count: int) -> None:
     if rows.shape != (count, len(Condition)):
         raise ValueError(f"conditions must have shape ({count}, {len(Condition)}), got {rows.shape}")
     limits = {Condition.DELAY: (0.0, MOST_DELAY_S), Condition.LAG: (0.0, MOST_LAG_S)}
-    limits |= {Condition.STRENGTH: (1e-3, 10.0), Condition.FRICTION: (1e-3, 10.0), Condition.NOISE: (0.0, 100.0)}
+    limits |= {Condition.PAYLOAD: (-0.1, 10.0), Condition.STRENGTH: (1e-3, 10.0)}
+    limits |= {Condition.FRICTION: (1e-3, 10.0), Condition.NOISE: (0.0, 100.0)}
     for condition in Condition:
         least, most = limits.get(condition, (-100.0, 100.0))
         wrong = ~((rows[:, condition] >= least - 1e-6) & (rows[:, condition] <= most + 1e-6))
