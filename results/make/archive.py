@@ -44,8 +44,8 @@ def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Makes the three archives and publishes them beside each other."""
-    script = parse(__doc__, argv, "archive/archive.json")
-    for name in SEARCHES:
+    script = parse(__doc__, argv, "archive/archive.json", parts=tuple(SEARCHES))
+    for name in script.parts or SEARCHES:
         run = make_archive(script, name)
         for pattern in PUBLISHED:
             for file in run.glob(pattern):

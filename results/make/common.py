@@ -2,14 +2,20 @@
 
 import argparse
 import json
+import os
+import queue
+import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
@@ -116,6 +122,35 @@ class Script:
         return content
 
 
+def run_parts(words: Sequence[str], parts: Sequence[str], at_once: int) -> None:
+    """Runs a script's parts, ``at_once`` on each GPU, each in a process of its own with a log under runs/make/logs.
+
+    ``words`` are the script's command line without its flags on parts. A RuntimeError names the parts that failed.
+    """
+    module, logs = sys.modules["__main__"].__spec__, Path("runs/make/logs")
+    assert module is not None
+    logs.mkdir(parents=True, exist_ok=True)
+    gpus = queue.SimpleQueue[int]()
+    for gpu in [*range(len(wp.get_cuda_devices()))] * at_once:
+        gpus.put(gpu)
+
+    def run(part: str) -> int:
+        gpu, name = gpus.get(), re.sub(r"\W+", "-", f"{module.name} {' '.join(words)} {part}")
+        try:
+            print(f"{part} on GPU {gpu}: {logs / name}.log", flush=True)
+            command = [sys.executable, "-m", module.name, *words, "--parts", part]
+            with (logs / f"{name}.log").open("wb") as log:
+                environment = {**os.environ, "CUDA_VISIBLE_DEVICES": str(gpu)}
+                return subprocess.run(command, env=environment, stdout=log, stderr=log, check=False).returncode
+        finally:
+            gpus.put(gpu)
+
+    with ThreadPoolExecutor(gpus.qsize()) as threads:
+        failed = [part for part, status in zip(parts, threads.map(run, parts), strict=True) if status]
+    if failed:
+        raise RuntimeError(f"{', '.join(failed)} failed; their logs under {logs} say why. What is done stays done")
+
+
 def parse(
     doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results", parts: Sequence[str] = ()
 ) -> Script:
@@ -136,7 +171,11 @@ def parse(
     parser.add_argument("--out", type=Path, help=f"file to write; {published}/<robot>/{file} if left out")
     if parts:
         parser.add_argument("--parts", nargs="+", choices=parts, help="all that this device can measure if left out")
+        parser.add_argument("--at-once", type=int, help="first run all parts, so many side by side on each GPU")
     args = parser.parse_args(argv)
+    if getattr(args, "at_once", None):
+        words = [f"--{name}={value}" for name, value in vars(args).items() if value and name in ("robot", "seed")]
+        run_parts(words, args.parts or parts, args.at_once)
     robot = get_robot(args.robot)
     out = args.out or Path("runs/make/small" if args.small else published) / robot.name / file
     prepare_output(out)

@@ -38,8 +38,14 @@ def search_again(script: Script, name: str, policy: Path | None, seed: int) -> d
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Hardens in three rounds, and searches both ends again; a trial is one tiny round alone."""
-    script = parse(__doc__, argv, "rounds.json")
+    """Hardens in three rounds, and searches both ends again; a trial is one tiny round alone.
+
+    Parts are the hardening with the searches of its last controller, and those of the base.
+    """
+    script = parse(__doc__, argv, "rounds.json", parts=("hardening", "base"))
+    seeds = () if script.small else (1000, 1001)  # far from those of the rounds
+    if script.parts == ("base",):
+        return {"searches": [search_again(script, "base", None, seed) for seed in seeds]}
     run = script.runs / "hardening"
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
     if script.small:
@@ -50,11 +56,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         )  # fmt: skip
     hardening = harden(script.robot, cfg, run, script.compute, certifiers={} if script.small else None)
     rounds, policy = hardening["rounds"], last_policy(hardening["rounds"], run)
-    seeds = () if script.small else (1000, 1001)  # far from those of the rounds
+    ends = {"last": (-1, policy)} if script.parts else {"last": (-1, policy), "base": (0, None)}
     again = {
         name: [rounds[place], *(search_again(script, name, file, seed) for seed in seeds)]
-        for name, place, file in (("last", -1, policy), ("base", 0, None))
+        for name, (place, file) in ends.items()
     }
+    if script.parts:
+        return again
     if policy is not None and not script.small:
         shutil.copyfile(policy, script.results / "hardened.pt")
     return script.write({**hardening, "seed": script.seed, "searches": again["last"], "base_searches": again["base"]})

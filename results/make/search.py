@@ -43,8 +43,13 @@ def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, An
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Runs every method with every seed and writes means with 95 % t intervals over seeds."""
-    script = parse(__doc__, argv, "search.json")
+    """Runs every method with every seed, and writes means with 95 % t intervals over seeds; parts are runs alone."""
+    runs = {f"{method}-{seed}": (method, seed) for method in METHODS for seed in SEEDS}
+    script = parse(__doc__, argv, "search.json", parts=tuple(runs))
+    for part in script.parts:
+        follow_search(script, *runs[part])
+    if script.parts:
+        return {}
     methods, seeds = ((DEFAULT,), SEEDS[:1]) if script.small else (METHODS, SEEDS)
     rows = {name: [follow_search(script, name, seed) for seed in seeds] for name in methods}
     numbers = {}

@@ -26,18 +26,22 @@ MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
 RESAMPLES = 10_000
 
 
-def train_controllers(script: Script) -> dict[str, str]:
+TRAININGS = {f"{name}-{seed}": (name, seed) for name in MIXES for seed in SEEDS}
+"""Kind and seed of each."""
+
+
+def train_controllers(script: Script, trainings: Sequence[str] = tuple(TRAININGS)) -> dict[str, str]:
     """Trains each kind with each seed; returns the files by name, those of further seeds as C-G@1."""
     controllers, options = {}, RunCfg(device=script.device)
-    for name, mix in MIXES.items():
-        for seed in SEEDS:
-            cfg = replace(FinetuneCfg.of(script.robot), mix=mix, seed=seed)
-            if mix == "generated":
-                cfg = replace(cfg, archive=(str(script.results / "archive"),))
-            policy = finetune(script.robot, cfg, script.runs / "tables" / f"{name}-{seed}", options)
-            controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = str(policy)
-            if seed == SEEDS[0]:
-                shutil.copyfile(policy, script.results / f"{name}.pt")
+    for training in trainings:
+        name, seed = TRAININGS[training]
+        cfg = replace(FinetuneCfg.of(script.robot), mix=MIXES[name], seed=seed)
+        if cfg.mix == "generated":
+            cfg = replace(cfg, archive=(str(script.results / "archive"),))
+        policy = finetune(script.robot, cfg, script.runs / "tables" / training, options)
+        controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = str(policy)
+        if seed == SEEDS[0]:
+            shutil.copyfile(policy, script.results / f"{name}.pt")
     return controllers
 
 
@@ -87,8 +91,11 @@ def families_of(terrains: TerrainSet) -> NDArray[np.int64]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Trains and evaluates; a trial evaluates what is published on few terrains."""
-    script = parse(__doc__, argv, "tables.json")
+    """Trains and evaluates; parts are trainings alone, a trial evaluates what is published on few terrains."""
+    script = parse(__doc__, argv, "tables.json", parts=tuple(TRAININGS))
+    if script.parts:
+        train_controllers(script, script.parts)
+        return
     controllers = published_controllers(script)
     if script.small:
         controllers = {name: controllers[name] for name in ("base", "C-G")}

@@ -3,9 +3,13 @@
 import importlib
 import json
 import re
+import subprocess
+import sys
+import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -76,6 +80,29 @@ def test_every_script_loads_and_is_listed():
     text = (MAKE / "all.sh").read_text()
     assert all(hasattr(importlib.import_module(f"results.make.{name}"), "main") for name in scripts - {"common"})
     assert [name for name in scripts if f" {name} " not in text and f"make.{name}" not in text] == []
+
+
+def test_parts_run_side_by_side_on_all_gpus_each_once(tmp_path, monkeypatch):
+    ran, both = [], threading.Barrier(4, timeout=10)
+
+    def run(command, *, env, stdout, stderr, check):
+        both.wait()  # four at once, two on each GPU
+        ran.append((command[-1], env["CUDA_VISIBLE_DEVICES"]))
+        assert command[:3] == [sys.executable, "-m", "results.make.some"] and command[3:-1] == ["--seed=3", "--parts"]
+        stdout.write(b"done")
+        return SimpleNamespace(returncode=int(command[-1] == "c 3"))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(common.wp, "get_cuda_devices", lambda: ["cuda:0", "cuda:1"])
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", SimpleNamespace(name="results.make.some"))
+    monkeypatch.setattr(subprocess, "run", run)
+    parts = [f"{letter} {number}" for letter in "abcd" for number in (1, 2)]
+    common.run_parts(["--seed=3"], parts, 2)
+    assert sorted(part for part, _ in ran) == sorted(parts)
+    assert [gpu for _, gpu in ran].count("0") == [gpu for _, gpu in ran].count("1") == 4
+    assert len(list((tmp_path / "runs/make/logs").glob("*.log"))) == 8
+    with pytest.raises(RuntimeError, match=r"^c 3 failed"):
+        common.run_parts(["--seed=3"], ["a 1", "c 3", "a 2", "b 1"], 2)
 
 
 def test_a_file_of_other_sources_or_of_a_trial_is_not_current(tmp_path):
