@@ -171,10 +171,10 @@ def methods(robot: str) -> str:
     return table(named, {name.replace("_", " "): name for name in names})
 
 
-def noise(robot: str) -> str:
+def noise(robot: str, file: str = "search_noise") -> str:
     """Designs of a search under noise: each with the screening's seed, and means over the seeds of the finals."""
     searches: dict[tuple[str, float], list[Any]] = {}
-    for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
+    for row in read(f"results/{robot}/{file}.json").get("rows", ()):
         searches.setdefault((row["design"], round(row["episodes"], -5)), []).append(row)
     rows = {
         f"{design}, {episodes:,.0f} episodes": {"seeds": len(rows), **mean_of(rows)}

@@ -23,23 +23,25 @@ from sim.spaces.registry import get_space
 SEED, EPISODES = 9, 200_000
 """Of the screening."""
 FINAL_SEEDS, FINAL_EPISODES = (0, 1, 2), 400_000
-PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12, "settling": 1}
+THREES = {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12}
+PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12}
+SETTLED = {"settling": 1}
 DESIGNS: dict[str, dict[str, Any]] = {
     "once": {},
     "10 episodes": {"replicas": 10, "batch_size": 40, "candidates": 10},
     "5 episodes": {"replicas": 5, "batch_size": 80, "candidates": 8},
-    "threes, half again": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12},
-    "threes, half again, settled": {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12, "settling": 1},
-    "threes, quarter again, settled": {"replicas": 3, "batch_size": 100, "again": 33, "candidates": 12, "settling": 1},
-    "pairs, half again": {**PAIRS, "settling": 0},
-    "pairs, half again, settled": PAIRS,
-    "pairs, quarter again, settled": {**PAIRS, "batch_size": 150, "again": 50},
-    "singles, half again, settled": {"replicas": 1, "batch_size": 220, "again": 180, "candidates": 6, "settling": 1},
-    "pairs, fewer candidates": {**PAIRS, "candidates": 4},
-    "pairs, learn longer": {**PAIRS, "training_steps": 1000},
+    "threes, half again": THREES,
+    "threes, half again, settled": {**THREES, **SETTLED},
+    "threes, quarter again": {**THREES, "batch_size": 100, "again": 33},
+    "pairs, half again": PAIRS,
+    "pairs, half again, settled": {**PAIRS, **SETTLED},
+    "pairs, quarter again": {**PAIRS, "batch_size": 150, "again": 50},
+    "singles, half again": {**PAIRS, "replicas": 1, "batch_size": 220, "again": 180, "candidates": 6},
+    "threes, half again, fewer candidates": {**THREES, "candidates": 6},
+    "threes, half again, learn longer": {**THREES, "training_steps": 1000},
 }
 """Settings of preset wide that each design changes."""
-FINALS = ("once", "pairs, half again, settled", "threes, half again, settled")
+FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled")
 SEARCHES = {name: (name, SEED, EPISODES) for name in DESIGNS} | {
     f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS
 }
