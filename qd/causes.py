@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kernels.ground import FIRM
 from sim.bank import heights_of, terrains_of
+from sim.conditions import words_of
 from sim.crossing import CrossingCfg
 from sim.ground import PATCHES, patches_at
 from sim.spaces.base import TerrainSpace
@@ -30,6 +31,11 @@ NARROW = 0.5
 HALF_WIDTH = 0.35
 """Half the width of a stance, where the robot is not known [m]; the shipped robots have 0.4 m and 0.3 m."""
 SLIPPERY, SOFT = "slippery ground", "soft ground"
+CONDITIONS = {
+    "payload": "payload", "motors": "weak motors", "delay": "late actions", "lag": "old observations",
+    "noise": "noise", "push": "push", "grip": "little grip",
+}  # fmt: skip
+"""Causes that are kinds of conditions (:data:`sim.conditions.KINDS`)."""
 UNCLEAR = "unclear"
 """The cause where no part of the terrain lies where robots end."""
 
@@ -74,6 +80,8 @@ class Effects:
     """Patches that it makes slippery, shape (num_parts, rows, cols) of its map."""
     soft: NDArray[np.bool_]
     """Patches that it makes soft, likewise."""
+    conditions: tuple[str, ...]
+    """The kind of condition that each of the parts sets; empty of one that sets none."""
 
     @property
     def patches(self) -> NDArray[np.bool_]:
@@ -81,8 +89,9 @@ class Effects:
         return self.slippery | self.soft
 
     def changes(self, least: float) -> NDArray[np.bool_]:
-        """Which parts change the ground, or heights by more than ``least`` [m]; shape (num_parts,)."""
-        return (np.abs(self.heights).max(axis=(1, 2)) > least) | (self.patches.sum(axis=(1, 2)) > 0)
+        """Which parts set a condition, or change the ground, or heights by more than ``least`` [m]; (num_parts,)."""
+        sets = np.array([kind != "" for kind in self.conditions], bool)
+        return sets | (np.abs(self.heights).max(axis=(1, 2)) > least) | (self.patches.sum(axis=(1, 2)) > 0)
 
     def way(self, part: int, half_width: float) -> tuple[float, bool]:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
@@ -93,16 +102,18 @@ class Effects:
         return on_the_way(self.heights[part], half_width), bool(changed)
 
     def shape(self, part: int, half_width: float) -> Shape:
-        """The shape of a part; of one that changes the ground and no height on the way, its kind alone."""
-        if not self.patches[part].any() or on_the_way(self.heights[part], half_width) >= LEAST_HEIGHT:
+        """The shape of a part; of a condition, or one that changes the ground and no height on the way, its kind."""
+        condition = CONDITIONS.get(self.conditions[part])
+        on_ground = self.patches[part].any() and on_the_way(self.heights[part], half_width) < LEAST_HEIGHT
+        if condition is None and not on_ground:
             return shape_of(self.heights[part], half_width)
-        kind = SLIPPERY if self.slippery[part].any() else SOFT
+        kind = condition or (SLIPPERY if self.slippery[part].any() else SOFT)
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
 
 
 def commonest_words(cause: str) -> str:
     """That most terrains stop the robot by a cause: ``ridges are the commonest cause``."""
-    if cause in (SLIPPERY, SOFT):
+    if cause in (SLIPPERY, SOFT, *CONDITIONS.values()):
         return f"{cause} is the commonest cause"
     return f"{cause}{'es' if cause.endswith('ch') else 's'} are the commonest cause"
 
@@ -116,7 +127,16 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainS
         heights=heights[0] - heights[1:],
         slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],
         soft=nothing if ground is None else ground.time_constant_s[0] != ground.time_constant_s[1:],
+        conditions=_conditions_of(genes, parts, space),
     )
+
+
+def _conditions_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> tuple[str, ...]:
+    """The kind of condition that each part of a terrain sets, if it does."""
+    first = len(space.parts(genes)) - len(space.conditions)
+    (row,) = space.conditions_of(genes[None])
+    kinds = [space.conditions[part - first] if part >= first else "" for part in parts]
+    return tuple(kind if kind and words_of(kind, row) else "" for kind in kinds)
 
 
 def causes_at(

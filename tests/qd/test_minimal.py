@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kernels.conditions import Condition
+from qd.causes import effects_of
 from qd.judge import Search
 from qd.minimal import Case, Trial, case_of, find_minimal, take_apart
 from qd.workers.cross import Crossings
 from sim.robots.find import get_robot
+from sim.spaces.registry import get_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
 from tests.qd.robots import Robots
@@ -175,3 +178,28 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
     assert counted - 2 * 20 * 2 == 5 * len(together.crossed)  # all but the whole terrains, which are given
     _, single = apart((2,), alone)
     assert set(alone.seeds) < set(together.seeds) and single[2].counts.tolist() == minima[2].counts.tolist()
+
+
+@BOTH
+def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(how):
+    space, archive = get_space("super_gaussian+payload+motors+push"), small_archive(1)
+    genes = space.without(np.ones((1, space.num_genes), np.float32), range(8 + 3))
+    genes[0, 8 * 3 : 8 * 4] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, 0.7)  # a bump across the way
+    genes[0, [64, 68, 69]] = 0.5, 0.4, 0.4  # a payload and a push; motors as they are
+    fresh = replace(fresh_values(archive), goal_rate=np.full(1, 0.1))
+    archive = replace(archive, fresh=fresh, genes=genes, space=space.name)
+
+    def fails(cfg, genes, seeds):
+        """With this payload, on the bump where it is higher than .6 of what the elite has."""
+        return (space.conditions_of(genes)[:, Condition.PAYLOAD] > 0.1) & (genes[:, 31] > 0.42)
+
+    case = case_of(archive, 0, space, 0.3, how, on_gpu=True)
+    assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
+    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space.name)
+    with Crossings(ROBOT, compute_by(Robots(fails))) as crossings:
+        minimal = take_apart(archive, {0: case}, space, search, crossings)[0]
+    assert (minimal.parts, minimal.scale) == ((3, 8), 0.625)
+    effects = effects_of(genes[0], range(11), space)
+    assert effects.conditions == ("",) * 8 + ("payload", "", "push")
+    assert [effects.shape(part, 0.3).kind for part in (8, 10)] == ["payload", "push"]
+    assert effects.shape(3, 0.3).height_m > 0.1
