@@ -121,8 +121,8 @@ def remembering() -> Iterator[list[NDArray[np.float32]]]:
     """The terrains that searches ask for, lot by lot; at the end those of two iterations that are not crossed."""
     asked, ask = [], Scheduler.ask
 
-    def remember(self: Scheduler, group: int = 0) -> NDArray[np.float32]:
-        asked.append(ask(self, group))
+    def remember(self: Scheduler, group: int = 0, *, new: bool = True) -> NDArray[np.float32]:
+        asked.append(ask(self, group, new=new))
         return asked[-1]
 
     with patch.object(Scheduler, "ask", remember):

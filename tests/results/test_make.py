@@ -21,7 +21,7 @@ from sim.files.records import sources_sha256
 from sim.rates import counted_episodes
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
-from tests.qd.searches import without_figures
+from tests.qd.searches import rows_of, run, without_figures
 from tests.qd.stand_in import Stub, make_result
 
 MAKE = Path(common.__file__).parent
@@ -209,6 +209,15 @@ def test_rates_of_training_are_of_the_same_device(speeds):
     assert [report[f"train_env_steps_per_s{key}"] for key in ("", "_8192", "_mjlab")] == [7.0, None, 2.0]
     file.write_text(json.dumps({**origin, "rows": rows, "sources_sha256": "0" * 64}))
     assert speeds.run("cuda:0", "--parts", "curve")["train_env_steps_per_s"] is None
+
+
+def test_what_a_search_asks_for_is_remembered(tmp_path, monkeypatch):
+    without_figures(monkeypatch)
+    with speed.remembering() as asked:
+        run(tmp_path / "run", iterations=4)
+    # Lots of 12 terrains: one is put in first, one behind each iteration, and the last is not crossed.
+    assert [len(lot) for lot in asked] == [12] * 5
+    assert sum(row["terrains"] for row in rows_of(tmp_path / "run")) == 4 * 12
 
 
 def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
