@@ -45,7 +45,8 @@ class Archive(ControllerFlags, WorkerFlags):
     """Iterations to reach; with --resume, more than before extend a finished run."""
     until: Annotated[float, Meta(gt=0, lt=1)] | None = None
     """Ends the search before, once its last tenth brought less than this share of the elites that can be expected to
-    stay in their cells, such as 0.03."""
+    stay in their cells, such as 0.03; asked from 20 iterations with new terrains on. What was asked for by then is
+    still crossed, and the settling iterations follow."""
     seed: int = 0
     """Seed of everything drawn."""
     resume: Path | None = None
@@ -95,6 +96,7 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.workers.evaluator import Compute
         from sim.spaces.registry import at_height, load_space, space_at
 
+        self.scheduler.check_iterations(self.iterations)  # before anything is loaded
         compute = Compute.resolve(self.device, self.workers, self.num_envs)
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:

@@ -1,6 +1,7 @@
 """The search: ask for terrains, let robots cross them, tell the emitters what became of them."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.registry import get_space, is_own
 
+UNTIL_FROM = 20
+"""Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
 _SAME = ("robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
          "collision_bit")  # fmt: skip
 _BATCH = ("fitness", "collision_rate", "goal_rate")
@@ -49,10 +52,10 @@ def search(
 ) -> Archive:
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
-    It ends before if its last tenth brought a share of the elites below ``until`` (:func:`last_tenth`). Nothing is
-    written before the simulation stands; whatever stops a search, all iterations that ended are saved. A robot that is
-    not shipped is given, and a controller that lies elsewhere than ``cfg`` says. The archive has what
-    judging says of its elites if nothing was left to do.
+    It ends before once its last tenth brought a share of the elites below ``until`` (:func:`last_tenth`), and what it
+    asked for by then is crossed and settled. Nothing is written before the simulation stands; whatever stops a search,
+    all iterations that ended are saved. A robot that is not shipped is given, and a controller that lies elsewhere than
+    ``cfg`` says. The archive has what judging says of its elites if nothing was left to do.
     """
     robot = robot or get_robot(cfg.robot)
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):
@@ -79,20 +82,21 @@ def search(
             scheduler, metrics = saved
         if scheduler.surrogate is not None:
             scheduler.surrogate.compute_on(compute.device)
-        done = len(metrics)
-        say(describe_search(cfg, path, done, compute.device, evaluator.num_workers))
+        done, last = len(metrics), _last_iteration(cfg, metrics, until)
+        say(describe_search(replace(cfg, iterations=last), path, done, compute.device, evaluator.num_workers))
         if note := scaled_by_another(robot, policy):
             print(note)
-        if done < cfg.iterations and not (until and last_tenth(archive_of(cfg, scheduler, done), metrics) < until):
+        if done < last:
             try:
                 with compute.open(evaluator) as pipeline:
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
-                    begun = f"iteration {done + 1}/{cfg.iterations}: compiling and evaluating"
-                    with Bar(begun, cfg.iterations, done) as bar:
+                    with Bar(f"iteration {done + 1}/{last}: compiling and evaluating", last, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name, until)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
+        if len(metrics) < cfg.iterations:
+            say(f"Ended by --until {until:g} after {len(metrics)} of {cfg.iterations} iterations.")
         archive = archive_of(cfg, scheduler, len(metrics))
         if (stored := _written_archive(run, archive)) is not None:
             return stored
@@ -129,7 +133,7 @@ def _run_iterations(
 
     pipeline.clear()
     num_under_way, began = 0, time.perf_counter()
-    last, settling = cfg.iterations, cfg.scheduler.settling
+    last, settling = _last_iteration(cfg, metrics, until), cfg.scheduler.settling
     while (iteration := len(metrics) + 1) <= last:
         for group in range(num_under_way, num_groups):
             put(scheduler.ask(group, new=iteration <= last - settling), iteration, group)
@@ -141,7 +145,8 @@ def _run_iterations(
             evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
             emitters_began = time.perf_counter()
             num_new += scheduler.tell(evaluation, iteration, group)
-            genes = scheduler.ask(group, new=iteration < last - settling)
+            # Behind the last iteration as well: if more follow, they begin with new terrains.
+            genes = scheduler.ask(group, new=not last - settling <= iteration < last)
             search_s += time.perf_counter() - emitters_began
             if goes_ahead:
                 put(genes, iteration + 1, group)
@@ -158,22 +163,37 @@ def _run_iterations(
             row |= status._asdict()
         began = ended
         metrics.append(row)
+        row["last_tenth"] = last_tenth(archive, metrics)
         run.save(cfg, scheduler, metrics, archive)
+        last = _last_iteration(cfg, metrics, until)
         bar.move_to(iteration, describe_iteration(row, last, status))
-        if until and last == cfg.iterations and last_tenth(archive, metrics) < until:
-            last = min(last, iteration + 1 + settling)  # what was asked for is still crossed
 
 
-def last_tenth(archive: Archive, metrics: Metrics) -> float:
+def _last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -> int:
+    """The iteration that ends a search, by the metrics alone: so a search that goes on ends where it would have.
+
+    Behind the one whose last tenth brought too little, what it asked for is crossed, and then all settles. A search
+    that went on past that end is judged anew.
+    """
+    ends = (
+        row["iteration"] + 1 + cfg.scheduler.settling
+        for row in metrics
+        if until is not None and row["last_tenth"] is not None and row["last_tenth"] < until
+    )
+    return min(cfg.iterations, next((end for end in ends if end >= len(metrics)), cfg.iterations))
+
+
+def last_tenth(archive: Archive, metrics: Metrics) -> float | None:
     """Share of the elites to stay that were found in the last tenth of the iterations which crossed anything new.
 
-    Elites count by their chance to stay in their cells (:func:`qd.pool.chance_to_stay`).
+    Elites count by their chance to stay in their cells (:func:`qd.pool.chance_to_stay`). None without elites, and of
+    fewer than 20 such iterations.
     """
     exploring = [row["iteration"] for row in metrics if row["terrains"]]
+    if len(exploring) < UNTIL_FROM or not len(archive):
+        return None
     chance = chance_to_stay(archive, archive.cells)
-    if not exploring or not len(archive):
-        return 1.0
-    found_late = archive.iteration >= exploring[-max(1, len(exploring) // 10)]
+    found_late = archive.iteration >= exploring[-(len(exploring) // 10)]
     return float(chance[found_late].sum() / chance.sum())
 
 
@@ -251,7 +271,7 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
     origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)
     figures = write_figures(run.path, archive, metrics)
-    with_collision = int(archive.collides.sum())
+    with_collision = int((archive.collision_rate > 0.0).sum())  # in any episode; the bit is of 20
     numbers = {
         **origin,
         **archive.named(),
@@ -279,7 +299,8 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
         f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
         f"in {clock(numbers['wall_s'])}"
     )
-    print(f"Its last tenth brought {last_tenth(archive, metrics):.0%} of the elites that can be expected to stay.")
+    if (share := metrics[-1]["last_tenth"]) is not None:
+        print(f"Its last tenth brought {share:.0%} of the elites that can be expected to stay.")
     print(f"Figures: {', '.join(map(str, figures))}")
     if invalid := invalid_iterations(metrics):
         print(f"Warning: {invalid}")

@@ -13,7 +13,8 @@ from typing import Any
 
 from sim.files.atomic import write_atomically
 
-_MAGIC = b"faultline search checkpoint 4\n"
+_KIND = b"faultline search checkpoint "
+_MAGIC = _KIND + b"5\n"
 _HASH_BYTES = 32
 _REMEDY = "put a copy of it back, or start a new run"
 
@@ -64,10 +65,10 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {_REMEDY}") from None
     header = len(_MAGIC) + _HASH_BYTES
+    if not data.startswith(_KIND):
+        raise ValueError(f"{path} must start with {_KIND!r}, got {data[: len(_KIND)]!r}: another file's; {_REMEDY}")
     if not data.startswith(_MAGIC):
-        raise ValueError(
-            f"{path} must start with {_MAGIC!r}, got {data[: len(_MAGIC)]!r}: another file's or version's; {_REMEDY}"
-        )
+        raise ValueError(f"{path} was written by another version of faultline: start a new run")
     payload = data[header:]
     if hashlib.sha256(payload).digest() != data[len(_MAGIC) : header]:
         raise ValueError(

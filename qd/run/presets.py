@@ -28,12 +28,13 @@ class SchedulerCfg:
     """Emitters that ask, each with an evolution strategy or a stream of its own."""
     batch_size: Annotated[int, Meta(ge=2)] = 20
     """Terrains an emitter asks for in an iteration."""
-    again: NonNegativeInt = 0
+    again: Annotated[int, Meta(ge=0, le=10_000)] = 0
     """Terrains that are crossed again beside those of an emitter, the least known ones. All episodes of a terrain then
     count, and it holds its cell by what it is expected to add to the QD score of fresh ones. With 0 a terrain is
     crossed once, and the fittest of a cell holds it, as in the paper."""
     settling: NonNegativeInt = 0
-    """Last iterations of a search, in which nothing new is crossed."""
+    """Last iterations of a search, in which nothing new is crossed; needs --scheduler.again; fewer than
+    --iterations."""
     groups: Annotated[int, Meta(ge=1, le=32)] = 1
     """Groups of emitters that ask and are told in turn, in a fixed order, at most one an emitter: robots have the
     terrains of the others to cross while the last robots of a group's terrains still walk."""
@@ -74,6 +75,11 @@ class SchedulerCfg:
             )
         if self.settling and not self.again:
             raise ValueError(f"again must be 1 or more where iterations settle, got 0 and settling {self.settling}")
+
+    def check_iterations(self, iterations: int) -> None:
+        """Refuses a search of so few iterations that all of them would settle."""
+        if self.settling >= iterations:
+            raise ValueError(f"scheduler.settling must be below the iterations, {iterations}, got {self.settling}")
 
     @property
     def methods(self) -> tuple[str, ...]:

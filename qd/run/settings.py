@@ -49,10 +49,7 @@ class SearchCfg:
     def __post_init__(self) -> None:
         check(self)
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
-        if self.scheduler.settling >= self.iterations:
-            raise ValueError(
-                f"scheduler.settling must be below the iterations, {self.iterations}, got {self.scheduler.settling}"
-            )
+        self.scheduler.check_iterations(self.iterations)
 
     @property
     def cells(self) -> Cells:

@@ -92,6 +92,13 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
     assert Path("full/thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
+def test_what_crosses_again_is_checked_before_the_controller_is_loaded(capsys, again, settling, name):
+    unreadable = ["--policy", f"{__name__}:narrow_policy"]  # loading it would say so
+    line = fails(capsys, *TINY, *unreadable, "--scheduler.again", again, "--scheduler.settling", settling)
+    assert name in line and os.listdir() == []
+
+
 def test_flags_come_to_the_settings_of_the_run():
     flags = ["--method", "map_elites", "--seed", "4", "--fitness.alpha", "0.5", "--fitness.intervals", "5"]
     flags += ["--fitness.penalties", "contact_force", "vel_x", "yaw_rate"]

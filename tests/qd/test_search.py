@@ -178,19 +178,51 @@ def test_the_last_iterations_settle_what_was_found(tmp_path):
     assert json.loads((path / "archive.json").read_text())["terrains_evaluated"] == 48
     assert archive.iteration.max() <= 4
     assert np.median(archive.episodes) > 8
-    run(path, scheduler=AGAIN, iterations=10)  # goes on with what it had asked for when it settled
-    assert [row["terrains"] for row in rows_of(path)][6:] == [0, 12, 0, 0]
+    run(path, scheduler=AGAIN, iterations=10)  # begins with new terrains again
+    assert [row["terrains"] for row in rows_of(path)][6:] == [12, 12, 0, 0]
+
+
+def test_a_search_that_crosses_again_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path):
+    scheduler = dataclasses.replace(AGAIN, settling=0)
+    run(tmp_path / "whole", scheduler=scheduler, iterations=6)
+    for iterations in (2, 6):
+        run(tmp_path / "pieces", scheduler=scheduler, iterations=iterations)
+    assert rows_of(tmp_path / "pieces") == rows_of(tmp_path / "whole")
+    assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
 
 
 def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):
-    path = tmp_path / "run"
-    archive = run(path, scheduler=AGAIN, iterations=60, until=0.06)
+    """The same if it is stopped before that is found out, behind it, or while it settles, and goes on."""
+    path, settings = tmp_path / "run", {"scheduler": AGAIN, "iterations": 60, "until": 0.05}
+    archive = run(path, **settings)
     rows = rows_of(path)
-    assert 6 < archive.iterations == len(rows) < 60
-    # What was asked for when it was found out is crossed, then all settles.
-    assert [bool(row["terrains"]) for row in rows] == [*[True] * (len(rows) - 2), False, False]
-    assert "Its last tenth brought " in capsys.readouterr().out
-    assert run(path, scheduler=AGAIN, iterations=len(rows) + 1).iterations == len(rows) + 1
+    assert [row["last_tenth"] for row in rows[:19]] == [None] * 19
+    little = next(row["iteration"] for row in rows if row["last_tenth"] and row["last_tenth"] < 0.05)
+    # What was asked for when it was found out is crossed, then all settles for two iterations.
+    assert 20 < little == archive.iterations - 3 < 57
+    assert [bool(row["terrains"]) for row in rows] == [*[True] * (little + 1), False, False]
+    ended = f"Ended by --until 0.05 after {little + 3} of 60 iterations."
+    assert ended in capsys.readouterr().out
+    run(path, **settings, opener=never)
+    assert (out := capsys.readouterr().out).count(ended) == 1 and f"0 of {little + 3} iterations to go" in out
+    for done in range(little - 1, little + 3):
+        stopped = tmp_path / f"stopped-{done}"
+        with pytest.raises(Interrupted, match=r"--until 0\.05"):
+            run(stopped, **settings, opener=Robots(stop_after=12 + 24 * (done - 1)))
+        assert len(rows_of(stopped)) == done
+        run(stopped, **settings)
+        assert rows_of(stopped) == rows
+        assert (stopped / "archive.npz").read_bytes() == (path / "archive.npz").read_bytes()
+    capsys.readouterr()
+    run(path, **settings | {"until": None, "iterations": little + 5})
+    assert [row["terrains"] for row in rows_of(path)][little + 3 :] == [12, 0]
+    assert "Ended by" not in capsys.readouterr().out
+
+
+def test_a_search_of_few_iterations_or_without_elites_has_no_last_tenth(tmp_path, capsys):
+    run(tmp_path / "run", iterations=4, until=0.99)
+    assert len(rows_of(tmp_path / "run")) == 4
+    assert "last tenth" not in capsys.readouterr().out
 
 
 def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
