@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from qd import check
 from qd.archive import read_archive
 from qd.commands import Archive
 from qd.judge import judge
@@ -93,10 +94,10 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
 
 
 @pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
-def test_what_crosses_again_is_checked_before_the_controller_is_loaded(capsys, again, settling, name):
-    unreadable = ["--policy", f"{__name__}:narrow_policy"]  # loading it would say so
-    line = fails(capsys, *TINY, *unreadable, "--scheduler.again", again, "--scheduler.settling", settling)
-    assert name in line and os.listdir() == []
+def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch, again, settling, name):
+    monkeypatch.setattr(check, "made_ready", lambda *given: pytest.fail("they are looked at"))
+    assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
+    assert os.listdir() == []
 
 
 def test_flags_come_to_the_settings_of_the_run():
