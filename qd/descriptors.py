@@ -41,7 +41,8 @@ class Cells:
     Args:
         num_ratios: Number of ratio descriptors, at least 2.
         intervals: Intervals that [0, 1] is divided into; 1.0 belongs to the last.
-        collision_bit: Whether "at least one episode has a base collision" is a descriptor too.
+        collision_bit: Whether a base collision is a descriptor too: in any of 20 episodes, as far as those crossed say
+            (:attr:`qd.fitness.Evaluation.collides`).
     """
 
     def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
@@ -86,7 +87,7 @@ class Cells:
 
         Args:
             ratios: Float64 ratios, each row not negative and summing to 1, shape (batch, num_ratios).
-            collided: Whether at least one episode had a base collision, shape (batch,); needed with a collision bit.
+            collided: The collision bit, shape (batch,); needed where there is one.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
         self._check_ratios(ratios)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from qd.descriptors import Cells, terrain_ratios
 from sim.files.settings import PositiveFloat, check
-from sim.rates import MAX_INVALID_SHARE, counted_episodes, typical_outcome
+from sim.rates import MAX_INVALID_SHARE, typical_outcome
 
 if TYPE_CHECKING:
     from sim.rollout import RolloutResult
@@ -120,12 +120,13 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
     """Fitness, ratios, cells and rates of the terrains of a rollout; ``cells`` have one ratio a penalty of ``cfg``.
 
     The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
-    episodes without a base collision, and 0 where no episode has one. An invalid terrain has fitness -20, equal ratios,
-    no end position (NaN) and otherwise zeros.
+    episodes without a base collision, and 0 where no episode has one. An invalid terrain has fitness -20, and the
+    statistics of its valid episodes: it may turn out to be valid when it is crossed again. Without a valid episode
+    there are equal ratios, no end position (NaN) and otherwise zeros.
     """
     penalties = _scaled_penalties(result, cfg)
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
-    counted = counted_episodes(invalid)
+    counted = ~invalid
     mean = _mean(penalties, counted)
     return _with_fitness(
         cells,
@@ -144,8 +145,7 @@ def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Eva
 
 def merged(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
     """The evaluation by all episodes of two evaluations of the same terrains; ends are the second's, if it has any."""
-    counts = [part.counted * part.valid for part in (first, second)]  # an invalid one has no statistics
-    share = counts[1] / np.maximum(counts[0] + counts[1], 1)
+    share = second.counted / np.maximum(first.counted + second.counted, 1)
 
     def mean_of(values: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
         shares = share if values.ndim == 1 else share[:, None]

@@ -35,18 +35,27 @@ def test_consistent_terrains_are_not_punished(collided, inconsistency):
     assert evaluation_of(result, CELLS, CFG).fitness[0] == pytest.approx(2.0 - 4.0 * inconsistency)
 
 
-@pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (20, False)])
+@pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (19, False)])
 def test_more_than_a_quarter_of_invalid_episodes_make_a_terrain_invalid(num_invalid, valid):
     invalid = np.arange(20)[None] < num_invalid
     penalties = np.where(invalid[..., None], np.nan, 1.0) * [1.0, 30.0]
     evaluation = evaluation_of(make_result(penalties, base_collision=~invalid, invalid=invalid), CELLS, CFG)
     assert evaluation.valid.tolist() == [valid]
     assert evaluation.fitness[0] == pytest.approx(4.0 if valid else -20.0)
-    assert evaluation.ratios[0] == pytest.approx([0.25, 0.75] if valid else [0.5, 0.5])
-    assert evaluation.collision_rate.tolist() == [1.0 if valid else 0.0]
+    # Statistics are those of the valid episodes, all alike, whether there are enough of them or not.
+    assert evaluation.ratios[0] == pytest.approx([0.25, 0.75])
+    assert evaluation.collision_rate.tolist() == [1.0]
     assert (evaluation.invalid_episodes.tolist(), evaluation.episodes.tolist()) == ([num_invalid], [20])
-    assert np.isfinite(evaluation.end_position).all() == valid
-    assert all(np.isfinite(value).all() for name, value in vars(evaluation).items() if name != "end_position")
+    assert all(np.isfinite(value).all() for value in vars(evaluation).values())
+
+
+def test_without_a_valid_episode_there_are_no_statistics():
+    penalties = np.full((1, 20, 2), np.nan)
+    evaluation = evaluation_of(make_result(penalties, invalid=np.ones((1, 20), bool)), CELLS, CFG)
+    assert evaluation.fitness.tolist() == [-20.0] and evaluation.ratios.tolist() == [[0.5, 0.5]]
+    assert np.isnan(evaluation.end_position).all()
+    for name in ("penalty_mean", "penalty_std", "collision_rate", "goal_rate", "fallen_rate"):
+        assert not getattr(evaluation, name).any()
 
 
 def test_the_typical_episode_ends_where_the_commonest_ending_of_a_failed_terrain_does():
@@ -54,7 +63,7 @@ def test_the_typical_episode_ends_where_the_commonest_ending_of_a_failed_terrain
         [Outcome.GOAL] * 2 + [Outcome.TIME_OUT] * 2 + [Outcome.BASE_COLLISION] * 1,  # 2 of 5 arrive: it is failed
         [Outcome.GOAL] * 3 + [Outcome.TIME_OUT] * 2,
         [Outcome.TIME_OUT] * 2 + [Outcome.BASE_COLLISION] * 2 + [Outcome.INVALID],  # of two as common a collision
-        [Outcome.INVALID] * 2 + [Outcome.OUT] * 3,  # 2 of 5 are more than a quarter
+        [Outcome.INVALID] * 5,
     ])  # fmt: skip
     x = np.array([[14, 14.2, 6, 7, 9], [14, 14.2, 14.4, 7, 9], [6, 6, 8, 9, 50], [1, 1, 1, 1, 1]])
     result = make_result(np.ones((4, 5, 2)), invalid=outcomes == Outcome.INVALID)
@@ -86,6 +95,28 @@ def test_evaluations_merge_to_that_of_all_episodes():
     assert whole.valid.all() and whole.invalid_episodes.any() and (whole.collision_rate > 0.0).any()
     for name, values in vars(whole).items():
         np.testing.assert_allclose(getattr(joined, name), values, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("part", [2, 4])
+def test_counts_and_statistics_agree_when_a_terrain_is_invalid_for_a_while(part):
+    """Parts of 12 episodes, of which one or several are invalid, one after the other."""
+    rng, cells = np.random.default_rng(0), Cells(2, collision_bit=True)
+    penalties, collides = rng.lognormal(0.0, 1.0, (2, 12, 2)), rng.random((2, 12)) < 0.3
+    invalid = np.zeros((2, 12), bool)
+    invalid[0, [0, 1]] = invalid[1, [0, 4, 5]] = True
+
+    def of(first: int, last: int):
+        some = (values[:, first:last] for values in (penalties, collides, invalid))
+        return evaluation_of(make_result(next(some), base_collision=next(some), invalid=next(some)), cells, CFG)
+
+    joined = of(0, part)
+    assert not joined.valid[0]
+    for first in range(part, 12, part):
+        joined = merged(joined, of(first, first + part), cells, CFG)
+        assert joined.counted.tolist() == (~invalid[:, : first + part]).sum(axis=1).tolist()
+        for name, values in vars(of(0, first + part)).items():
+            np.testing.assert_allclose(getattr(joined, name), values, rtol=1e-12, atol=1e-12, err_msg=name)
+    assert joined.valid.all()
 
 
 def test_an_invalid_crossing_adds_nothing_but_its_number_of_episodes():
