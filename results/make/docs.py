@@ -320,11 +320,11 @@ def speed() -> str:
         by_ray = "; ".join(f"{one['workers']}: {one['episodes_per_s']:,.0f}" for one in scale.get("rows", ()))
         largest = [one for one in numbers.get("kernels") or () if one.get("share", 0.0) >= 0.04]
         shares = ", ".join(f"{kernel_words(one['name'])} {one['share']:.0%}" for one in largest)
-        two = [f"{one['train_env_steps_per_s']:,.0f} ({one['device']})" for one in numbers.get("training") or ()
-               if one["gpus"] == 2]  # fmt: skip
-        of_others = {"ray": by_ray, "kernels": shares, "two": " ".join(two)}
+        of_others = {"ray": by_ray, "kernels": shares}
         rows[words] = {**numbers, "named": {**named, **{key: text or NONE for key, text in of_others.items()}}}
     mixed, million, minutes = "cma_mae+map_elites", {"form": ".1f", "factor": 1e-6}, {"form": ".1f", "factor": 1 / 60}
+    compared = next((row["agreement"] for row in rows.values() if row.get("agreement")), {})
+    sizes = f"{compared.get('resolved', {}).get('terrains')} terrains x {compared.get('episodes')} episodes"
     columns: dict[str, Column] = {
         **{f"episodes/s of {count:,} robots": inside("envs_curve", count, "episodes_per_s")
            for count in (1024, 4096, 32768)},
@@ -342,17 +342,31 @@ def speed() -> str:
         **{f"{count:,} robots standing: physics steps/s [million]{alone}":
            inside("flat", count, f"world_steps_per_s{key}", **million)
            for count in (4096, 32768) for alone, key in (("", ""), (", mujoco_warp alone", "_mujoco_warp"))},
-        "training: environment steps/s of 4,096 robots": "train_env_steps_per_s",
-        "... of 8,192 robots": "train_env_steps_per_s_8192",
-        "... of 8,192 on each of two GPUs": lambda row: row["named"]["two"],
-        "... of mjlab's 4,096 Unitree Go1 in the same run": "train_env_steps_per_s_mjlab",
-        "goal rate above that of finer physics": inside("agreement", "resolved", "goal_bias", form="+.3f"),
-        "goal rate above that of MuJoCo C": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),
+        "training: environment steps/s of 4,096 robots": trained("train_env_steps_per_s"),
+        "... of 8,192 robots": trained("train_env_steps_per_s_8192"),
+        "... of 8,192 on each of two GPUs": trained("train_env_steps_per_s_2gpu"),
+        "... of mjlab's 4,096 Unitree Go1": trained("train_env_steps_per_s_mjlab"),
+        f"goal rate above that of finer physics, {sizes}": inside("agreement", "resolved", "goal_bias", form="+.3f"),
+        f"goal rate above that of MuJoCo C, {sizes}": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),
         "largest kernels of a control step": lambda row: row["named"]["kernels"],
         "device": lambda row: row["named"]["device"],
         "commit": lambda row: row["named"]["commit"],
     }  # fmt: skip
     return table(rows, columns, upright=True)
+
+
+def trained(key: str) -> Callable[[Any], str]:
+    """A cell: a rate of training, with device, commit, day and packages of its row in ``training``."""
+
+    def cell(row: Any) -> str:
+        rate, rows = row.get(key), row.get("training") or ()
+        one = next((one for one in rows if one["train_env_steps_per_s"] == rate), None)
+        if one is None:
+            return NONE
+        packages = [f"{name} {version}" for name, version in one.get("versions", {}).items()]
+        return f"{rate:,.0f} ({', '.join([one['device'], one['commit'][:7], one['date'][:10], *packages])})"
+
+    return cell
 
 
 def kernel_words(name: str) -> str:

@@ -92,11 +92,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     script = parse(__doc__, argv, "search_noise.json", parts=tuple(SEARCHES))
     report: dict[str, Any] = {}
     for name in script.parts or list(SEARCHES)[: 1 if script.small else None]:
-        rows = script.read_so_far(script.out).get("rows", [])
-        if name not in [row["search"] for row in rows]:
-            row = row_of(script, name)
+        report = script.read_so_far(script.out)
+        if name not in [row["search"] for row in report.get("rows", [])]:
+            row = row_of(script, name) | {key: script.origin[key] for key in ("commit", "device", "date")}
             rows = [*script.read_so_far(script.out).get("rows", []), row]  # others may have been written meanwhile
-        report = script.add(script.origin, {"rows": rows})
+            report = script.add(script.origin, {"rows": rows})
     return report
 
 

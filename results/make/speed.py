@@ -183,11 +183,11 @@ def time_kernels(script: Script) -> dict[str, Any]:
 
 def measure_agreement(script: Script) -> dict[str, Any]:
     """Agreement with finer physics and MuJoCo C on a few hard-random terrains, so that no rate stands without it."""
-    terrains = 1 if script.small else 40
+    terrains, episodes = 1 if script.small else 40, 10
     genes = SUPER_GAUSSIAN.hard_random(terrains, script.seed)
     with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
-        outcome = cross_in_all_ways(script, crossings, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=10)
-    return {"agreement": compare(outcome, script.seed)}
+        outcome = cross_in_all_ways(script, crossings, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=episodes)
+    return {"agreement": {"episodes": episodes, **compare(outcome, script.seed)}}
 
 
 def time_cpu(script: Script) -> dict[str, Any]:
@@ -239,7 +239,8 @@ def time_view(robot: str, folder: Path) -> dict[str, float | None]:
 def training_rates(script: Script, device: str) -> dict[str, Any]:
     """PPO's environment steps a second with learning on a device, as train_speed.py wrote them with today's sources.
 
-    Those of several GPUs are of a host that has them, whose GPUs may be others.
+    Those of several GPUs are of a host that has them, whose GPUs may be others. Each row of ``training`` has command,
+    commit and date of its own.
     """
     rows = script.read_so_far(script.out.with_name("train_speed.json")).get("rows", [])
     rates = {(row.get("peer", "")[:5], row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in rows

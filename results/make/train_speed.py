@@ -62,7 +62,7 @@ def time_mjlab(folder: str, device: str, num_envs: int) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Times both sizes and writes a row each, and one of mjlab if there is one."""
+    """Times both sizes, and mjlab if there is one; each row says which run it is of."""
     script = parse(__doc__, argv, "train_speed.json")
     ranks = Ranks.of_environment()
     sizes, iterations = (((8, 24), (16, 24)), 1) if script.small else (SIZES, 40)
@@ -72,6 +72,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     rows = [time_training(script, device, *size, iterations) for size in sizes]
     if ranks.size == 1 and (folder := os.environ.get("MJLAB")):
         rows.append(time_mjlab(folder, device, sizes[0][0]))
+    origin = {name: script.origin[name] for name in ("command", "commit", "date")}
+    if ranks.size > 1:
+        origin["command"] = origin["command"].replace("python", f"torchrun --nproc-per-node {ranks.size}", 1)
+    rows = [row | origin for row in rows]  # those of other runs stand beside them
     if ranks.is_first:
         gpus = {row["gpus"] for row in rows}
         before = script.read_so_far(script.out, "versions").get("rows", [])

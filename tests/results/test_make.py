@@ -16,13 +16,14 @@ import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import bare, common, docs, speed, tables
+from results.make import bare, common, docs, search_noise, speed, tables, train_speed
 from sim.files.records import sources_sha256
 from sim.rates import counted_episodes
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.qd.searches import rows_of, run, without_figures
 from tests.qd.stand_in import Stub, make_result
+from train.ppo.learner import Ranks
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
@@ -211,6 +212,39 @@ def test_rates_of_training_are_of_the_same_device(speeds):
     assert speeds.run("cuda:0", "--parts", "curve")["train_env_steps_per_s"] is None
 
 
+def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
+    def time_training(script, device, num_envs, steps, iterations):
+        return {"gpus": Ranks.of_environment().size, "num_envs": num_envs}
+
+    monkeypatch.setattr(train_speed, "time_training", time_training)
+    file = tmp_path / "train_speed.json"
+    for commit, gpus in (("first", "1"), ("second", "2")):
+        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
+        monkeypatch.setenv("WORLD_SIZE", gpus)
+        train_speed.main(["--small", "--device", "cpu", "--out", str(file)])
+    rows = json.loads(file.read_text())["rows"]
+    assert [(row["gpus"], row["num_envs"], row["commit"]) for row in rows] == [
+        (1, 8, "first"), (1, 16, "first"), (2, 16, "second"),
+    ]  # fmt: skip
+    assert rows[0]["command"].startswith("python -m ") and rows[0]["date"] <= rows[2]["date"]
+    assert rows[2]["command"].startswith("torchrun --nproc-per-node 2 -m ")
+
+
+def test_rows_that_are_there_keep_their_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(search_noise, "row_of", lambda script, name: {"search": name})
+    words = ["--small", "--device", "cpu", "--out", str(tmp_path / "search_noise.json"), "--parts"]
+
+    def run(commit, *parts):
+        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
+        report = search_noise.main([*words, *parts])
+        assert report == json.loads((tmp_path / "search_noise.json").read_text())
+        return report["commit"], [(row["search"], row["commit"]) for row in report["rows"]]
+
+    first = ("first", [("once", "first")])
+    assert run("first", "once") == run("second", "once") == first
+    assert run("third", "once", "5 episodes") == ("third", [("once", "first"), ("5 episodes", "third")])
+
+
 def test_what_a_search_asks_for_is_remembered(tmp_path, monkeypatch):
     without_figures(monkeypatch)
     with speed.remembering() as asked:
@@ -311,6 +345,14 @@ def test_a_cell_is_a_number_with_its_interval():
     rows = {"a": {"share": 0.5, "share_interval": [0.2, 1.0]}, "b": {"share": 0.25}}
     made = docs.table(rows, {"cm": docs.shown("share", ".1f", 100), "rate": docs.shown("share", ".2f")}, upright=True)
     assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
+
+
+def test_a_rate_of_training_names_its_run_and_the_packages_of_another_learner():
+    made = {"device": "GPU", "commit": "0123456789", "date": "2026-11-27T07:52:08+00:00"}
+    rows = [{**made, "train_env_steps_per_s": 2000.4}, {**made, "train_env_steps_per_s": 7.0, "versions": {"a": "1.2"}}]
+    row = {"ours": 2000.4, "theirs": 7.0, "lost": 3.0, "training": rows}
+    cells = [docs.trained(key)(row) for key in ("ours", "theirs", "lost", "absent")]
+    assert cells == ["2,000 (GPU, 0123456, 2026-11-27)", "7 (GPU, 0123456, 2026-11-27, a 1.2)", "-", "-"]
 
 
 def test_results_name_no_path_of_the_machine_that_made_them():
