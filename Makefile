@@ -93,7 +93,7 @@ test-all: setup ## Run all tests: about seven minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) $(ARGS)
 
 test-gpu: setup ## Run on a GPU (FAULTLINE_DEVICE, default cuda:0) what can run there
-	FAULTLINE_DEVICE=$(FAULTLINE_DEVICE) $(PYTEST) -m gpu --record=results/bench/gpu-tests.json $(ARGS)
+	FAULTLINE_DEVICE=$(FAULTLINE_DEVICE) $(PYTEST) -m gpu $(or $(ARGS),--record=results/bench/gpu-tests.json)
 
 lint: setup ## Check style, documentation and types
 	$(BIN)/ruff check .

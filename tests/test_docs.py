@@ -123,6 +123,12 @@ def test_the_script_of_a_page_searches_judges_crosses_and_trains(tmp_path, monke
     assert Path("runs/mine-tuned/policy.pt").exists() and "elites" in capsys.readouterr().out
 
 
+def test_make_records_the_tests_of_a_gpu_where_all_of_them_run():
+    record = "--record=results/bench/gpu-tests.json"
+    assert pages.run_by_make(("make", "test-gpu"))[-3:] == ["-m", "gpu", record]
+    assert pages.run_by_make(("make", "test-gpu", "ARGS=-k contact"))[-4:] == ["-m", "gpu", "-k", "contact"]
+
+
 def test_make_hands_on_what_it_is_given():
     for name in ("a b", "it's", '"#', "*ü\\", "`id`"):
         command = pages.run_by_make(("make", "archive", f"ROBOT={name}", "ARGS=--preset small --seed 3"))

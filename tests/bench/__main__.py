@@ -83,16 +83,19 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--robot", default="anymal")
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--num-envs", type=int, help="robots: 4,096 on CUDA, 16 on the CPU")
-    parser.add_argument("--out", type=Path, help="file to write; <device>.json in results/bench if left out")
+    where = "results/bench, of another robot or number in runs/make/bench"
+    parser.add_argument("--out", type=Path, help=f"file to write; <device>.json in {where}, if left out")
     parser.add_argument("--small", action="store_true", help="a trial without torch.compile; it publishes nothing")
     args = parser.parse_args(argv)
 
     robot, device = get_robot(args.robot), resolve_device(args.device)
-    origin, folder = provenance(device, 0), Path("runs/make/small" if args.small else "results") / "bench"
+    on_gpu = device.startswith("cuda")
+    usual = 4096 if on_gpu else 16
+    num_envs = args.num_envs or usual
+    published = "results" if (robot.name, num_envs) == (parser.get_default("robot"), usual) else "runs/make"
+    origin, folder = provenance(device, 0), Path("runs/make/small" if args.small else published) / "bench"
     out = args.out or folder / file_name(origin["device"])
     prepare_output(out)
-    on_gpu = device.startswith("cuda")
-    num_envs = args.num_envs or (4096 if on_gpu else 16)
     num_terrains = min(num_envs, 200 if on_gpu else 8)
     timing = Timing(rounds=20, replay_s=2e-3) if on_gpu else Timing(rounds=10, replay_s=10e-3)
     if args.small:
