@@ -108,7 +108,8 @@ class Surrogate:
         # Its many small kernels go before the large ones that let robots walk, which fill what is left of the device;
         # the other way round each small one would wait for a large one to end.
         self._stream = torch.cuda.Stream(device, priority=-1) if device.startswith("cuda") else None
-        self._maps: Tensor | None = None  # a ring of the newest terrains' maps, in half precision since there are many
+        # A ring of the newest terrains' maps, in half precision since there are many; it grows by doubling.
+        self._maps = torch.empty((0, *SHAPE, 1 + num_maps(self.space)), dtype=torch.half, device=device)
         self._num_mapped, self._num_unmapped = 0, len(self)  # terrains that the ring has taken, and has still to take
         self._codes: Tensor | None = None  # of the cells
         with on_stream(self._stream):
@@ -152,10 +153,14 @@ class Surrogate:
 
     def _map_new(self) -> tuple[Tensor, Tensor]:
         """The ring of maps, once it has those of all terrains, and the place of each terrain in it."""
-        if self._maps is None:
-            shape = MOST, *SHAPE, 1 + num_maps(self.space)
-            self._maps = torch.empty(shape, dtype=torch.half, device=self.device)
         self._num_mapped += self._num_unmapped
+        size = len(self._maps)
+        while size < min(self._num_mapped, MOST):
+            size = min(max(FEWEST, 2 * size), MOST)
+        if size > len(self._maps):  # nothing was overwritten yet, so that maps stay in their places
+            grown = self._maps.new_empty(size, *self._maps.shape[1:])
+            grown[: len(self._maps)] = self._maps
+            self._maps = grown
         places = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
         new = slice(len(self) - self._num_unmapped, None)
         units = torch.from_numpy(self._genes[new]).to(self.device)

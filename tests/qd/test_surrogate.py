@@ -8,7 +8,7 @@ import torch
 
 from qd import surrogate as module
 from qd.descriptors import Cells
-from qd.fitness import Evaluation, FitnessCfg, evaluation_of
+from qd.fitness import Evaluation, FitnessCfg, evaluation_of, rows_of
 from qd.networks import MEMBERS, Networks, Training
 from qd.run.presets import SchedulerCfg
 from qd.surrogate import Surrogate, vary_elites
@@ -240,6 +240,31 @@ def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch):
         result = stand_in.make_result(np.ones((40, 4, 6)), invalid=invalid)
         search.learn(genes, evaluation_of(result, CELLS, FITNESS))
         assert len(search) == length
+
+
+def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(monkeypatch):
+    """By what training is given: 60 terrains at a time up to 300, and then in place of the oldest."""
+    monkeypatch.setattr(module, "MOST", 300)
+    given = []
+
+    def run(self, maps, targets, drawn, turned):
+        given.append((maps.clone(), targets, drawn))
+
+    monkeypatch.setattr(Training, "run", run)
+    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=60))
+    genes = SUPER_GAUSSIAN.hard_random(420, 0)
+    evaluation = crossed(genes, 0)
+    ratios = torch.from_numpy(evaluation.ratios)
+    heights = (corridor_heights(torch.from_numpy(genes), SUPER_GAUSSIAN) / 0.25).flatten(1)
+    for first in range(0, 420, 60):
+        part = slice(first, first + 60)
+        search.learn(genes[part], rows_of(evaluation, part))
+    assert [len(maps) for maps, _, _ in given] == [128, 256, 256, 300, 300, 300]
+    for told, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
+        places = drawn.unique()
+        terrain = torch.cdist(maps[places].float().flatten(1), heights).argmin(1)  # genes of 16 bits move maps a little
+        assert sorted(terrain.tolist()) == [*range(max(0, told - 300), told)]
+        torch.testing.assert_close(targets[places, :6].double(), ratios[terrain], rtol=0.0, atol=1e-3)
 
 
 PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
