@@ -166,6 +166,17 @@ def test_invalid_episodes_are_counted_and_many_of_them_reported(tmp_path, capsys
     assert [row["invalid_reasons"] for row in rows_of(tmp_path / "run")] == [{}, {"state": 12}]
 
 
+def test_elites_are_counted_by_a_collision_in_any_episode(tmp_path):
+    def rule(cfg, genes, seeds):
+        penalties = stand_in.evaluate(genes, seeds, 40).penalties
+        return stand_in.make_result(penalties, base_collision=np.arange(40) < np.ones((len(genes), 1)))
+
+    archive = run(tmp_path / "run", replicas=40, opener=Robots(rule))
+    numbers = json.loads((tmp_path / "run/archive.json").read_text())
+    assert not archive.collides.any()  # one of 40 is less than one expected in 20
+    assert numbers["with_collision"] == numbers["elites"] > 0 == numbers["without_collision"]
+
+
 AGAIN = dataclasses.replace(CFG.scheduler, method="map_elites", again=6, settling=2)
 
 
@@ -220,8 +231,9 @@ def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):
 
 
 def test_a_search_of_few_iterations_or_without_elites_has_no_last_tenth(tmp_path, capsys):
-    run(tmp_path / "run", iterations=4, until=0.99)
-    assert len(rows_of(tmp_path / "run")) == 4
+    run(tmp_path / "few", iterations=4, until=0.99)
+    assert len(run(tmp_path / "none", iterations=21, until=0.99, opener=invalid_from(0, 0.5))) == 0
+    assert (len(rows_of(tmp_path / "few")), len(rows_of(tmp_path / "none"))) == (4, 21)
     assert "last tenth" not in capsys.readouterr().out
 
 
