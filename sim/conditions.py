@@ -7,20 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.conditions import Condition
-from sim.files.settings import NonNegativeFloat
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoiseCfg:
-    """Half widths of the uniform observation noise, in the units of the measured quantity: those of legged_gym."""
-
-    lin_vel: NonNegativeFloat = 0.1
-    ang_vel: NonNegativeFloat = 0.2
-    gravity: NonNegativeFloat = 0.05
-    joint_pos: NonNegativeFloat = 0.01
-    joint_vel: NonNegativeFloat = 1.5
-    scan: NonNegativeFloat = 0.1
-
 
 NOMINAL = np.array([condition in (Condition.STRENGTH, Condition.FRICTION) for condition in Condition], np.float32)
 """A row of conditions that change nothing, shape (12,)."""

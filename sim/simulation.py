@@ -16,12 +16,13 @@ from kernels.observation import Sensors
 from kernels.restart import clear_rows
 from kernels.state import make_zeros
 from sim.bank import TerrainBank
-from sim.conditions import MOST_DELAY_S, MOST_LAG_S, NoiseCfg
+from sim.conditions import MOST_DELAY_S, MOST_LAG_S
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.robots.compiled import robot_spec
 from sim.robots.model import builder_of
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
+from sim.robots.training import NoiseCfg
 from sim.solver import TheirDynamics, dynamics_of
 
 

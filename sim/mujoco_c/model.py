@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from kernels.conditions import Condition
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
-from sim.conditions import NoiseCfg
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
 from sim.maps.hfield import Margins, as_hfield
 from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
+from sim.robots.training import NoiseCfg
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m

@@ -9,6 +9,18 @@ from sim.files.settings import Interval, NonNegativeFloat, PositiveFloat, Positi
 
 
 @dataclass(frozen=True, kw_only=True)
+class NoiseCfg:
+    """Half widths of the uniform observation noise, in the units of the measured quantity: those of legged_gym."""
+
+    lin_vel: NonNegativeFloat = 0.1
+    ang_vel: NonNegativeFloat = 0.2
+    gravity: NonNegativeFloat = 0.05
+    joint_pos: NonNegativeFloat = 0.01
+    joint_vel: NonNegativeFloat = 1.5
+    scan: NonNegativeFloat = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
 class RewardCfg:
     """Weight of each reward term per second: legged_gym's for ANYmal, and the paper's two."""
 

@@ -6,10 +6,9 @@ from typing import Annotated, Any, Self
 
 from msgspec import Meta
 
-from sim.conditions import NoiseCfg
 from sim.files.settings import Interval, NonNegativeFloat, NonNegativeInt, PositiveFloat, problems
 from sim.robots.robot import RobotCfg
-from sim.robots.training import MOST_SPREAD, TrainingCfg
+from sim.robots.training import MOST_SPREAD, NoiseCfg, TrainingCfg
 from sim.terrain import NUM_LEVELS
 
 
