@@ -53,6 +53,10 @@ class TerrainSpace:
         """Rows of conditions (:class:`kernels.conditions.Condition`), shape (num_terrains, 12)."""
         return np.tile(NOMINAL, (len(np.asarray(genes)), 1))
 
+    def condition_words(self, genes: ArrayLike) -> str:
+        """The conditions of one row of genes (num_genes,) in words; empty of a space without any."""
+        return ""
+
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
         ...

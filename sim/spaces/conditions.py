@@ -82,8 +82,11 @@ class UnderConditions(TerrainSpace):
 
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and the conditions in a line behind it."""
-        words = ", ".join(filter(None, self._words(genes)))
-        return "\n".join([self.inner.describe(self._split(genes)[0]), words or "nominal conditions"])
+        return "\n".join([self.inner.describe(self._split(genes)[0]), self.condition_words(genes)])
+
+    def condition_words(self, genes: ArrayLike) -> str:
+        """Those that are not nominal, in words."""
+        return ", ".join(filter(None, self._words(genes))) or "nominal conditions"
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Those of the space."""

@@ -109,8 +109,9 @@ def cross_cases(
 
     ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short. What the
     template takes of each: its number, name and verdict, the ``source`` of the picture at the moment of failure
-    ``time_s`` [s], empty without pictures, who crosses ``beside`` it, if anybody, the source of the ``figure`` with
-    paths and profile, empty in short, the table of its ``rates``, and the command that films it.
+    ``time_s`` [s], empty without pictures, the ``conditions`` in words, who crosses ``beside`` it, if anybody, the
+    source of the ``figure`` with paths and profile, empty in short, the table of its ``rates``, and the command that
+    films it.
     """
     files, cases = opened_run.certifiers(), dict[int, dict[str, Any]]()
     names = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
@@ -155,6 +156,7 @@ def _case(
         "verdict": VERDICTS[int(ranking.elites.verdict[row])],
         "source": sources[0],
         "time_s": failure.time_s,
+        "conditions": opened_run.space.condition_words(archive.genes[number]),
         "beside": beside,
         "figure": figure_source(draw_crossing(recording, title)) if whole else "",
         "rates": _rates(ranking, archive, row, arrived),
