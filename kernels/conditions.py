@@ -105,10 +105,12 @@ def _begin_conditions_kernel(
     delay_out.steps[env] = own_delay + int(wp.round(conditions[t, int(Condition.DELAY)] / physics_dt))
     robots_out.strength[env] = conditions[t, int(Condition.STRENGTH)]
     mass, rotation = nominal.mass[env], nominal.frame[env]
-    added = conditions[t, int(Condition.PAYLOAD)] * nominal.total_mass[env]
+    added = wp.max(conditions[t, int(Condition.PAYLOAD)] * nominal.total_mass[env], -0.5 * mass)
     frame = wp.quat(rotation[0], rotation[1], rotation[2], rotation[3])
     moved, moments = wp.vec3(0.0), 1.0 * nominal.inertia[env]
-    if added != 0.0:
+    if added < 0.0:  # less of the base itself
+        moments *= (mass + added) / mass
+    if added > 0.0:
         offset = wp.vec3(
             conditions[t, int(Condition.PAYLOAD_X)],
             conditions[t, int(Condition.PAYLOAD_Y)],
@@ -135,7 +137,8 @@ def begin_conditions(
 ) -> None:  # fmt: skip
     """Make robots as the conditions of their terrains, (num_terrains, 12), say where ``begins`` (num_envs,) is not 0.
 
-    A payload is a point mass. The weights by which the solver softens constraints stay those of the robot without it.
+    A payload is a point mass; a negative one leaves less of the base, half of it at least. The weights by which the
+    solver softens constraints stay those of the robot without it.
     """
     inputs = [begins, terrain_of_env, conditions, nominal, own_delay, physics_dt]
     outputs = [tree_out, robots_out, delay_out, disturbed_out]

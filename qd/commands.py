@@ -55,7 +55,8 @@ class Archive(ControllerFlags, WorkerFlags):
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
     space: str | None = None
     """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
-    file.py:CLASS; behind any of them +friction, +softness or both. super_gaussian if left out."""
+    file.py:CLASS; behind any of them +friction, +softness, and conditions: +payload, +motors, +delay, +lag, +noise,
+    +push, +grip. super_gaussian if left out."""
     height: float | None = None
     """Lowers the terrains: the largest height of a bump [m], at most 0.25, and everything else alike. If left out, 0.25
     for shipped robots; for yours the height of the penalty scales: about 80 % of hard-random terrains are crossed."""
@@ -165,14 +166,14 @@ class Judge(_OnRun):
     if under half of the robots reach the goal. resolved: those that fail are crossed in 20 episodes with contact
     resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
     controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
-    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. Crossings are
-    kept, so the same command goes on after Ctrl-C.
+    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. varied: faults
+    are crossed again under 20 draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault
+    is robust if the controller still fails in half of them, and another still crosses. Crossings are kept, so the same
+    command goes on after Ctrl-C.
     """
 
     stages: tuple[Literal["fresh", "resolved", "others", "varied"], ...] = ("fresh", "resolved", "others")
-    """What to do, in this order. varied: faults are crossed again under 20 draws of moderate conditions: payload, motor
-    strength, delay, noise and friction. A fault is robust if the controller still fails in half of them, and another
-    still crosses."""
+    """What to do, in this order."""
 
     def execute(self) -> None:
         """Judges the run."""
@@ -345,8 +346,8 @@ class Dose(RobotFlag, WorkerFlags):
     elements: tuple[str, ...] = ()
     """Obstacles: stairs_up, stairs_down, step_up, step_down, sill, rail, pallet, ramp_up, ramp_down, cross_slope,
     ditch, beam, stones, rubble; grounds: friction, softness; conditions on level ground: payload, motors, delay, lag,
-    noise, push. All of them if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond what the
-    space course has."""
+    noise, push. All but the conditions if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond
+    what the space course has."""
     at: tuple[str, ...] = ()
     """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
     resolved: bool = False

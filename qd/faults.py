@@ -25,6 +25,8 @@ SPECIALIST = "specialist"
 """Name of the certifier that was trained for one search, on its failing elites; all others are the panel."""
 
 _INVALID = OUTCOMES.index("invalid")
+OF_VARIED = ("crossed_varied", "robust")
+"""Numbers of :func:`fault_numbers` that only those have who were judged under varied conditions."""
 
 
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:

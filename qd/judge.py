@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from qd.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
-from qd.faults import EPISODES, FRESH_EPISODES, fault_numbers, fresh_numbers
+from qd.faults import EPISODES, FRESH_EPISODES, OF_VARIED, fault_numbers, fresh_numbers
 from qd.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, check_config, check_space, claimed
@@ -202,14 +202,22 @@ def vary(archive: Archive, certifiers: Mapping[str, str], search: Search, crossi
         return outcome_counts(result).reshape(-1, EPISODES, 4).sum(axis=1)
 
     rows = np.flatnonzero(archive.is_fault)
+    now = {name: str(controller_hash(policy)) for name, policy in certifiers.items()}
+    known = zip(faults.certifiers, faults.certifier_sha256, faults.certificates()[rows].T, strict=True)
+    if lost := [name for name, digest, certifies in known if certifies.any() and now.get(name) != digest]:
+        raise ValueError(
+            f"certifiers must be those that certify faults of {search.run}, got none or another file for "
+            f"{', '.join(lost)}: name them by --certifiers, or judge --stages others again"
+        )
     by_searched = _put(np.zeros_like(faults.resolved_outcomes), rows, counts_of(search.policy, rows, "searched"))
     by_others = np.zeros_like(faults.certifier_outcomes)
     for column, name in enumerate(faults.certifiers):
         certified = rows[faults.certificates()[rows, column]]
-        if len(certified) and name in certifiers:
+        if len(certified):
             by_others[certified, column] = counts_of(certifiers[name], certified, name)
-    varied = replace(faults, varied_outcomes=by_searched, certifier_varied_outcomes=by_others)
-    return replace(archive, faults=varied)
+    archive = replace(archive, faults=replace(faults, varied_outcomes=by_searched, certifier_varied_outcomes=by_others))
+    print(f"{archive.robust.sum()} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
+    return archive
 
 
 def _cross(
@@ -275,6 +283,9 @@ def judge(
         archive = search.read_archive()
         if archive.fresh is None and "fresh" not in stages:
             raise ValueError(f"{run} must have fresh episodes of its elites, got none: begin with the stage fresh")
+        before = stages[: stages.index("varied")] if "varied" in stages else ()
+        if "varied" in stages and "others" not in before and (archive.faults is None or "fresh" in before):
+            raise ValueError(f"{run} must have faults, got none judged: begin with the stages resolved, others")
         families = None
         for stage in stages:
             failing = np.flatnonzero(archive.failing)
@@ -290,8 +301,6 @@ def judge(
             elif stage == "others":
                 archive = certify(archive, failing, certifiers, search, crossings)
             elif stage == "varied":
-                if archive.faults is None:
-                    raise ValueError(f"{run} must have faults, got none judged: begin with the stages resolved, others")
                 archive = vary(archive, certifiers, search, crossings)
             else:
                 archive = confirm(archive, failing, search, crossings)
@@ -313,6 +322,7 @@ def _write(
     assert archive.fresh is not None
     seen = None if archive.faults is None else seen_by(archive, families, certifiers)
     numbers = read_json(file) if file.exists() else {}
+    numbers = {name: value for name, value in numbers.items() if name not in OF_VARIED}
     numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, families, seen)
     numbers["judged_by"] = numbers.get("judged_by", {}) | by
     write_archive(search.run / ARCHIVE_FILE, archive)

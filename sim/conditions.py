@@ -47,7 +47,7 @@ KINDS: dict[str, tuple[Gene, ...]] = {
     "push": (
         Gene(Condition.PUSH_X, -2.0, 0.0, 2.0),
         Gene(Condition.PUSH_Y, -2.0, 0.0, 2.0),
-        Gene(Condition.PUSH_TIME, 0.0, 8.0, 16.0),
+        Gene(Condition.PUSH_TIME, 0.0, 6.0, 12.0),
     ),
     "grip": (Gene(Condition.FRICTION, 0.2, 1.0, 1.2),),
 }
@@ -87,9 +87,9 @@ _SIDES = {(True, 1): "ahead of", (True, -1): "behind", (False, 1): "left of", (F
 
 
 def words_of(kind: str, row: NDArray[np.float32]) -> str:
-    """One kind of a row of conditions in words; empty where it changes nothing."""
+    """One kind of a row of conditions in words; empty where it changes nothing to speak of."""
     payload, strength, push = row[Condition.PAYLOAD], row[Condition.STRENGTH], row[[Condition.PUSH_X, Condition.PUSH_Y]]
-    if kind == "payload" and payload:
+    if kind == "payload" and abs(payload) >= 0.0005:
         offsets = row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y]]
         places = [
             f"{abs(offset):.2f} m {_SIDES[axis == 0, 1 if offset > 0 else -1]}"
@@ -97,17 +97,17 @@ def words_of(kind: str, row: NDArray[np.float32]) -> str:
         ]  # fmt: skip
         where = f", {' and '.join(places)} its centre" if places else ""
         return f"payload of {payload:.1%} of its mass{where}" if payload > 0 else f"{-payload:.1%} of its mass less"
-    if kind == "motors" and strength != 1.0:
+    if kind == "motors" and abs(strength - 1.0) >= 0.005:
         return f"motors at {strength:.0%}"
-    if kind == "delay" and row[Condition.DELAY] > 0.0:
+    if kind == "delay" and row[Condition.DELAY] >= 0.0005:
         return f"actions {1000 * row[Condition.DELAY]:.0f} ms late"
-    if kind == "lag" and row[Condition.LAG] > 0.0:
+    if kind == "lag" and row[Condition.LAG] >= 0.0005:
         return f"observations {1000 * row[Condition.LAG]:.0f} ms old"
-    if kind == "noise" and row[Condition.NOISE] > 0.0:
+    if kind == "noise" and row[Condition.NOISE] >= 0.05:
         return f"noise {row[Condition.NOISE]:.1f} times legged_gym's"
-    if kind == "push" and push.any():
+    if kind == "push" and np.abs(push).max() >= 0.05:
         return f"pushed by {push[0]:+.1f} m/s along and {push[1]:+.1f} m/s across the way after " \
                f"{row[Condition.PUSH_TIME]:.0f} s"  # fmt: skip
-    if kind == "grip" and row[Condition.FRICTION] != 1.0:
+    if kind == "grip" and abs(row[Condition.FRICTION] - 1.0) >= 0.005:
         return f"friction times {row[Condition.FRICTION]:.2f}"
     return ""

@@ -1,5 +1,6 @@
 """Parallel robots on height grids, one world each: Newton's MuJoCo model, terrain contact and steps of our own."""
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -200,7 +201,7 @@ class Simulation:
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
         most = robot.drive_delay_steps
         if self.bank.conditions is not None:
-            most += round(MOST_DELAY_S / robot.physics_dt)
+            most += math.ceil(MOST_DELAY_S / robot.physics_dt)
         if most:
             delay = self._delay = Delay()
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
@@ -218,7 +219,7 @@ class Simulation:
                 "(sim/solver.py says why): leave conditions out"
             )
         self._varied = self._dynamics.vary_bases()
-        most, size = round(MOST_LAG_S / self.robot.control_dt), self.robot.observation_size
+        most, size = math.ceil(MOST_LAG_S / self.robot.control_dt), self.robot.observation_size
         disturbed = make_zeros(
             Disturbed, str(self.device), row=(self.num_envs, len(Condition)), age=(self.num_envs, 1),
             former=(self.num_envs, 1 + most, size),

@@ -56,7 +56,9 @@ class Wanted:
     @property
     def kind(self) -> tuple[Any, ...]:
         """What crossings have in common that one simulation makes side by side."""
-        return self.policy, self.replicas, self.seed, self.space, self.terrain.shape, self.ground is None
+        conditions = self.ground is not None and self.ground.conditions is not None
+        about = self.policy, self.replicas, self.seed, self.space, self.terrain.shape
+        return *about, self.ground is None, conditions
 
 
 def on_elite(
@@ -180,7 +182,8 @@ class Recordings:
 
     def _key(self, wanted: Wanted) -> str:
         """Hash of all that a recording depends on."""
-        maps = [] if wanted.ground is None else [wanted.ground.friction, wanted.ground.time_constant_s]
+        ground = wanted.ground
+        maps = [] if ground is None else [ground.friction, ground.time_constant_s, ground.rows]
         arrays = [array.astype(np.float32).tobytes().hex() for array in (wanted.terrain, *maps)]
         parts = [
             *self._about,

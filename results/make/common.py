@@ -174,8 +174,9 @@ def parse(
         parser.add_argument("--at-once", type=int, help="first run all parts, so many side by side on each GPU")
     args = parser.parse_args(argv)
     if getattr(args, "at_once", None):
-        words = [f"--{name}={value}" for name, value in vars(args).items() if value and name in ("robot", "seed")]
-        run_parts(words, args.parts or parts, args.at_once)
+        if args.small or args.out or not wp.get_cuda_devices():
+            parser.error("--at-once is for published numbers on GPUs, got a trial, another file, or no GPU")
+        run_parts([f"--robot={args.robot}", f"--seed={args.seed}"], args.parts or parts, args.at_once)
     robot = get_robot(args.robot)
     out = args.out or Path("runs/make/small" if args.small else published) / robot.name / file
     prepare_output(out)

@@ -44,8 +44,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """
     script = parse(__doc__, argv, "rounds.json", parts=("hardening", "base"))
     seeds = () if script.small else (1000, 1001)  # far from those of the rounds
-    if script.parts == ("base",):
-        return {"searches": [search_again(script, "base", None, seed) for seed in seeds]}
+    if "base" in script.parts:
+        searches = [search_again(script, "base", None, seed) for seed in seeds]
+        if script.parts == ("base",):
+            return {"searches": searches}
     run = script.runs / "hardening"
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
     if script.small:

@@ -41,6 +41,7 @@ from sim.mujoco_c.model import (
     goal_commands,
     noise_widths,
     observations,
+    rounded_steps,
     step_penalties,
     to_mujoco,
     vary_model,
@@ -108,7 +109,7 @@ class Episodes:
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
-        steps = robot.drive_delay_steps + round(float(conditions[Condition.DELAY]) / robot.physics_dt)
+        steps = robot.drive_delay_steps + rounded_steps(conditions[Condition.DELAY], robot.physics_dt)
         self._delayed = deque([self._targets.copy()] * steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
@@ -175,10 +176,11 @@ def cross(
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     vary_model(model, conditions)
     episodes = Episodes(robot, model, starts, conditions)
-    lag = round(float(conditions[Condition.LAG]) / robot.control_dt)
+    lag = rounded_steps(conditions[Condition.LAG], robot.control_dt)
     former: deque[Array] = deque(maxlen=1 + lag)
     width = float(conditions[Condition.NOISE]) * noise_widths(robot)
-    rng, push_at = np.random.default_rng(0), float(conditions[Condition.PUSH_TIME]) / robot.physics_dt
+    rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))  # of the episodes' own
+    push_at = rounded_steps(conditions[Condition.PUSH_TIME], robot.physics_dt)
     count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
@@ -208,7 +210,7 @@ def cross(
             action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
             last_action[running] = action
             episodes.hold(running, default + robot.action_scale * action)
-            if step <= round(push_at) < step + robot.decimation:
+            if step <= push_at < step + robot.decimation:
                 episodes.push(running, conditions[[Condition.PUSH_X, Condition.PUSH_Y]].astype(np.float64))
         episodes.step(running)
         judged = _judge(robot, episodes, running, base)

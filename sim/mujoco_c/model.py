@@ -218,8 +218,14 @@ def vary_model(model: Any, conditions: NDArray[np.floating]) -> None:
     model.actuator_forcerange[:] *= strength
     model.jnt_actfrcrange[:] *= strength
     model.geom_friction[:, 0] *= row[Condition.FRICTION]
-    added = row[Condition.PAYLOAD] * model.body_subtreemass[base]
+    added = max(row[Condition.PAYLOAD] * model.body_subtreemass[base], -0.5 * model.body_mass[base])
     if added:
+        model.body_sameframe[base] = 0  # or MuJoCo takes the frame of the body for that of its inertia
+        model.body_subtreemass[[0, base]] += added
+    if added < 0.0:
+        model.body_inertia[base] *= (model.body_mass[base] + added) / model.body_mass[base]
+        model.body_mass[base] += added
+    elif added > 0.0:
         mass, offset = model.body_mass[base], row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y, Condition.PAYLOAD_Z]]
         moved = added / (mass + added) * offset
         axes = rotation_matrix(model.body_iquat[base])
@@ -231,7 +237,11 @@ def vary_model(model: Any, conditions: NDArray[np.floating]) -> None:
         _mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
         model.body_inertia[base], model.body_mass[base] = moments, mass + added
         model.body_ipos[base] += moved
-        model.body_subtreemass[[0, base]] += added
+
+
+def rounded_steps(seconds: float, dt: float) -> int:
+    """Steps of a time, rounded as the parallel simulation does."""
+    return int(np.float32(seconds) / np.float32(dt) + np.float32(0.5))
 
 
 def noise_widths(robot: RobotCfg) -> Array:

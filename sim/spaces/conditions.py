@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.conditions import Condition
 from kernels.ground import Ground
 from sim.conditions import KINDS, genes_of, rows_of, words_of
 from sim.ground import joined_name, split_name
@@ -45,11 +46,13 @@ class UnderConditions(TerrainSpace):
         self.inner.lay_ground(genes[:, : self.inner.num_genes].contiguous(), ground_out)
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
-        """Hard-random terrains of the space, each condition at one of its limits."""
-        rng = np.random.default_rng(seed)
+        """Hard-random terrains of the space, each condition at one of its limits; pushes come at any time."""
+        rng, genes = np.random.default_rng(seed), genes_of(self.conditions)
         terrains = self.inner.hard_random(count, rng)
-        limits = rng.choice([-1.0, 1.0], (count, self.num_genes - self.inner.num_genes))
-        return np.concatenate([terrains, limits.astype(np.float32)], axis=1)
+        limits = rng.choice([-1.0, 1.0], (count, len(genes)))
+        times = [gene.condition == Condition.PUSH_TIME for gene in genes]
+        conditions = np.where(times, rng.uniform(-1.0, 1.0, limits.shape), limits)
+        return np.concatenate([terrains, conditions.astype(np.float32)], axis=1)
 
     def _words(self, genes: ArrayLike) -> list[str]:
         row = self.conditions_of(np.asarray(genes)[None])[0]

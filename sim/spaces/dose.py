@@ -86,7 +86,7 @@ QUANTITIES: dict[Kind, dict[str, Quantity]] = {
 _OF_CONDITION = {gene.condition: gene for gene in genes_of(tuple(KINDS))}
 _UNITS = {"delay": "s", "lag": "s", "push": "m/s"}
 _GROUND = {
-    name: Quantity("", _OF_CONDITION[condition].least, _OF_CONDITION[condition].most, _UNITS.get(name, ""))
+    name: Quantity("", max(0.0, _OF_CONDITION[condition].least), _OF_CONDITION[condition].most, _UNITS.get(name, ""))
     for name, condition in _CONDITIONS.items()
 } | {
     "friction": Quantity("", LEAST_FRICTION, 1.0, ""),
@@ -243,7 +243,7 @@ DOSES: dict[str, Dose] = {
 
 
 def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
-    """Some of :data:`DOSES`, in their order, as a command line names them; all of them without ``words``.
+    """Some of :data:`DOSES`, in their order, as a command line names them; without ``words`` all but conditions.
 
     A word is ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces. ``at`` are
     other parameters of those that have them, ``tread=0.25``.
@@ -252,7 +252,7 @@ def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     for word in " ".join(words).split():
         name, equals, values = word.partition("=")
         elements[name] = [_number(value, word) for value in values.split(",")] if equals else None
-    elements = elements or dict.fromkeys(DOSES)
+    elements = elements or {name: None for name, dose in DOSES.items() if dose.parameter not in _CONDITIONS}
     pairs = (word.partition("=") for word in " ".join(at).split())
     others = {name: _number(value, f"{name}={value}") for name, _, value in pairs}
     if unknown := elements.keys() - DOSES.keys():

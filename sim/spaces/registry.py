@@ -4,6 +4,7 @@ import re
 import shlex
 from dataclasses import replace
 
+from sim.conditions import KINDS
 from sim.ground import GROUND_KINDS, joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
@@ -96,7 +97,7 @@ def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
     if not is_own(name):
         raise ValueError(
             f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
-            "+friction, +softness or both"
+            f"some of {', '.join(f'+{kind}' for kind in (*GROUND_KINDS, *KINDS))}"
         )
     for space in _loaded:
         if space.name == name if sha256 is None else space.sha256 == sha256:

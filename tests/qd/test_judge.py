@@ -172,9 +172,14 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
     # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
     assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
     assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)
+    # Whoever certified is asked, and nobody else.
+    for wrong in ({}, {"C-G": str(ROBOTS["anymal"].panel / "S.pt")}):
+        with pytest.raises(ValueError, match="got none or another file for C-G"):
+            judged(path, Robots(result_of, stop_after=0), stages=("varied",), certifiers=wrong)
     # With other certificates nobody knows any more.
     weak = str(ROBOTS["anymal"].panel / "S.pt")
     assert not judged(path, stages=("others",), certifiers={"C-G": weak}).robust.any()
+    assert not {"robust", "crossed_varied"} & numbers_in(path).keys()
 
 
 def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):

@@ -13,13 +13,15 @@ from sim.conditions import KINDS, NOMINAL, genes_of
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.mujoco_c.model import crossing_model, noise_widths, vary_model
+from sim.mujoco_c.model import crossing_model, noise_widths, rounded_steps, vary_model
 from sim.policy.loaders import load_policy
 from sim.robots.compiled import robot_spec
+from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.spaces.registry import get_space, identity
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS
+from tests.sim.dogs import write_dog
 
 ALL = "super_gaussian+" + "+".join(KINDS)
 SPACE = get_space(ALL)
@@ -227,6 +229,39 @@ def test_a_payload_is_a_point_mass_on_the_base(anymal):
         mujoco.mj_fullM(model, data, full)
         inertias.append(full)
     np.testing.assert_allclose(inertias[0], inertias[1], atol=1e-5)
+
+
+def test_a_payload_is_where_it_is_on_a_base_whose_inertia_lies_at_its_origin(tmp_path):
+    """MuJoCo takes the frame of such a body for that of its inertia."""
+    robot = get_robot(str(write_dog(tmp_path)))
+    model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
+    assert model.body_sameframe[1]
+    vary_model(model, SPACE.conditions_of(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0])
+    data = mujoco.MjData(model)
+    data.qpos[3] = 1.0
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(data.xipos[1] - data.xpos[1], model.body_ipos[1], atol=1e-9)
+    assert np.abs(model.body_ipos[1]).max() > 0.03
+
+
+def test_a_negative_payload_leaves_a_body_that_can_be(robot, device):
+    """Less of the base itself, wherever the payload would be, and no less than half of it."""
+    row = genes(payload=-0.05, payload_x=0.2, payload_y=0.2)
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=1, device=device, space=SPACE)
+    rollout.put(row[None], np.array([1], np.uint32))
+    tree = rollout.sim._dynamics._tree
+    plain = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
+    share = 1.0 - min(0.5, 0.05 * plain.body_subtreemass[1] / plain.body_mass[1])
+    assert tree.body_mass.numpy()[0, 1] == pytest.approx(share * plain.body_mass[1], rel=1e-5)
+    np.testing.assert_allclose(tree.body_inertia.numpy()[0, 1], share * plain.body_inertia[1], rtol=1e-5)
+    np.testing.assert_allclose(tree.body_ipos.numpy()[0, 1], plain.body_ipos[1], atol=1e-6)
+    vary_model(plain, SPACE.conditions_of(row[None])[0])
+    np.testing.assert_allclose(plain.body_inertia[1], tree.body_inertia.numpy()[0, 1], rtol=1e-5)
+
+
+def test_times_are_rounded_alike_in_both():
+    for seconds, dt, steps in ((0.03, 0.02, 2), (0.01, 0.02, 1), (0.0125, 0.005, 3), (0.06, 0.024, 3), (0.0, 0.02, 0)):
+        assert rounded_steps(seconds, dt) == steps
 
 
 def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
