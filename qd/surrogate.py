@@ -351,7 +351,10 @@ def vary_elites(
     if cfg.crossover_share and genes_per_part:
         crossed = torch.rand((count, 1), **on) < cfg.crossover_share
         swapped = (torch.rand((count, pool.shape[1] // genes_per_part), **on) < 0.5) & crossed
-        children = torch.where(swapped.repeat_interleave(genes_per_part, dim=1), further, children)
+        swapped = swapped.repeat_interleave(genes_per_part, dim=1)
+        children[:, : swapped.shape[1]] = torch.where(
+            swapped, further[:, : swapped.shape[1]], children[:, : swapped.shape[1]]
+        )
     return children.clamp(-1.0, 1.0)
 
 

@@ -24,9 +24,8 @@ class UnderConditions(TerrainSpace):
         self.inner, self.conditions = inner, kinds
         self.name = joined_name(inner.name, kinds)
         self.num_genes = inner.num_genes + len(genes_of(kinds))
-        for name in ("sha256", "sigma0", "any_spacing", "height_share", "ground"):
+        for name in ("sha256", "sigma0", "any_spacing", "height_share", "ground", "genes_per_part"):
             setattr(self, name, getattr(inner, name))
-        self.genes_per_part = None  # kinds have one to three genes
 
     def _split(self, genes: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Clipped genes of terrains and of conditions."""

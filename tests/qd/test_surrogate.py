@@ -287,6 +287,10 @@ def test_of_a_share_of_the_children_half_of_the_bumps_are_another_elites():
     without_parts = children(PAIR, crossover_share=1.0, genes_per_part=None)
     assert all((row == PAIR.numpy()).all(axis=1).any() for row in without_parts)
     assert np.abs(children(PAIR, iso_sigma=5.0)).max() == 1.0  # clipped
+    # Genes behind the last whole part, such as of conditions, stay with those of the first elite.
+    longer = children(torch.cat([PAIR, PAIR[:, :3]], dim=1), crossover_share=1.0)
+    ends = (longer[:, None, 64:] == PAIR[:, :3].numpy()).all(axis=2)
+    assert (ends.sum(axis=1) == 1).all() and (longer[:, :8] != PAIR[0, :8].numpy()).any(axis=1).mean() > 0.4
 
 
 def test_steps_along_lines_stay_on_them():
