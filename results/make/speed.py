@@ -26,6 +26,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from qd.archive import read_archive
+from qd.fitness import FAILING_GOAL_RATE
 from qd.run.directory import Metrics, RunDirectory
 from qd.run.settings import SearchCfg, preset
 from qd.scheduler import Scheduler
@@ -201,7 +203,9 @@ def time_cpu(script: Script) -> dict[str, Any]:
         wall_s = time.perf_counter() - began
         if compiled == set(kernels.iterdir()):
             break  # else the first run compiled some
-    return {"cpu": {**script.origin, "archive_wall_s": wall_s, **time_view(script.robot.name, script.runs / "speed")}}
+    view, archive = time_view(script.robot.name, script.runs / "speed"), read_archive(run)
+    found = {"elites": len(archive), "failing_as_found": int((archive.goal_rate < FAILING_GOAL_RATE).sum())}
+    return {"cpu": {**script.origin, "archive_wall_s": wall_s, **found, **view}}
 
 
 def time_view(robot: str, folder: Path) -> dict[str, float | None]:
