@@ -98,8 +98,6 @@ class Listing:
             f"{others or 'No'} other elite{'s' * (others > 1)} like it (within 6 cm).",
             f"Fitness **{fitness:.2f}** ({before:.2f} as found in iteration {iteration}): {FITNESS_WORDS}.",
         ]
-        if words := self.space.condition_words(archive.genes[number]):
-            parts.insert(0, f"**Conditions**: {words}.")
         if minima is not None and number in minima.genes:
             parts.insert(0, f"**Minimal terrain**: {minima.words(number)}.")
         return "\n\n".join(parts)

@@ -288,7 +288,10 @@ class Tab:
     def _show_elite(self) -> None:
         show, elite, listing = self.common.show, self.selection.picked, self.common.show.listing
         name, verdict = listing.ranking.name(elite), listing.verdict(elite)
-        known = f"elite {elite} of {len(self._archive):,}{f' · {verdict}' * bool(verdict)}"
+        genes = self.common.show.genes(elite, self._minimal)
+        shown = self._archive.genes[elite] if genes is None else genes
+        words = (f"elite {elite} of {len(self._archive):,}", verdict, listing.space.condition_words(shown))
+        known = " · ".join(filter(None, words))
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         self.panel.show_elite(
             f"<b>{escape(name)}</b><br>{known}",
@@ -296,8 +299,6 @@ class Tab:
             has_minimal=self.common.show.genes(elite, True) is not None,
             minimal=self.minimal,
         )
-        genes = self.common.show.genes(elite, self._minimal)
-        shown = self._archive.genes[elite] if genes is None else genes
         heights, ground = terrains_of(shown[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
