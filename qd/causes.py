@@ -12,9 +12,7 @@ from sim.bank import heights_of, terrains_of
 from sim.conditions import words_of
 from sim.crossing import CrossingCfg
 from sim.ground import PATCHES, patches_at
-from sim.spaces.base import TerrainSpace
-from sim.spaces.conditions import UnderConditions
-from sim.spaces.ground import OnGround
+from sim.spaces.base import TerrainSpace, WiderSpace
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 LEAST_HEIGHT = 0.03
@@ -158,8 +156,9 @@ def causes_at(
 def _cause_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace, half_width: float) -> str:
     if not np.isfinite(end).all():
         return UNCLEAR
-    raised = space.inner if isinstance(space, UnderConditions) else space
-    raised = raised.inner if isinstance(raised, OnGround) else raised
+    raised = space
+    while isinstance(raised, WiderSpace):
+        raised = raised.inner
     row = genes[None, : raised.num_genes]
     parts = range(len(raised.parts(row[0])))
     alone = [raised.without(row, [other for other in parts if other != part]) for part in parts] or [row]

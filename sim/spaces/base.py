@@ -103,6 +103,43 @@ class TerrainSpace:
         return array
 
 
+class WiderSpace(TerrainSpace):
+    """The terrains of another space, whose genes come first, with genes of its own behind them.
+
+    Attributes:
+        inner: The other space.
+    """
+
+    inner: TerrainSpace
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
+        """Turns genes into heights on the device, by the other space."""
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
+
+    def absent(self, part: int) -> tuple[slice, Any]:
+        """Columns of a part of its own, by its number among these, and genes of it that change nothing."""
+        raise NotImplementedError
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes without some parts, those of the other space first; one of its own becomes :meth:`absent`."""
+        changed = self.validate(genes).copy()
+        first = self.inner.num_genes
+        if len(changed):
+            count = len(self.inner.parts(changed[0, :first]))
+            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
+            for part in parts:
+                if part >= count:
+                    columns, values = self.absent(part - count)
+                    changed[:, columns] = values
+        return changed
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes with heights scaled by the other space; its own stay as they are."""
+        rows, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(rows[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShippedSpace(TerrainSpace):
     """A space whose heights are for robots half a metre high, and can be lowered for others."""

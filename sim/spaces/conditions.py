@@ -10,10 +10,10 @@ from kernels.conditions import Condition
 from kernels.ground import Ground
 from sim.conditions import KINDS, genes_of, rows_of, words_of
 from sim.ground import joined_name, split_name
-from sim.spaces.base import Seed, TerrainSpace, clipped
+from sim.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 
-class UnderConditions(TerrainSpace):
+class UnderConditions(WiderSpace):
     """The terrains of a space, crossed under conditions (:mod:`sim.conditions`).
 
     The genes of the space come first, then those of each kind of condition. A kind is a part.
@@ -35,10 +35,6 @@ class UnderConditions(TerrainSpace):
     def conditions_of(self, genes: ArrayLike) -> NDArray[np.float32]:
         """Rows of conditions, shape (num_terrains, 12)."""
         return rows_of(self._split(genes)[1], self.conditions)
-
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
-        """Turns genes into heights on the device, by the space."""
-        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device, by the space."""
@@ -62,25 +58,11 @@ class UnderConditions(TerrainSpace):
         words = [word or f"no {kind}" for kind, word in zip(self.conditions, self._words(genes), strict=True)]
         return (*self.inner.parts(self._split(genes)[0]), *words)
 
-    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes without some parts: a condition that changes nothing is absent."""
-        changed = self.validate(genes).copy()
-        first = self.inner.num_genes
-        if len(changed):
-            count = len(self.inner.parts(changed[0, :first]))
-            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
-            for part in parts:
-                if part >= count:
-                    before = len(genes_of(self.conditions[: part - count]))
-                    absent = [gene.absent for gene in KINDS[self.conditions[part - count]]]
-                    changed[:, first + before : first + before + len(absent)] = absent
-        return changed
-
-    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes with heights scaled by the space; conditions stay as they are."""
-        rows, first = clipped(self.validate(genes)), self.inner.num_genes
-        heights = self.inner.scaled(rows[:, :first], scale)
-        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+    def absent(self, part: int) -> tuple[slice, Any]:
+        """A condition that changes nothing."""
+        first = self.inner.num_genes + len(genes_of(self.conditions[:part]))
+        values = [gene.absent for gene in KINDS[self.conditions[part]]]
+        return slice(first, first + len(values)), values
 
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and the conditions in a line behind it."""

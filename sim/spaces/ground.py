@@ -1,6 +1,5 @@
 """Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
 from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, joined_name, patches_at
-from sim.spaces.base import Seed, TerrainSpace, clipped
+from sim.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
 """The gene of ground that changes nothing."""
@@ -16,7 +15,7 @@ _BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the ri
 _MOST_FRICTION = 0.995  # rounded, what is above is 1.00
 
 
-class OnGround(TerrainSpace):
+class OnGround(WiderSpace):
     """The terrains of a space on ground whose patches differ.
 
     The genes of the space come first, then those of each map, patch after patch (:mod:`kernels.ground`). A patch is a
@@ -32,10 +31,6 @@ class OnGround(TerrainSpace):
         # Where maps divide by the parts of the space too: eight patches are a row along the way.
         per_part = inner.genes_per_part
         self.genes_per_part = per_part if per_part and NUM_PATCHES % per_part == 0 else None
-
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
-        """Turns genes into heights on the device, by the space."""
-        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device (:mod:`kernels.ground`)."""
@@ -58,23 +53,10 @@ class OnGround(TerrainSpace):
         words = [_patch_words(kind, value, patch) for kind, (patch, value) in values]
         return (*self.inner.parts(row[: self.inner.num_genes]), *words)
 
-    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes without some parts: a patch without friction or softness of its own is as ground always is."""
-        changed = self.validate(genes).copy()
-        first = self.inner.num_genes
-        if len(changed):
-            count = len(self.inner.parts(changed[0, :first]))
-            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
-            for part in parts:
-                if part >= count:
-                    changed[:, first + part - count] = ABSENT[self.ground[(part - count) // NUM_PATCHES]]
-        return changed
-
-    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes with heights scaled by the space; the ground stays as it is."""
-        rows, first = clipped(self.validate(genes)), self.inner.num_genes
-        heights = self.inner.scaled(rows[:, :first], scale)
-        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+    def absent(self, part: int) -> tuple[slice, Any]:
+        """A patch without friction or softness of its own is as ground always is."""
+        first = self.inner.num_genes + part
+        return slice(first, first + 1), ABSENT[self.ground[part // NUM_PATCHES]]
 
     def describe(self, genes: ArrayLike) -> str:
         """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
