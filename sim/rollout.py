@@ -11,7 +11,6 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from kernels.conditions import disturb_observation, push
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.penalties import PENALTIES, add_penalties
@@ -221,8 +220,7 @@ class Rollout:
         park_ended(
             self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
         )
-        if sim.disturbed is not None:
-            push(self._episode, sim.disturbed, robot.physics_dt, robot.decimation, sim.joint_qd)
+        sim.push(self._episode, robot.physics_dt)
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
@@ -257,10 +255,7 @@ class Rollout:
             sim.joint_q, sim.joint_qd, self.command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
             sim.sensors, Noise(), self._counter, self._observation,
         )  # fmt: skip
-        if sim.disturbed is not None:
-            disturb_observation(
-                self._episode, self.robot.num_joints, self.robot.control_dt, sim.disturbed, self._observation
-            )
+        sim.disturb(self._episode, self._observation)
 
     @property
     def num_free(self) -> int:

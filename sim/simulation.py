@@ -9,9 +9,10 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.conditions import Condition, Disturbed, begin_conditions
+from kernels.conditions import Condition, Disturbed, begin_conditions, disturb_observation, push
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay_targets, limit_torques, tell_solver
+from kernels.episode import Episodes
 from kernels.ground import Ground
 from kernels.observation import Sensors
 from kernels.restart import clear_rows
@@ -264,6 +265,17 @@ class Simulation:
                 begins, self.terrain_of_env, self.bank.conditions, nominal, self.robot.drive_delay_steps,
                 self.robot.physics_dt, tree, robots, self._delay, self.disturbed,
             )  # fmt: skip
+
+    def push(self, episodes: Episodes, dt: float) -> None:
+        """Push the robots whose time it is in a control step; the episodes count steps of ``dt`` [s]."""
+        if self.disturbed is not None:
+            push(episodes, self.disturbed, dt, round(self.robot.control_dt / dt), self.joint_qd)
+
+    def disturb(self, episodes: Episodes, observation: Any) -> None:
+        """Make observations, (num_envs, observation_size), as noisy and old as the conditions of their terrains say."""
+        if self.disturbed is not None:
+            robot = self.robot
+            disturb_observation(episodes, robot.num_joints, robot.control_dt, self.disturbed, observation)
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""

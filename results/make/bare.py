@@ -14,7 +14,6 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.conditions import disturb_observation, push
 from kernels.episode import Outcome, make_episodes
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
@@ -156,12 +155,10 @@ def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
         varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
         varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
         observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
-    disturbed = varied.disturbed
-    assert disturbed is not None
 
     def beside() -> None:
-        push(episodes, disturbed, robot.physics_dt, robot.decimation, varied.joint_qd)
-        disturb_observation(episodes, robot.num_joints, robot.control_dt, disturbed, observation)
+        varied.push(episodes, robot.physics_dt)
+        varied.disturb(episodes, observation)
 
     return Motion(varied, segments, beside)
 

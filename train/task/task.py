@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from kernels.conditions import disturb_observation, push
 from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
 from kernels.observation import Noise, apply_action, write_observation
 from kernels.restart import StartRanges, restart_episodes
@@ -172,8 +171,7 @@ class CommandTask:
     def _control_step(self) -> None:
         sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
-        if sim.disturbed is not None:
-            push(episodes, sim.disturbed, self.robot.control_dt, 1, sim.joint_qd)  # whose steps are control steps
+        sim.push(episodes, self.robot.control_dt)
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
             # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
@@ -207,10 +205,7 @@ class CommandTask:
             sim.joint_q, sim.joint_qd, training.command, training.last_action, sim.terrain_of_env, terrain,
             sim.sensors, self._noise, training.counter, training.observation,
         )  # fmt: skip
-        if sim.disturbed is not None:
-            disturb_observation(
-                episodes, self.robot.num_joints, self.robot.control_dt, sim.disturbed, training.observation
-            )
+        sim.disturb(episodes, training.observation)
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 
