@@ -59,8 +59,8 @@ class FaultCounts:
     certifier_resolved_outcomes: NDArray[np.int64]
     """By them with contact resolved, shape (N, C, 4)."""
     varied_outcomes: NDArray[np.int64] | None = None
-    """By the controller that was searched under varied conditions (:func:`sim.conditions.varied`), shape (N, 4); None
-    where nobody has crossed so."""
+    """By the controller that was searched under varied conditions (:data:`sim.spaces.conditions.VARIED`), shape (N, 4);
+    None where nobody has crossed so."""
     certifier_varied_outcomes: NDArray[np.int64] | None = None
     """By the others under the same ones, shape (N, C, 4); None likewise."""
 

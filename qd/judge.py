@@ -192,16 +192,18 @@ def vary(archive: Archive, certifiers: Mapping[str, str], search: Search, crossi
     faults, space = archive.counts, get_space(search.cfg.space, search.cfg.space_sha256)
     under = load_space(varied_name(space))
 
-    def counts_of(policy: str, rows: NDArray[np.int64], label: str) -> NDArray[np.int64]:
-        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=_VARY_STREAM).reshape(-1, EPISODES)[rows]
-        genes = [varied_genes(space, archive.genes[row], of_row) for row, of_row in zip(rows, seeds, strict=True)]
+    rows = np.flatnonzero(archive.is_fault)
+    seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=_VARY_STREAM).reshape(-1, EPISODES)[rows]
+    drawn = [varied_genes(space, archive.genes[row], of_row) for row, of_row in zip(rows, seeds, strict=True)]
+    genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, under.num_genes)
+
+    def counts_of(policy: str, which: NDArray[np.bool_], label: str) -> NDArray[np.int64]:
         result = crossings.cross(
-            policy, np.concatenate([np.zeros((0, under.num_genes), np.float32), *genes]), seeds.ravel(), replicas=1,
-            space=under.name, label=f"{label}, varied conditions", invalid_ok=True,
+            policy, genes[which].reshape(-1, under.num_genes), seeds[which].ravel(), replicas=1, space=under.name,
+            label=f"{label}, varied conditions", invalid_ok=True,
         )  # fmt: skip
         return outcome_counts(result).reshape(-1, EPISODES, 4).sum(axis=1)
 
-    rows = np.flatnonzero(archive.is_fault)
     now = {name: str(controller_hash(policy)) for name, policy in certifiers.items()}
     known = zip(faults.certifiers, faults.certifier_sha256, faults.certificates()[rows].T, strict=True)
     if lost := [name for name, digest, certifies in known if certifies.any() and now.get(name) != digest]:
@@ -209,12 +211,13 @@ def vary(archive: Archive, certifiers: Mapping[str, str], search: Search, crossi
             f"certifiers must be those that certify faults of {search.run}, got none or another file for "
             f"{', '.join(lost)}: name them by --certifiers, or judge --stages others again"
         )
-    by_searched = _put(np.zeros_like(faults.resolved_outcomes), rows, counts_of(search.policy, rows, "searched"))
+    counts = counts_of(search.policy, np.ones(len(rows), bool), "searched")
+    by_searched = _put(np.zeros_like(faults.resolved_outcomes), rows, counts)
     by_others = np.zeros_like(faults.certifier_outcomes)
     for column, name in enumerate(faults.certifiers):
-        certified = rows[faults.certificates()[rows, column]]
-        if len(certified):
-            by_others[certified, column] = counts_of(certifiers[name], certified, name)
+        certified = faults.certificates()[rows, column]
+        if certified.any():
+            by_others[rows[certified], column] = counts_of(certifiers[name], certified, name)
     archive = replace(archive, faults=replace(faults, varied_outcomes=by_searched, certifier_varied_outcomes=by_others))
     print(f"{archive.robust.sum()} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
     return archive

@@ -20,11 +20,9 @@ from qd.workers.cross import Crossings
 from results.make.common import Script, parse, read_made
 from results.make.spaces import COUNTS, causes_of
 from sim.conditions import KINDS
-from sim.ground import joined_name
+from sim.spaces.dose import CONDITIONS_SPACE as SPACE
 from sim.spaces.registry import get_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 
-SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(KINDS))
 EPISODES_SEARCHED = 400_000
 _STREAM = 2000
 _EXAMPLES = 10
@@ -73,7 +71,7 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             {
                 "elite": int(row),
                 "goal_rate": float(archive.fresh.goal_rate[row]) if archive.fresh else None,
-                "conditions": space.describe(archive.genes[row]).splitlines()[-1],
+                "conditions": space.condition_words(archive.genes[row]),
                 "needed": [kind for kind in KINDS if needed[kind][place]],
             }
             for place, row in enumerate(cured[:_EXAMPLES])
