@@ -39,6 +39,22 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "singles, half again": {**PAIRS, "replicas": 1, "batch_size": 220, "again": 180, "candidates": 6},
     "threes, half again, fewer candidates": {**THREES, "candidates": 6},
     "threes, half again, learn longer": {**THREES, "training_steps": 1000},
+    "pairs, 40 emitters": {**PAIRS, "emitters": 40},
+    "pairs, 20 emitters": {**PAIRS, "emitters": 20, "groups": 4},
+    "pairs, 40 emitters, settled": {**PAIRS, **SETTLED, "emitters": 40},
+    "threes, 40 emitters": {**THREES, "emitters": 40},
+    "pairs, more again": {**PAIRS, "batch_size": 80, "again": 120},
+    "threes, more again": {**THREES, "batch_size": 50, "again": 83},
+    "pairs, learn longer": {**PAIRS, "training_steps": 1000},
+    "pairs, 24 candidates": {**PAIRS, "candidates": 24},
+    "pairs, 5 generations": {**PAIRS, "generations": 5},
+    "pairs, 20 generations": {**PAIRS, "generations": 20},
+    "pairs, explore a tenth": {**PAIRS, "explore_share": 0.1},
+    "pairs, explore half": {**PAIRS, "explore_share": 0.5},
+    "pairs, iso sigma .05": {**PAIRS, "iso_sigma": 0.05},
+    "pairs, iso sigma .01": {**PAIRS, "iso_sigma": 0.01},
+    "pairs, line sigma .4": {**PAIRS, "line_sigma": 0.4},
+    "pairs, crossover .6": {**PAIRS, "crossover_share": 0.6},
 }
 """Settings of preset wide that each design changes."""
 FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled")
