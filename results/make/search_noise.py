@@ -26,6 +26,7 @@ FINAL_SEEDS, FINAL_EPISODES = (0, 1, 2), 400_000
 THREES = {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12}
 PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12}
 SETTLED = {"settling": 1}
+FEW_EMITTERS = {"emitters": 20, "groups": 4}
 DESIGNS: dict[str, dict[str, Any]] = {
     "once": {},
     "10 episodes": {"replicas": 10, "batch_size": 40, "candidates": 10},
@@ -39,12 +40,16 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "singles, half again": {**PAIRS, "replicas": 1, "batch_size": 220, "again": 180, "candidates": 6},
     "threes, half again, fewer candidates": {**THREES, "candidates": 6},
     "threes, half again, learn longer": {**THREES, "training_steps": 1000},
-    "pairs, 40 emitters": {**PAIRS, "emitters": 40},
-    "pairs, 20 emitters": {**PAIRS, "emitters": 20, "groups": 4},
-    "pairs, 40 emitters, settled": {**PAIRS, **SETTLED, "emitters": 40},
-    "threes, 40 emitters": {**THREES, "emitters": 40},
-    "pairs, more again": {**PAIRS, "batch_size": 80, "again": 120},
     "threes, more again": {**THREES, "batch_size": 50, "again": 83},
+    "threes, 40 emitters": {**THREES, "emitters": 40},
+    "threes, 20 emitters": {**THREES, **FEW_EMITTERS},
+    "pairs, 40 emitters": {**PAIRS, "emitters": 40},
+    "pairs, 40 emitters, settled": {**PAIRS, **SETTLED, "emitters": 40},
+    "pairs, 20 emitters": {**PAIRS, **FEW_EMITTERS},
+    "pairs, 20 emitters, 100 steps": {**PAIRS, **FEW_EMITTERS, "training_steps": 100},
+    "pairs, 20 emitters, settled": {**PAIRS, **FEW_EMITTERS, "settling": 2},
+    "pairs, 10 emitters": {**PAIRS, "emitters": 10, "groups": 2},
+    "pairs, more again": {**PAIRS, "batch_size": 80, "again": 120},
     "pairs, learn longer": {**PAIRS, "training_steps": 1000},
     "pairs, 24 candidates": {**PAIRS, "candidates": 24},
     "pairs, 5 generations": {**PAIRS, "generations": 5},
@@ -60,6 +65,9 @@ DESIGNS: dict[str, dict[str, Any]] = {
 FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled")
 SEARCHES = {name: (name, SEED, EPISODES) for name in DESIGNS} | {
     f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS
+} | {
+    f"{name}, seed 0": (name, 0, FINAL_EPISODES)
+    for name in ("threes, 20 emitters", "pairs, 20 emitters", "pairs, 20 emitters, settled")
 }
 """Design, seed and episodes of each search."""
 
