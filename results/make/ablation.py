@@ -16,7 +16,7 @@ from qd.judge import FRESH_STREAM, elite_seeds, fresh_values
 from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.workers.cross import Crossings
-from results.make.common import parse
+from results.make.common import ONCE, parse
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
 MOST_ELITES, STREAM = 200, 3  # of the random numbers that choose them
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Runs both searches and writes their mean STD with 95 % bootstrap intervals over elites."""
     script = parse(__doc__, argv, "ablation.json")
     every = 1 if script.small else 6
-    cfg = script.search_cfg(18, seed=script.seed)
+    cfg = script.search_cfg(18, seed=script.seed, **ONCE)
     iterations = [*range(every, cfg.iterations + 1, every)]
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ALPHAS}
     with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:

@@ -20,15 +20,16 @@ for robot in "${robots[@]}"; do
   folder=results/$robot
   make_file "$folder/base.json" base "$robot"                         # 2 min
   make_file "$folder/penalty_ratios.json" penalty_ratios "$robot"     # 1 min
-  make_file "$folder/archive/archive.json" archive "$robot"           # 100 min: three searches, judged
+  make_file "$folder/recipes.json" recipes "$robot"                   # 25 min: nine trainings
+  make_file "$folder/archive/archive.json" archive "$robot"           # 60 min: four searches, judged
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
-  make_file "$folder/search.json" search "$robot"                     # 105 min: 21 searches
-  make_file "$folder/search_noise.json" search_noise "$robot"         # 10 min: eight short searches
+  make_file "$folder/search.json" search "$robot"                     # 40 min: 16 searches
+  make_file "$folder/search_noise.json" search_noise "$robot"         # 60 min: 47 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
-  make_file "$folder/tables.json" tables "$robot"                     # 60 min: nine trainings
+  make_file "$folder/rounds.json" rounds "$robot"                     # 60 min
+  make_file "$folder/tables.json" tables "$robot"                     # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
-  make_file "$folder/rounds.json" rounds "$robot"                     # 120 min
   make_file "$folder/dose.json" dose "$robot"                         # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
   make_file "$folder/conditions.json" conditions "$robot"             # 8 min

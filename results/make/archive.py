@@ -2,6 +2,7 @@
 
 The default method, the paper's method, and the default one again with another seed. Each is a search of preset wide.
 Then it is judged: fresh episodes, contact resolved, a specialist trained on what fails, and others' crossings.
+On the way its elites cross fresh episodes, and curve.json has what they say. A third seed is searched for that alone.
 """
 
 import shutil
@@ -12,23 +13,40 @@ from typing import Any
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.search import search
-from results.make.common import Script, parse
+from results.make.common import ONCE, Script, parse
+from sim.files.atomic import to_json, write_atomically
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
-SEARCHES = {"archive": (None, 0), "archive_cma_mae": ("cma_mae", 0), "independent": (None, 1)}
-"""Method, or None for the default one, and seed of each."""
-PUBLISHED = ("archive.npz", "archive.json", "config.json", "metrics.jsonl", "*.png", "certifiers/specialist.pt")
+SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
+    "archive": ({}, 0),
+    "archive_cma_mae": ({"method": "cma_mae", **ONCE}, 0),
+    "independent": ({}, 1),
+    "third": ({}, 2),
+}
+"""Changes of preset wide, and seed of each."""
+CURVE = (6, 12, 31, 62, 125)
+"""Iterations after which elites cross fresh episodes, the last those of the preset; the third search has three."""
+PUBLISHED = (
+    "archive.npz", "archive.json", "config.json", "metrics.jsonl", "curve.json", "*.png", "certifiers/specialist.pt",
+)  # fmt: skip
 """Files of a run that are published."""
+COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
 
 
 def make_archive(script: Script, name: str) -> Path:
     """Searches and judges; returns the run."""
-    method, seed = SEARCHES[name]
-    changes = {} if method is None else {"method": method}
-    run = script.runs / name
-    search(script.search_cfg(seed=script.seed + seed, **changes), run, script.compute)
-    if not script.small:  # on a CPU judging and a training take hours
+    changes, seed = ({}, 0) if script.small else SEARCHES[name]
+    run, points = script.runs / name, CURVE[:3] if name == "third" else CURVE
+    so_far = {row["iterations"]: row for row in script.read_so_far(run / "curve.json").get("curve", [])}
+    for iterations in points[:1] if script.small else points:
+        if iterations not in so_far:
+            search(script.search_cfg(iterations, seed=script.seed + seed, **changes), run, script.compute)
+            judge(run, stages=("fresh",), compute=script.compute)
+            numbers = RunDirectory(run).read_summary()
+            so_far[iterations] = {"iterations": iterations, **{count: numbers[count] for count in COUNTS}}
+            write_atomically(run / "curve.json", to_json({**script.origin, "curve": [*so_far.values()]}))
+    if not script.small and name != "third":  # on a CPU a training takes hours
         judge_with_specialist(script, run)
     return run
 
@@ -43,11 +61,11 @@ def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Makes the three archives and publishes them beside each other."""
+    """Makes the archives and publishes them beside each other."""
     script = parse(__doc__, argv, "archive/archive.json", parts=tuple(SEARCHES))
     for name in script.parts or SEARCHES:
         run = make_archive(script, name)
-        for pattern in PUBLISHED:
+        for pattern in PUBLISHED if name != "third" else ("curve.json",):
             for file in run.glob(pattern):
                 target = script.out.parent.parent / name / file.relative_to(run)
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -33,6 +33,8 @@ from sim.robots.robot import RobotCfg
 
 SEEDS = (0, 1, 2)
 """Seeds of everything that is done several times."""
+ONCE = {"replicas": 20, "batch_size": 20, "again": 0, "candidates": 20}
+"""Changes of preset wide: each terrain is crossed once, in the paper's 20 episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)

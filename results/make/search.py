@@ -1,7 +1,8 @@
-"""Does the search earn its cost? Methods of search on equally many terrains, three seeds each: search.json.
+"""Does the search earn its cost? Methods of search in equally many episodes: search.json.
 
 Each search of preset wide is extended step by step; after each step all elites cross fresh episodes. At the end, those
-that fail cross with contact resolved and are crossed by the robot's panel.
+that fail cross with contact resolved and are crossed by the robot's panel. The default is searched with three seeds,
+others with two.
 """
 
 from collections.abc import Sequence
@@ -12,26 +13,42 @@ import numpy as np
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.search import search
-from results.make.common import SEEDS, Script, mean_over_seeds, parse
+from results.make.common import ONCE, SEEDS, Script, mean_over_seeds, parse
 
-METHODS = ("uniform_random", "hard_random", "map_elites", "cma_me", "cma_mae", "cma_mae+map_elites", "surrogate")
 DEFAULT = "surrogate"
-STEPS = (3, 6, 9, 12)
-"""Iterations at which elites cross fresh episodes: up to 384,000 episodes."""
-COUNTS = ("elites", "corrected_elites", "failing")
+METHODS: dict[str, dict[str, Any]] = {
+    DEFAULT: {},
+    "surrogate, each terrain once": ONCE,
+    "cma_mae+map_elites": {"method": "cma_mae+map_elites", **ONCE},
+    "cma_mae": {"method": "cma_mae", **ONCE},
+    "cma_mae, 10 emitters": {"method": "cma_mae", "emitters": 10, "groups": 1, **ONCE},
+    "map_elites": {"method": "map_elites", **ONCE},
+    "hard_random": {"method": "hard_random", **ONCE},
+}
+"""What each method changes in preset wide. The paper has ten emitters, and crosses each terrain once."""
+SEEDS_OF = {DEFAULT: SEEDS, "surrogate, each terrain once": SEEDS}
+STEPS = (96_000, 192_000, 384_000)
+"""Episodes after which elites cross fresh ones."""
+COUNTS = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
 JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 
 def follow_search(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """The numbers of a run's archive.json after each step."""
-    steps, run = (1,) if script.small else STEPS, script.runs / "search" / f"{method}-{seed}"
-    rows = []
-    for iterations in steps:
-        search(script.search_cfg(iterations, seed=seed, method=method), run, script.compute)
-        is_last = iterations == steps[-1] and not script.small
+    changes = {} if script.small else METHODS[method]
+    run, rows = script.runs / "search" / f"{method}-{seed}".replace(", ", "-").replace(" ", "-"), []
+    each = script.search_cfg(seed=seed, **changes).episodes_per_iteration
+    for episodes in STEPS[:1] if script.small else STEPS:
+        search(script.search_cfg(episodes // each, seed=seed, **changes), run, script.compute)
+        is_last = episodes == STEPS[-1]
         judge(run, stages=("fresh", "resolved", "others") if is_last else ("fresh",), compute=script.compute)
         rows.append(RunDirectory(run).read_summary())
     return rows
+
+
+def seeds_of(method: str) -> tuple[int, ...]:
+    """Seeds that a method is searched with."""
+    return SEEDS_OF.get(method, SEEDS[:2])
 
 
 def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -44,18 +61,18 @@ def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, An
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Runs every method with every seed, and writes means with 95 % t intervals over seeds; parts are runs alone."""
-    runs = {f"{method}-{seed}": (method, seed) for method in METHODS for seed in SEEDS}
+    runs = {f"{method}, seed {seed}": (method, seed) for method in METHODS for seed in seeds_of(method)}
     script = parse(__doc__, argv, "search.json", parts=tuple(runs))
     for part in script.parts:
         follow_search(script, *runs[part])
     if script.parts:
         return {}
-    methods, seeds = ((DEFAULT,), SEEDS[:1]) if script.small else (METHODS, SEEDS)
-    rows = {name: [follow_search(script, name, seed) for seed in seeds] for name in methods}
+    methods = [(DEFAULT, SEEDS[:1])] if script.small else [(name, seeds_of(name)) for name in METHODS]
+    rows = {name: [follow_search(script, name, seed) for seed in seeds] for name, seeds in methods}
     numbers = {}
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
-        numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(seeds)}
+        numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
         for count in (*COUNTS, *JUDGED):
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
         numbers[name]["curve"] = curve_of(rows_of_seeds)

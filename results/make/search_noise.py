@@ -17,7 +17,7 @@ from qd.pool import chance_to_stay
 from qd.run.directory import RunDirectory
 from qd.search import search
 from qd.workers.cross import Crossings
-from results.make.common import Script, parse
+from results.make.common import ONCE, Script, parse
 from sim.spaces.registry import get_space
 
 SEED, EPISODES = 9, 200_000
@@ -28,9 +28,9 @@ PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12}
 SETTLED = {"settling": 1}
 FEW_EMITTERS = {"emitters": 20, "groups": 4}
 DESIGNS: dict[str, dict[str, Any]] = {
-    "once": {},
-    "10 episodes": {"replicas": 10, "batch_size": 40, "candidates": 10},
-    "5 episodes": {"replicas": 5, "batch_size": 80, "candidates": 8},
+    "once": ONCE,
+    "10 episodes": {**ONCE, "replicas": 10, "batch_size": 40, "candidates": 10},
+    "5 episodes": {**ONCE, "replicas": 5, "batch_size": 80, "candidates": 8},
     "threes, half again": THREES,
     "threes, half again, settled": {**THREES, **SETTLED},
     "threes, quarter again": {**THREES, "batch_size": 100, "again": 33},
@@ -63,12 +63,14 @@ DESIGNS: dict[str, dict[str, Any]] = {
 }
 """Settings of preset wide that each design changes."""
 FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled")
-SEARCHES = {name: (name, SEED, EPISODES) for name in DESIGNS} | {
-    f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS
-} | {
-    f"{name}, seed 0": (name, 0, FINAL_EPISODES)
-    for name in ("threes, 20 emitters", "pairs, 20 emitters", "pairs, 20 emitters, settled")
-}
+SEARCHES = (
+    {name: (name, SEED, EPISODES) for name in DESIGNS}
+    | {f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS}
+    | {
+        f"{name}, seed 0": (name, 0, FINAL_EPISODES)
+        for name in ("threes, 20 emitters", "pairs, 20 emitters", "pairs, 20 emitters, settled")
+    }
+)
 """Design, seed and episodes of each search."""
 
 

@@ -36,7 +36,7 @@ from qd.workers.cross import Crossings
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator
 from results.make.agreement import compare, cross_in_all_ways
 from results.make.bare import bare_rates, kernel_shares, standing_rates
-from results.make.common import Script, parse
+from results.make.common import ONCE, Script, parse
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.spaces.registry import SUPER_GAUSSIAN, load_space
@@ -102,7 +102,7 @@ def time_wide(script: Script) -> dict[str, Any]:
     """Iterations of preset wide by method, and what the paper's four million episodes take by them."""
     numbers = {}
     for method in WIDE:
-        cfg = script.search_cfg(method=method)
+        cfg = script.search_cfg(method=method, **({} if method == "surrogate" else ONCE))
         with remembering() as asked:
             metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
         seconds = float(np.median([row["wall_s"] for row in metrics]))
@@ -132,9 +132,12 @@ def remembering() -> Iterator[list[NDArray[np.float32]]]:
 
 
 def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]]) -> list[float]:
-    """Seconds of each iteration after the first two, of a search's crossings without the search; lots are equal."""
+    """Seconds of each iteration after the first two, of a search's crossings without the search.
+
+    Lots of the first iteration are left out, in which nothing can be crossed again; later ones are equal.
+    """
     num_groups, num_terrains = cfg.scheduler.num_groups, cfg.scheduler.num_terrains
-    iterations = range(1, len(lots) // num_groups + 1)
+    iterations, lots = range(2, len(lots) // num_groups + 1), lots[num_groups:]
     seeds = np.concatenate([episode_seeds(cfg.seed, iteration, num_terrains) for iteration in iterations])
     evaluator = EvaluatorCfg(
         robot=script.robot, policy=script.policy, num_terrains=num_terrains, num_replicas=cfg.replicas,
@@ -142,7 +145,7 @@ def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]])
     )  # fmt: skip
     with open_evaluator(evaluator) as pipeline:
         lots_ended = [time.perf_counter() for _ in pipeline.in_lots(np.concatenate(lots), seeds, len(lots[0]))]
-    return np.diff(lots_ended[num_groups - 1 :: num_groups])[WARM_UP - 1 :].tolist()
+    return np.diff(lots_ended[num_groups - 1 :: num_groups])[WARM_UP - 2 :].tolist()
 
 
 def time_curve(script: Script) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The paper's tables: controllers trained on three kinds of terrains, on terrains they have not seen: tables.json.
 
 C-HC trains on hand-crafted terrains, C-HR on hard-random ones too, C-G on elites of the published archive too; three
-seeds each, of which the first is published as a file. tables.npz has the goal rate of every terrain.
+seeds each, of which the first is published as a file. tables.npz has the goal rate of every terrain. The same of one
+seed at the paper's sizes is tables_paper_sizes.json.
 """
 
 import itertools
@@ -19,28 +20,31 @@ from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
 from results.make.common import SEEDS, Script, crossing_rates, parse, published_controllers
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
-from train.cfg import FinetuneCfg, RunCfg
+from train.cfg import LARGE, FinetuneCfg, RunCfg
 from train.finetune import finetune
 
 MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
 RESAMPLES = 10_000
 
 
-TRAININGS = {f"{name}-{seed}": (name, seed) for name in MIXES for seed in SEEDS}
-"""Kind and seed of each."""
+SIZES: dict[str, dict[str, int]] = {"tables": {**LARGE, "iterations": 1200}, "tables_paper_sizes": {}}
+"""Robots, terrains at a time and iterations by the file that they are of; the paper's are the default."""
+TRAININGS = {f"tables: {name}-{seed}": ("tables", name, seed) for name in MIXES for seed in SEEDS}
+TRAININGS |= {f"tables_paper_sizes: {name}": ("tables_paper_sizes", name, SEEDS[0]) for name in MIXES}
+"""File, kind and seed of each."""
 
 
-def train_controllers(script: Script, trainings: Sequence[str] = tuple(TRAININGS)) -> dict[str, str]:
-    """Trains each kind with each seed; returns the files by name, those of further seeds as C-G@1."""
+def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str]:
+    """Trains kinds with seeds of one file; returns the files by name, those of further seeds as C-G@1."""
     controllers, options = {}, RunCfg(device=script.device)
     for training in trainings:
-        name, seed = TRAININGS[training]
-        cfg = replace(FinetuneCfg.of(script.robot), mix=MIXES[name], seed=seed)
+        file, name, seed = TRAININGS[training]
+        cfg = replace(FinetuneCfg.of(script.robot), mix=MIXES[name], seed=seed, **SIZES[file])
         if cfg.mix == "generated":
             cfg = replace(cfg, archive=(str(script.results / "archive"),))
-        policy = finetune(script.robot, cfg, script.runs / "tables" / training, options)
+        policy = finetune(script.robot, cfg, script.runs / file / f"{name}-{seed}", options)
         controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = str(policy)
-        if seed == SEEDS[0]:
+        if (file, seed) == ("tables", SEEDS[0]):
             shutil.copyfile(policy, script.results / f"{name}.pt")
     return controllers
 
@@ -96,12 +100,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     if script.parts:
         train_controllers(script, script.parts)
         return
-    controllers = published_controllers(script)
+    published = published_controllers(script)
     if script.small:
-        controllers = {name: controllers[name] for name in ("base", "C-G")}
-    else:
-        hardened = {name: file for name, file in controllers.items() if name == "hardened"}
-        controllers = {"base": controllers["base"], **train_controllers(script), **hardened}
+        write_tables(script, {name: published[name] for name in ("base", "C-G")})
+        return
+    for file in SIZES:
+        trainings = [training for training, (of_file, *_) in TRAININGS.items() if of_file == file]
+        controllers = {"base": script.policy, **train_controllers(script, trainings)}
+        if file == "tables" and "hardened" in published:
+            controllers["hardened"] = published["hardened"]
+        write_tables(replace(script, out=script.out.with_stem(file)), controllers)
+
+
+def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
+    """Evaluates controllers on all sets, and writes the file and the rates of its terrains."""
     terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
     cfg = SetsCfg(
         sets=("hard_random", "generated") if script.small else (),

@@ -1,0 +1,80 @@
+"""Which recipe fine-tunes best: recipes.json. C-HC, C-HR and C-G are trained by each, at the sizes of tables.json.
+
+As in the paper one recipe serves all three. It is chosen by their mean goal rate on validation terrains, of which no
+other number is made.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from qd.evaluate.evaluate import cross_sets
+from qd.evaluate.sets import generated_set, paper_terrains, plain_set
+from results.make.common import Script, crossing_rates, parse
+from results.make.tables import MIXES, SIZES
+from train.cfg import FinetuneCfg, RunCfg
+from train.finetune import finetune
+from train.ppo.cfg import PpoCfg
+from train.task.cfg import TaskCfg
+
+RECIPES = ("today's", "rewards of the base", "the base's own")
+
+
+def recipe_of(script: Script, name: str) -> FinetuneCfg:
+    """A fine-tuning by a recipe: today's, today's with the rewards of the base's training, or wholly as the base."""
+    cfg = FinetuneCfg.of(script.robot)
+    if name == "today's":
+        return cfg
+    task = TaskCfg.of(script.robot, crosses=True, start_spread=cfg.task.start_spread)
+    if name == "rewards of the base":
+        return replace(cfg, task=task)
+    return replace(cfg, task=task, ppo=replace(PpoCfg.of(script.robot), steps_per_env=cfg.ppo.steps_per_env))
+
+
+TRAININGS = {f"{recipe}: {kind}": (recipe, kind) for recipe in RECIPES for kind in MIXES}
+
+
+def train(script: Script, training: str) -> str:
+    """File of the controller that a recipe makes of a kind."""
+    recipe, kind = TRAININGS[training]
+    cfg = replace(recipe_of(script, recipe), mix=MIXES[kind], seed=script.seed)
+    if cfg.mix == "generated":
+        cfg = replace(cfg, archive=(str(script.results / "archive"),))
+    cfg = replace(cfg, **({"num_envs": 4, "terrains": 4, "iterations": 1} if script.small else SIZES["tables"]))
+    run = script.runs / "recipes" / f"{RECIPES.index(recipe)}-{kind}"
+    return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Trains and evaluates on validation terrains; parts are trainings alone, a trial has one."""
+    script = parse(__doc__, argv, "recipes.json", parts=tuple(TRAININGS))
+    names = script.parts or (list(TRAININGS)[-1:] if script.small else tuple(TRAININGS))
+    controllers = {name: train(script, name) for name in names}
+    if script.parts:
+        return {}
+    terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
+    sets = {name: plain_set(name, terrains, script.seed, part="validation") for name in ("hand_crafted", "hard_random")}
+    sets["generated"] = generated_set(script.read_archive(), terrains, script.seed, "validation")
+    crossed = cross_sets(
+        {"base": script.policy, **controllers}, sets, robot=script.robot, compute=script.compute, episodes=episodes,
+        cache=script.runs / "crossings",
+    )  # fmt: skip
+    goal = {
+        controller: {
+            name: float(np.nanmean(crossing_rates(crossed[name][controller].outcome, "goal"))) for name in sets
+        }
+        for controller in ("base", *controllers)
+    }
+    score = {
+        recipe: float(np.mean([[*goal[name].values()] for name in controllers if TRAININGS[name][0] == recipe]))
+        for recipe in dict.fromkeys(TRAININGS[name][0] for name in controllers)
+    }
+    return script.write(
+        {"score": score, "goal": goal, "terrains": {name: len(of_set) for name, of_set in sets.items()}}
+    )
+
+
+if __name__ == "__main__":
+    main()
