@@ -1,9 +1,11 @@
 """What breaks the controller under conditions and terrain alone does not, and the dose beside it: conditions.json.
 
 Terrains and conditions are searched together. Then the terrains of the elites that fail are crossed under nominal
-conditions, and without each kind of condition alone.
+conditions, and without each kind of condition alone. Some that need one kind alone are taken apart. The archive is
+published in results/<robot>/conditions.
 """
 
+import shutil
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +16,7 @@ from qd.archive import Archive, goal_rates
 from qd.faults import EPISODES
 from qd.fitness import FAILING_GOAL_RATE
 from qd.judge import elite_seeds, judge, outcome_counts
+from qd.minimise import minimise
 from qd.run.directory import RunDirectory
 from qd.search import search
 from qd.workers.cross import Crossings
@@ -25,7 +28,9 @@ from sim.spaces.registry import get_space
 
 EPISODES_SEARCHED = 400_000
 _STREAM = 2000
-_EXAMPLES = 10
+_EXAMPLES = 2
+"""Of each kind of condition."""
+_PUBLISHED = ("archive.npz", "archive.json", "config.json", "minimal.npz", "minimal.json")
 
 
 def search_under_conditions(script: Script) -> tuple[Archive, dict[str, Any]]:
@@ -60,6 +65,10 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
         cured = rows[nominal]
         needed = {kind: passes(cured, [number], f"without {kind}") for number, kind in enumerate(KINDS)}
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
+    examples = examples_of(archive, cured, needed)
+    minima = None
+    if examples and not script.small:
+        minima = minimise(run, compute=script.compute, elite=" ".join(map(str, examples)))
     return {
         "failing": len(rows),
         "nominal_passes": len(cured),
@@ -69,14 +78,26 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
         "needs_no_single_one": int((alone == 0).sum()),
         "examples": [
             {
-                "elite": int(row),
-                "goal_rate": float(archive.fresh.goal_rate[row]) if archive.fresh else None,
-                "conditions": space.condition_words(archive.genes[row]),
-                "needed": [kind for kind in KINDS if needed[kind][place]],
+                "elite": number,
+                "needs": kind,
+                "fault": bool(archive.is_fault[number]),
+                "conditions": space.condition_words(archive.genes[number]),
+                "minimal": minima.words(number) if minima else None,
             }
-            for place, row in enumerate(cured[:_EXAMPLES])
+            for number, kind in examples.items()
         ],
     }
+
+
+def examples_of(archive: Archive, cured: NDArray[np.int64], needed: dict[str, NDArray[np.bool_]]) -> dict[int, str]:
+    """Some elites of each kind that is the only one they need, faults first; by their numbers."""
+    single = np.sum([*needed.values()], axis=0) == 1
+    examples = {}
+    for kind, of_kind in needed.items():
+        numbers = cured[single & of_kind]
+        for number in numbers[np.argsort(~archive.is_fault[numbers], kind="stable")][:_EXAMPLES].tolist():
+            examples[number] = kind
+    return examples
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -84,6 +105,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     script = parse(__doc__, argv, "conditions.json")
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
+    for name in _PUBLISHED:
+        if (file := script.runs / "conditions" / name).exists():
+            target = script.out.parent / "conditions" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
     file = script.out.with_name("dose.json")
     dose = [row for row in read_made(file).get("dose", []) if row["parameter"] in KINDS]
     return script.write(
