@@ -156,13 +156,12 @@ def methods(robot: str) -> str:
     return table(named, {name.replace("_", " "): name for name in names})
 
 
-def noise(file: str = "search_noise") -> str:
-    """Designs of a search under noise, those of the most episodes: means over their seeds."""
+def noise() -> str:
+    """Designs of a search under noise: means over their seeds."""
     rows = {
         f"{words}, {design}": mean_of(rows)
         for robot, words in ROBOTS.items()
-        for design, rows in searches_of(robot, file).items()
-        if len(rows) > 1
+        for design, rows in searches_of(robot).items()
     }
     columns: dict[str, Column] = {name.replace("_", " "): name for name in NOISE_COUNTS}
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
@@ -173,13 +172,13 @@ def noise(file: str = "search_noise") -> str:
 NOISE_COUNTS = ("elites", "corrected_elites", "failing", "families")
 
 
-def searches_of(robot: str, file: str) -> dict[str, list[Any]]:
-    """Rows of searches under noise by design, those of the most episodes."""
-    searches, rows = dict[str, list[Any]](), read(f"results/{robot}/{file}.json").get("rows", ())
-    for row in rows:
-        if row["episodes"] > 0.9 * max(other["episodes"] for other in rows):
+def searches_of(robot: str) -> dict[str, list[Any]]:
+    """Rows of searches under noise by design, those that have several seeds."""
+    searches = dict[str, list[Any]]()
+    for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
+        if row["search"].endswith(f"seed {row['seed']}"):
             searches.setdefault(row["design"], []).append(row)
-    return searches
+    return {design: rows for design, rows in searches.items() if len(rows) > 1}
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:

@@ -1,7 +1,8 @@
-"""The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures [film] [pages]``.
+"""The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures [film] [pages] [curves]``.
 
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
-robots' controllers of the day cross them. ``pages`` takes the pictures of the viewer and of the report.
+robots' controllers of the day cross them. ``pages`` takes the pictures of the viewer and of the report. ``curves``
+draws what the published files say of searches.
 """
 
 import subprocess
@@ -9,10 +10,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
 from qd.judge import controllers_in
 from qd.show.crossed import title_of, typical_episode
+from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import save, source_of_map
+from results.make.docs import PAPER_ARCHIVES, ROBOTS, read
+from sim.files.figures import new_figure
 from sim.robots.find import get_robot
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
@@ -31,12 +37,53 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     return [*pictures_of(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
 
 
+def draw_noise() -> Figure:
+    """Searches under noise: corrected elites against the share of elites that is in its cell again."""
+    figure = new_figure(10.5, 4.2)
+    for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
+        axes.set(title=words, xlabel="share of elites in their cell again", ylabel="corrected elites")
+        rows = read(f"results/{robot}/search_noise.json")["rows"]
+        searches, short = dict[str, list[tuple[float, float]]](), "other designs, half as long"
+        for row in rows:
+            place = row["elites_same_cell"] / row["elites"], row["corrected_elites"]
+            name = short if row["search"] == row["design"] else row["search"].partition(", seed")[0]
+            searches.setdefault(name, []).append(place)
+        for name, places in searches.items():
+            mark = {"color": "0.6", "marker": "."} if name == short else {"marker": "o"}
+            axes.plot(*zip(*places, strict=True), linestyle="", label=name, **mark)
+        axes.legend(fontsize=7)
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def draw_growth() -> Figure:
+    """The published searches: corrected and failing elites over their episodes, by the paper's method too."""
+    figure = new_figure(10.5, 4.2)
+    for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
+        axes.set(title=words, xlabel="episodes", ylabel="elites", xscale="log")
+        for name, label in {"archive": "default", "archive_cma_mae": "CMA-MAE"}.items():
+            rows = read(f"results/{robot}/{name}/curve.json").get("curve", ())
+            for count, style in {"corrected_elites": "-", "failing": "--"}.items():
+                axes.plot(
+                    [row["episodes"] for row in rows], [row[count] for row in rows], style, marker=".",
+                    color="C0" if name == "archive" else "C1", label=f"{label}: {count.replace('_', ' ')}",
+                )  # fmt: skip
+        axes.axhline(PAPER_ARCHIVES[robot]["elites"], color="0.5", label="the paper's elites, as found")
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    return figure
+
+
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
-    wanted = sys.argv[1:] or ["film", "pages"]
+    wanted = sys.argv[1:] or ["film", "pages", "curves"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
+    if "curves" in wanted:
+        save_figure(FOLDER / "noise.png", draw_noise())
+        if read("results/anymal/archive/curve.json"):
+            save_figure(FOLDER / "growth.png", draw_growth())
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.screenshots"], check=True)
 

@@ -1,6 +1,7 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
-Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds. Then all elites cross
+Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds, and some in a million.
+Then all elites cross
 two lots of 40 fresh episodes. The share that both put into one cell is what no search could exceed with these elites.
 """
 
@@ -25,6 +26,7 @@ SEED, EPISODES = 9, 200_000
 FINAL_SEEDS, FINAL_EPISODES = (0, 1, 2), 400_000
 THREES = {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12}
 PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12}
+SINGLES = {"replicas": 1, "batch_size": 220, "again": 180, "candidates": 6}
 SETTLED = {"settling": 1}
 FEW_EMITTERS = {"emitters": 20, "groups": 4}
 DESIGNS: dict[str, dict[str, Any]] = {
@@ -37,7 +39,7 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "pairs, half again": PAIRS,
     "pairs, half again, settled": {**PAIRS, **SETTLED},
     "pairs, quarter again": {**PAIRS, "batch_size": 150, "again": 50},
-    "singles, half again": {**PAIRS, "replicas": 1, "batch_size": 220, "again": 180, "candidates": 6},
+    "singles, half again": SINGLES,
     "threes, half again, fewer candidates": {**THREES, "candidates": 6},
     "threes, half again, learn longer": {**THREES, "training_steps": 1000},
     "threes, more again": {**THREES, "batch_size": 50, "again": 83},
@@ -60,9 +62,14 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "pairs, iso sigma .01": {**PAIRS, "iso_sigma": 0.01},
     "pairs, line sigma .4": {**PAIRS, "line_sigma": 0.4},
     "pairs, crossover .6": {**PAIRS, "crossover_share": 0.6},
+    "threes, crossover .6": {**THREES, "crossover_share": 0.6},
+    "singles, crossover .6": {**SINGLES, "crossover_share": 0.6},
+    "singles, quarter again": {**SINGLES, "batch_size": 300, "again": 100},
+    "singles, more again": {**SINGLES, "batch_size": 160, "again": 240},
 }
 """Settings of preset wide that each design changes."""
-FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled")
+FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled", "singles, half again")
+LONG = ("threes, half again", "pairs, half again", "singles, half again", "threes, 40 emitters")
 SEARCHES = (
     {name: (name, SEED, EPISODES) for name in DESIGNS}
     | {f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS}
@@ -70,6 +77,7 @@ SEARCHES = (
         f"{name}, seed 0": (name, 0, FINAL_EPISODES)
         for name in ("threes, 20 emitters", "pairs, 20 emitters", "pairs, 20 emitters, settled")
     }
+    | {f"{name}, a million": (name, 0, 1_000_000) for name in LONG}
 )
 """Design, seed and episodes of each search."""
 
