@@ -19,17 +19,15 @@ from train.finetune import finetune
 from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
 
-RECIPES = ("today's", "rewards of the base", "the base's own")
+RECIPES = ("today's", "the base's own")
 
 
 def recipe_of(script: Script, name: str) -> FinetuneCfg:
-    """A fine-tuning by a recipe: today's, today's with the rewards of the base's training, or wholly as the base."""
+    """A fine-tuning by a recipe: today's, or with rewards and learner of the base's training."""
     cfg = FinetuneCfg.of(script.robot)
     if name == "today's":
         return cfg
     task = TaskCfg.of(script.robot, crosses=True, start_spread=cfg.task.start_spread)
-    if name == "rewards of the base":
-        return replace(cfg, task=task)
     return replace(cfg, task=task, ppo=replace(PpoCfg.of(script.robot), steps_per_env=cfg.ppo.steps_per_env))
 
 
