@@ -214,6 +214,34 @@ def hardening() -> str:
     return table(rows, columns)
 
 
+def searched_again() -> str:
+    """What further searches find of the base, the hardened controller and one of as many steps: least to most."""
+    rows = {}
+    for words, numbers in of_robots("results/{}/rounds.json").items():
+        for name, label in {"base_searches": "base", "searches": "hardened", "at_once_searches": "at once"}.items():
+            found = numbers.get(name) or ()
+            rows |= {f"{words}: {label} ({len(found)})": found} if found else {}
+
+    def spread(count: str) -> Callable[[Any], str]:
+        return lambda found: " to ".join(f"{end(row[count] for row in found):,}" for end in (min, max))
+
+    counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel", "fault_families")
+    return table(rows, {count.replace("_", " "): spread(count) for count in counts})
+
+
+def growth() -> str:
+    """What the published searches have found after so many episodes."""
+    rows = {
+        f"{words}, {label}, {row['episodes']:,}": row
+        for robot, words in ROBOTS.items()
+        for name, label in {"archive": "seed 0", "independent": "seed 1", "third": "seed 2",
+                            "archive_cma_mae": "CMA-MAE"}.items()
+        for row in read(f"results/{robot}/{name}/curve.json").get("curve", ())
+    }  # fmt: skip
+    counts = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
+    return table(rows, {count.replace("_", " "): count for count in counts})
+
+
 def spaces() -> str:
     """Searches in different terrain spaces."""
     rows = {f"{words}, {one['space']}": one for words, numbers in of_robots("results/{}/spaces.json").items()
@@ -380,7 +408,7 @@ def kernels() -> str:
 
 
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
-    archives, training, goals, beside_paper, methods, hardening, spaces, sizes, agreement,
+    archives, growth, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement,
     minimal, packs, public_controllers, speed, kernels, noise, conditions)}  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """Rounds of hardening, and how much the count of faults differs between searches of one controller: rounds.json.
 
 The base and the last controller are searched twice more, each time with a specialist of its own. The last controller is
-published as results/<robot>/hardened.pt.
+published as results/<robot>/hardened.pt. Beside it one training on the published archive alone, of as many steps as
+all rounds together, is searched as often.
 """
 
 import shutil
@@ -13,13 +14,16 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse
-from train.cfg import HardenCfg
+from train.cfg import LARGE, HardenCfg, RunCfg
+from train.finetune import finetune
 from train.harden import harden
 
 COUNTS = (
     "episodes", "elites", "corrected_elites", "families", "failing", "confirmed", "certified", "faults", "faults_panel",
     "faults_unseen", "fault_families",
 )  # fmt: skip
+
+PARTS = ("hardening", "base", "at_once")
 
 
 def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
@@ -37,19 +41,33 @@ def search_again(script: Script, name: str, policy: Path | None, seed: int) -> d
     return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
 
 
+def train_at_once(script: Script, cfg: HardenCfg) -> Path:
+    """A controller that has the steps of all rounds in one training, on the published archive."""
+    tune = cfg.tune.sized(script.robot, script.device, **({} if script.robot.name == "cassie" else LARGE))
+    tune = replace(
+        tune, seed=script.seed, archive=(str(script.results / "archive"),), iterations=cfg.rounds * tune.iterations
+    )
+    return finetune(script.robot, tune, script.runs / "at_once", RunCfg(device=script.device))
+
+
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends again; a trial is one tiny round alone.
 
-    Parts are the hardening with the searches of its last controller, and those of the base.
+    Parts are the hardening with the searches of its last controller, those of the base, and the one training.
     """
-    script = parse(__doc__, argv, "rounds.json", parts=("hardening", "base"))
-    seeds = () if script.small else (1000, 1001)  # far from those of the rounds
-    if "base" in script.parts:
-        searches = [search_again(script, "base", None, seed) for seed in seeds]
-        if script.parts == ("base",):
-            return {"searches": searches}
-    run = script.runs / "hardening"
+    script = parse(__doc__, argv, "rounds.json", parts=PARTS)
+    seeds = () if script.small else (1000, 1001, 1002)  # far from those of the rounds
+    parts = script.parts or PARTS
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
+    searches = dict[str, list[dict[str, Any]]]()
+    if "base" in parts:
+        searches["base"] = [search_again(script, "base", None, seed) for seed in seeds]
+    if "at_once" in parts and not script.small:
+        policy = train_at_once(script, cfg)
+        searches["at_once"] = [search_again(script, "at_once", policy, seed) for seed in seeds]
+    if "hardening" not in parts:
+        return searches
+    run = script.runs / "hardening"
     if script.small:
         cfg = replace(
             cfg, rounds=1, search=replace(cfg.search, episodes=16),
@@ -57,17 +75,21 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
         )  # fmt: skip
     hardening = harden(script.robot, cfg, run, script.compute, certifiers={} if script.small else None)
-    rounds, policy = hardening["rounds"], last_policy(hardening["rounds"], run)
-    ends = {"last": (-1, policy)} if script.parts else {"last": (-1, policy), "base": (0, None)}
-    again = {
-        name: [rounds[place], *(search_again(script, name, file, seed) for seed in seeds)]
-        for name, (place, file) in ends.items()
-    }
+    policy = last_policy(hardening["rounds"], run)
+    searches["last"] = [search_again(script, "last", policy, seed) for seed in seeds]
     if script.parts:
-        return again
+        return searches
     if policy is not None and not script.small:
         shutil.copyfile(policy, script.results / "hardened.pt")
-    return script.write({**hardening, "seed": script.seed, "searches": again["last"], "base_searches": again["base"]})
+    return script.write(
+        {
+            **hardening,
+            "seed": script.seed,
+            "searches": searches["last"],
+            "base_searches": searches["base"],
+            "at_once_searches": searches.get("at_once", []),
+        }
+    )
 
 
 if __name__ == "__main__":
