@@ -85,7 +85,7 @@ class TerrainBank:
         assert self.ground is not None
         self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
 
-    def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
+    def _maps_of(self, slots: slice, *, wanted: bool) -> Ground | None:
         """The maps of some slots, None of a bank without any."""
         if self.ground is None:
             if wanted:
@@ -93,7 +93,6 @@ class TerrainBank:
             return None
         maps = Ground()
         maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
-        maps.factor = self.ground.factor[slots]
         return maps
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:

@@ -15,6 +15,7 @@ from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay
 from kernels.episode import Episodes
 from kernels.ground import Ground
 from kernels.observation import Sensors
+from kernels.penalties import BASE, FOOT, LIMB
 from kernels.restart import clear_rows
 from kernels.state import make_zeros
 from sim.bank import TerrainBank
@@ -63,13 +64,8 @@ class Simulation:
     ) -> None:
         """Build the model on the bank's device.
 
-        Args:
-            robot: Robot settings.
-            bank: Terrains.
-            terrain_of_env: Terrain of each environment, integers of shape (num_envs,).
-            friction: Coulomb friction of each robot, shape (num_envs,); the file's where None.
-            added_base_mass: Mass added to each base [kg], shape (num_envs,).
-            cfg: Solver options.
+        Of shape (num_envs,) are the terrain of each environment, the Coulomb friction of each robot, the file's where
+        None, and the mass added to each base [kg].
         """
         if terrain_of_env.min() < 0 or terrain_of_env.max() >= bank.num_terrains:
             raise ValueError(
@@ -163,10 +159,11 @@ class Simulation:
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
         self.parked = wp.zeros(self.num_envs, dtype=int)
         # A mesh of several parts is several shapes of one name.
-        names = self.robot.geom_names
+        robot, names = self.robot, self.robot.geom_names
         columns = [names.index(name) if name in names else -1 for name in builder.shape_label]
         self.column_of_shape = wp.array(columns, dtype=int)
-        self.geom_role = wp.array([self.robot.role_of(name) for name in names], dtype=int)
+        roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
+        self.geom_role = wp.array(roles, dtype=int)
         ground = int(geom_of_shape[np.flatnonzero(shape_body < 0)[0]])
         model, data = self.solver.mjw_model, self.solver.mjw_data
         self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, ground)
@@ -182,7 +179,6 @@ class Simulation:
         self.geom_force = wp.zeros((self.num_envs, len(self.robot.geom_names)), dtype=wp.vec3)
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
-        self.geom_names = self.robot.geom_names
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()

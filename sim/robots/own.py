@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import warp as wp
 
@@ -17,7 +16,7 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import from_builtins, problems, read_toml, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, read_robot_file
+from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import extents, make_probes, start_height
@@ -145,9 +144,9 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
     """Half length and half width of the rectangle about the base that holds the feet in the default pose [m]."""
-    data: Any = mujoco.MjData(model)  # type: ignore
+    data = mj.MjData(model)
     data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), pose
-    mujoco.mj_kinematics(model, data)  # type: ignore
+    mj.mj_kinematics(model, data)
     numbers = [k for k in range(model.ngeom) if model.geom(k).name in feet]
     reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
     return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
