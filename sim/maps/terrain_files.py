@@ -21,7 +21,7 @@ from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
-from sim.maps.hfield import LEAST_EXTENT, as_hfield, surface_of
+from sim.maps.hfield import LEAST_EXTENT, QUARTER_TURN, as_hfield, surface_of
 from sim.terrain import SPACING
 
 STEP_M = 1e-3
@@ -124,7 +124,7 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", name="sun", directional="true", pos="8 4 10", dir="0.3 0.4 -1", diffuse="0.8 0.8 0.8")
     shape = {"type": "hfield", "hfield": "terrain", "friction": str(GROUND_FRICTION), "rgba": "0.7 0.66 0.6 1"}
-    shape |= {"pos": _words(field.position), "quat": _words(field.quaternion)}
+    shape |= {"pos": _words(field.position), "quat": _words(QUARTER_TURN)}
     ET.SubElement(world, "geom", {"name": "terrain", **shape})
     for name, place, color in (("start", CrossingCfg.start, "1 1 1 1"), ("goal", CrossingCfg.goal, "0 0.62 0.45 1")):
         position = _words(terrain.on_ground(*place))

@@ -18,7 +18,7 @@ from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
-from sim.maps.hfield import Margins, as_hfield
+from sim.maps.hfield import QUARTER_TURN, Margins, as_hfield
 from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
@@ -123,7 +123,7 @@ def _add_field(
     spec.add_hfield(name=name, nrow=rows, ncol=columns, size=field.size, userdata=field.data.ravel())
     x, y, z = field.position
     _add_geom(spec, name, (x + low[0], y + low[1], z), type=mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
-              quat=field.quaternion)  # fmt: skip
+              quat=QUARTER_TURN)  # fmt: skip
 
 
 def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **looks: Any) -> None:

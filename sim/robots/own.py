@@ -113,8 +113,8 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
     point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
     the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
-    ``file``, the robot.toml; a controller.toml beside it says the scan. ``given`` has one value a joint where a setting
-    is of joints.
+    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it. ``given`` has
+    one value a joint where a setting is of joints.
     """
     model = of_file.model
     low, high = model.jnt_range[1:].T
@@ -139,7 +139,10 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
     found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))
-    return _scan(file.with_name("controller.toml")) | found
+    controller = file.with_name("controller.toml")
+    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
+    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
+    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"} | found
 
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
@@ -150,13 +153,6 @@ def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[f
     numbers = [k for k in range(model.ngeom) if model.geom(k).name in feet]
     reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
     return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
-
-
-def _scan(controller: Path) -> dict[str, Any]:
-    """Points of the height scan: those of the first one in a controller's observation, or none."""
-    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
-    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
-    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"}
 
 
 def describe_inferred(robot: RobotCfg) -> str:

@@ -156,10 +156,8 @@ class Dose:
         """Terrains of all values, ``count`` each: those of the first place, value by value, then those of the next.
 
         An obstacle begins at ``count`` places that are spread evenly over 1 m. A cross slope leans to a side that is
-        drawn for each place, rubble is another one at each. All else is the same, and equal for all values.
-
-        Returns:
-            Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
+        drawn for each place, rubble is another one at each. All else is the same, and equal for all values. What comes
+        are heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
         """
         if self.kind is None:
             return np.tile(self._level(), (count, 1))
