@@ -170,7 +170,12 @@ class Dose:
         for name, value in {**self.others, self.parameter: np.array(self.values)}.items():
             quantity = self.quantities[name]
             elements[quantity.field] = np.rint(value / SPACING) if quantity.cells else value
-        return _heights_of(elements.reshape(-1))
+        with wp.ScopedDevice(host_device()):  # each alone on flat ground, before x = 12 m
+            laid: Any = wp.array(elements.reshape(-1, 1), dtype=Element)
+            course.place(laid)
+            heights: Any = wp.empty((len(laid), NUM_ROWS, NUM_COLS), dtype=float)
+            course.rasterise_elements(laid, heights)
+            return np.array(heights.numpy(), np.float32)
 
     def _turns(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         if self.kind is Kind.CROSS_SLOPE:
@@ -193,16 +198,6 @@ class Dose:
         maps = genes[:, SUPER_GAUSSIAN.num_genes :].reshape(len(genes), len(GROUND_KINDS), -1)
         maps[:, GROUND_KINDS.index(self.parameter)] = gene_of(self.parameter, np.array(self.values))[:, None]
         return genes
-
-
-def _heights_of(elements: Any) -> NDArray[np.float32]:
-    """Heights [m] of records of :class:`kernels.course.Element`, each alone on flat ground, before x = 12 m."""
-    with wp.ScopedDevice(host_device()):
-        laid: Any = wp.array(elements[:, None], dtype=Element)
-        course.place(laid)
-        heights: Any = wp.empty((len(elements), NUM_ROWS, NUM_COLS), dtype=float)
-        course.rasterise_elements(laid, heights)
-        return np.array(heights.numpy(), np.float32)
 
 
 _LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)
