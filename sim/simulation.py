@@ -171,11 +171,10 @@ class Simulation:
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
         self._state = model.state()
-        self._control = model.control()
         self.body_q = self._state.body_q.reshape((self.num_envs, -1))
         self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
         self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
-        self.targets = self._control.joint_target_q.reshape((self.num_envs, 7 + num_joints))
+        self.targets = wp.zeros((self.num_envs, 7 + num_joints), dtype=float)
         self.geom_force = wp.zeros((self.num_envs, len(self.robot.geom_names)), dtype=wp.vec3)
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
@@ -235,12 +234,8 @@ class Simulation:
         for joint in range(1, model.joint_count // self.num_envs):  # the first is the base's
             columns[first_of[joint] - 7] = column_of[joint]
         of_solver = solver.mjc_body_to_newton.numpy()[0]
-        # Newton tells actuators what they follow. Targets that are their own numbers show which one that is.
-        self.targets.assign(np.tile(1.0 + np.arange(self.targets.shape[1], dtype=np.float32), (self.num_envs, 1)))
-        solver._apply_mjc_control(model, self._state, self._control, data)
-        followed = data.ctrl.numpy()[0].astype(np.int32) - 1
-        self.targets.zero_()
-        data.ctrl.zero_()
+        moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
+        followed = [7 + int(np.flatnonzero(columns == column)[0]) for column in moved]
         coordinates = SolverState()
         for name in ("qpos", "qvel", "ctrl", "xpos", "xquat"):
             setattr(coordinates, name, getattr(data, name))
