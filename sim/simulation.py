@@ -104,8 +104,7 @@ class Simulation:
         model, bodies = self.model, self.model.body_count // self.num_envs
         if friction is not None:
             mu = model.shape_material_mu.numpy()
-            on_robot = model.shape_body.numpy() >= 0
-            mu[on_robot] = np.repeat(friction, on_robot.sum() // self.num_envs)
+            mu[1:] = np.repeat(friction, (len(mu) - 1) // self.num_envs)  # the first shape is the ground's
             model.shape_material_mu.assign(mu)
         if added_base_mass is not None:
             mass = model.body_mass.numpy()
@@ -152,9 +151,8 @@ class Simulation:
         self.solver.notify_model_changed(changed)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
-        shape_body, geom_of_shape = self.model.shape_body.numpy(), self.solver.newton_shape_to_mjc_geom.numpy()
-        first = int(np.flatnonzero(shape_body >= 0)[0])
-        self.geom_of_shape = geom_of_shape[first : first + builder.shape_count]
+        geoms = self.solver.newton_shape_to_mjc_geom.numpy()  # that of the ground, then those of each robot
+        self.geom_of_shape = geoms[1 : 1 + builder.shape_count]
         self.probes = make_probes(builder)
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
         self.parked = wp.zeros(self.num_envs, dtype=int)
@@ -164,9 +162,8 @@ class Simulation:
         self.column_of_shape = wp.array(columns, dtype=int)
         roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
         self.geom_role = wp.array(roles, dtype=int)
-        ground = int(geom_of_shape[np.flatnonzero(shape_body < 0)[0]])
         model, data = self.solver.mjw_model, self.solver.mjw_data
-        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, ground)
+        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
@@ -226,14 +223,9 @@ class Simulation:
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
-        model: Any = self.model
         solver: Any = self.solver
         data = solver.mjw_data
-        columns = np.full(self.robot.num_joints, -1, np.int32)
-        column_of, first_of = solver.mj_q_start.numpy(), model.joint_q_start.numpy()
-        for joint in range(1, model.joint_count // self.num_envs):  # the first is the base's
-            columns[first_of[joint] - 7] = column_of[joint]
-        of_solver = solver.mjc_body_to_newton.numpy()[0]
+        columns = solver.mj_q_start.numpy()[1 : 1 + self.robot.num_joints]  # the first is the base's
         moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
         followed = [7 + int(np.flatnonzero(columns == column)[0]) for column in moved]
         coordinates = SolverState()
@@ -241,9 +233,8 @@ class Simulation:
             setattr(coordinates, name, getattr(data, name))
         coordinates.column_of_joint = wp.array(columns, dtype=int)
         coordinates.target_of_actuator = wp.array(followed, dtype=int)
-        coordinates.column_of_body = wp.array(
-            [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.body_q.shape[1])], dtype=int
-        )
+        bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
+        coordinates.column_of_body = wp.array(bodies[-self.body_q.shape[1] :], dtype=int)
         coordinates.base_com = self.sensors.base_com
         return coordinates
 

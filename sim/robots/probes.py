@@ -268,8 +268,6 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     centres, radius, spread, body, shape, problems = [], [], [], [], [], []
     vec3: Any = wp.vec3
     for k in range(builder.shape_count):
-        if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
-            continue
         pose: Any = builder.shape_transform[k]
         try:
             strips = shape_strips(
