@@ -192,10 +192,10 @@ def collide_strips(
     wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=device)
 
 
-def make_contacts(num_envs: int, capacity: int, device: str | None = None) -> Contacts:
-    """Room for so many contacts of each robot."""
+def make_contacts(num_envs: int, capacity: int) -> Contacts:
+    """Room for so many contacts of each robot, on the current device."""
     fields = dict.fromkeys(Contacts.vars, (num_envs, capacity)) | {"count": (num_envs,)}
-    return make_zeros(Contacts, device, **fields)
+    return make_zeros(Contacts, None, **fields)
 
 
 @wp.kernel

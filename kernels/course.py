@@ -301,8 +301,7 @@ def _rasterise_elements_kernel(elements: wp.array2d[Element], factor: float, hei
 def lay_out(genes: Any) -> Any:
     """The elements of courses, in order: an array of :class:`Element`, shape (num_terrains, 6).
 
-    Args:
-        genes: Warp array, shape (num_terrains, 36); clipped to [-1, 1], six an element in the order of :data:`GENES`.
+    Genes, shape (num_terrains, 36), are clipped to [-1, 1], six an element in the order of :data:`GENES`.
     """
     num_genes = MAX_ELEMENTS * GENES_PER_ELEMENT
     if genes.ndim != 2 or genes.shape[1] != num_genes:
@@ -319,9 +318,8 @@ def lay_out(genes: Any) -> Any:
 def place(elements: Any) -> None:
     """Lay single elements of any size behind the nodes that they name, each on a course of its own, in place.
 
-    Args:
-        elements: Warp array of :class:`Element`, shape (num_terrains, 1), with kind, first, size, length, detail and
-            turn. One that does not fit before x = 12 m is cut, or becomes FLAT.
+    Of :class:`Element`, shape (num_terrains, 1), they have kind, first, size, length, detail and turn. One that does
+    not fit before x = 12 m is cut, or becomes FLAT.
     """
     wp.launch(_place_kernel, elements.shape, [elements], device=elements.device)
 
@@ -333,13 +331,10 @@ def rasterise_elements(elements: Any, heights_out: Any, factor: float = 1.0) -> 
 
 
 def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0) -> None:
-    """Rasterise one course a terrain.
+    """Rasterise one course a terrain, of genes as :func:`lay_out` takes them.
 
-    Args:
-        genes: As of :func:`lay_out`.
-        spacing: Distance of neighbouring grid nodes [m]: 0.05, in which elements are measured.
-        heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
-        factor: Of all heights.
+    Nodes are ``spacing`` [m] apart: 0.05, in which elements are measured. Heights [m] have shape (num_terrains, nrow,
+    ncol), row along y, column along x, and are times ``factor``.
     """
     if spacing != SPACING:
         raise ValueError(f"spacing must be {SPACING} m, got {spacing}: elements have whole numbers of such cells")

@@ -85,12 +85,9 @@ def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, factor: flo
 def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0, *origin: float) -> None:
     """Rasterise one Super-Gaussian mixture a terrain (equation 1; genes clipped to [-1, 1], rescaled by Table I).
 
-    Args:
-        genes: Warp array, shape (num_terrains, 8 * num_bumps); per bump in the order of :data:`PARAMETERS`.
-        spacing: Distance of neighbouring grid nodes [m].
-        heights_out: Warp array of heights [m], shape (num_terrains, nrow, ncol); row is y, col is x.
-        factor: Of all heights.
-        origin: x and y of the first node [m]; 0 if left out.
+    Genes have shape (num_terrains, 8 * num_bumps), per bump in the order of :data:`PARAMETERS`. Nodes are ``spacing``
+    [m] apart; ``origin`` is x and y of the first one [m], 0 if left out. Heights [m], shape (num_terrains, nrow, ncol),
+    row along y, column along x, are times ``factor``.
     """
     if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
         raise ValueError(

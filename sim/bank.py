@@ -64,52 +64,44 @@ class TerrainBank:
             raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
         if ground is not None and len(ground) != len(heights):
             raise ValueError(f"ground must be of {len(heights)} terrains, got {len(ground)}")
-        maps = self._maps_of(slots, wanted=ground is not None)
+        self._check_room(ground=ground is not None, conditions=ground is not None and ground.conditions is not None)
+        ground = ground or GroundMaps.plain(len(heights))
         replaced.assign(heights.astype(np.float32))
         max_blocks(replaced, self.terrain.ceilings[slots])
-        if maps is not None:
-            ground = ground or GroundMaps.plain(len(heights))
-            maps.friction.assign(np.float32(ground.friction))
-            maps.time_constant.assign(np.float32(ground.time_constant_s))
-        self._set_conditions(None if ground is None else ground.conditions, slots)
+        if self.ground is not None:
+            self.ground.friction[slots].assign(np.float32(ground.friction))
+            self.ground.time_constant[slots].assign(np.float32(ground.time_constant_s))
+        self._set_conditions(ground.rows, slots)
 
-    def _set_conditions(self, rows: np.ndarray | None, slots: slice) -> None:
-        """Conditions of the terrains of some slots, (number of slots, 12), nominal ones if None."""
-        if self.conditions is None:
-            if rows is not None:
-                raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
-            return
-        replaced = self.conditions[slots]
-        rows = np.tile(NOMINAL, (len(replaced), 1)) if rows is None else rows
-        replaced.assign(np.float32(rows))
-        assert self.ground is not None
-        self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
+    def _check_room(self, *, ground: bool, conditions: bool) -> None:
+        if ground and self.ground is None:
+            raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
+        if conditions and self.conditions is None:
+            raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
 
-    def _maps_of(self, slots: slice, *, wanted: bool) -> "Ground | None":
-        """The maps of some slots, None of a bank without any."""
-        if self.ground is None:
-            if wanted:
-                raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
-            return None
-        maps = Ground()
-        maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
-        maps.factor = self.ground.factor[slots]
-        return maps
+    def _set_conditions(self, rows: np.ndarray, slots: slice) -> None:
+        """Replace the conditions of some slots, (number of slots, 12), if the bank has any."""
+        if self.conditions is not None:
+            assert self.ground is not None
+            self.conditions[slots].assign(np.float32(rows))
+            self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
         """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
         valid, replaced = space.validate(genes), self.heights[slots]
         if len(valid) != len(replaced):
             raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
-        maps = self._maps_of(slots, wanted=bool(space.ground))
+        self._check_room(ground=bool(space.ground), conditions=bool(space.conditions))
         on_device = wp.array(valid, dtype=float, device=self.device)
         space.rasterise(on_device, SPACING, replaced)
         max_blocks(replaced, self.terrain.ceilings[slots])
-        if maps is not None:
+        if self.ground is not None:
+            maps = Ground()
+            maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
             maps.friction.fill_(1.0)
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
-        self._set_conditions(space.conditions_of(valid) if space.conditions else None, slots)
+        self._set_conditions(space.conditions_of(valid), slots)
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import Outcome
+
 MAX_INVALID_SHARE = 0.25
 """A terrain with more than this share of invalid episodes is invalid."""
 
@@ -24,8 +26,6 @@ def typical_outcome(outcome: NDArray[np.integer]) -> NDArray[np.int64]:
 
     Shape (...); ``INVALID`` where no episode is valid.
     """
-    from kernels.episode import Outcome  # which imports Warp: not for `--help`
-
     counts = (outcome[..., None] == np.arange(max(Outcome) + 1)).sum(axis=-2)
     valid = outcome.shape[-1] - counts[..., Outcome.INVALID]
     counts[..., Outcome.INVALID] *= valid == 0

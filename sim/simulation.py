@@ -15,6 +15,7 @@ from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay
 from kernels.episode import Episodes
 from kernels.ground import Ground
 from kernels.observation import Sensors
+from kernels.penalties import BASE, FOOT, LIMB
 from kernels.restart import clear_rows
 from kernels.state import make_zeros
 from sim.bank import TerrainBank
@@ -63,13 +64,8 @@ class Simulation:
     ) -> None:
         """Build the model on the bank's device.
 
-        Args:
-            robot: Robot settings.
-            bank: Terrains.
-            terrain_of_env: Terrain of each environment, integers of shape (num_envs,).
-            friction: Coulomb friction of each robot, shape (num_envs,); the file's where None.
-            added_base_mass: Mass added to each base [kg], shape (num_envs,).
-            cfg: Solver options.
+        Of shape (num_envs,) are the terrain of each environment, the Coulomb friction of each robot, the file's where
+        None, and the mass added to each base [kg].
         """
         if terrain_of_env.min() < 0 or terrain_of_env.max() >= bank.num_terrains:
             raise ValueError(
@@ -108,8 +104,7 @@ class Simulation:
         model, bodies = self.model, self.model.body_count // self.num_envs
         if friction is not None:
             mu = model.shape_material_mu.numpy()
-            on_robot = model.shape_body.numpy() >= 0
-            mu[on_robot] = np.repeat(friction, on_robot.sum() // self.num_envs)
+            mu[1:] = np.repeat(friction, (len(mu) - 1) // self.num_envs)  # the first shape is the ground's
             model.shape_material_mu.assign(mu)
         if added_base_mass is not None:
             mass = model.body_mass.numpy()
@@ -156,33 +151,30 @@ class Simulation:
         self.solver.notify_model_changed(changed)
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
-        shape_body, geom_of_shape = self.model.shape_body.numpy(), self.solver.newton_shape_to_mjc_geom.numpy()
-        first = int(np.flatnonzero(shape_body >= 0)[0])
-        self.geom_of_shape = geom_of_shape[first : first + builder.shape_count]
+        geoms = self.solver.newton_shape_to_mjc_geom.numpy()  # that of the ground, then those of each robot
+        self.geom_of_shape = geoms[1 : 1 + builder.shape_count]
         self.probes = make_probes(builder)
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
         self.parked = wp.zeros(self.num_envs, dtype=int)
         # A mesh of several parts is several shapes of one name.
-        names = self.robot.geom_names
+        robot, names = self.robot, self.robot.geom_names
         columns = [names.index(name) if name in names else -1 for name in builder.shape_label]
         self.column_of_shape = wp.array(columns, dtype=int)
-        self.geom_role = wp.array([self.robot.role_of(name) for name in names], dtype=int)
-        ground = int(geom_of_shape[np.flatnonzero(shape_body < 0)[0]])
+        roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
+        self.geom_role = wp.array(roles, dtype=int)
         model, data = self.solver.mjw_model, self.solver.mjw_data
-        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, ground)
+        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
         self._state = model.state()
-        self._control = model.control()
         self.body_q = self._state.body_q.reshape((self.num_envs, -1))
         self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
         self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
-        self.targets = self._control.joint_target_q.reshape((self.num_envs, 7 + num_joints))
+        self.targets = wp.zeros((self.num_envs, 7 + num_joints), dtype=float)
         self.geom_force = wp.zeros((self.num_envs, len(self.robot.geom_names)), dtype=wp.vec3)
         self.joint_torque = data.qfrc_actuator
         self.overflow = data.overflow
-        self.geom_names = self.robot.geom_names
         self.sensors = Sensors()
         self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
         scan_x, scan_y = self.robot.scan_points()
@@ -231,28 +223,18 @@ class Simulation:
 
     def _build_coordinates(self) -> SolverState:
         """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
-        model: Any = self.model
         solver: Any = self.solver
         data = solver.mjw_data
-        columns = np.full(self.robot.num_joints, -1, np.int32)
-        column_of, first_of = solver.mj_q_start.numpy(), model.joint_q_start.numpy()
-        for joint in range(1, model.joint_count // self.num_envs):  # the first is the base's
-            columns[first_of[joint] - 7] = column_of[joint]
-        of_solver = solver.mjc_body_to_newton.numpy()[0]
-        # Newton tells actuators what they follow. Targets that are their own numbers show which one that is.
-        self.targets.assign(np.tile(1.0 + np.arange(self.targets.shape[1], dtype=np.float32), (self.num_envs, 1)))
-        solver._apply_mjc_control(model, self._state, self._control, data)
-        followed = data.ctrl.numpy()[0].astype(np.int32) - 1
-        self.targets.zero_()
-        data.ctrl.zero_()
+        columns = solver.mj_q_start.numpy()[1 : 1 + self.robot.num_joints]  # the first is the base's
+        moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
+        followed = [7 + int(np.flatnonzero(columns == column)[0]) for column in moved]
         coordinates = SolverState()
         for name in ("qpos", "qvel", "ctrl", "xpos", "xquat"):
             setattr(coordinates, name, getattr(data, name))
         coordinates.column_of_joint = wp.array(columns, dtype=int)
         coordinates.target_of_actuator = wp.array(followed, dtype=int)
-        coordinates.column_of_body = wp.array(
-            [int(np.flatnonzero(of_solver == body)[0]) for body in range(self.body_q.shape[1])], dtype=int
-        )
+        bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
+        coordinates.column_of_body = wp.array(bodies[-self.body_q.shape[1] :], dtype=int)
         coordinates.base_com = self.sensors.base_com
         return coordinates
 

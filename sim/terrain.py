@@ -108,9 +108,8 @@ def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
 def hand_crafted_crossings(count: int, seed: Seed) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Hand-crafted crossings: the types of :data:`CROSSING_TYPES` in turn (equal shares), levels uniform in 0..9.
 
-    Returns:
-        Heights [m] float32 of shape (count, NUM_ROWS, NUM_COLS), types (count,) and levels (count,), both int;
-        a type is an index into :data:`CROSSING_TYPES`.
+    Heights [m] are float32 of shape (count, NUM_ROWS, NUM_COLS), types, indices into :data:`CROSSING_TYPES`, and levels
+    int of shape (count,).
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
@@ -147,11 +146,9 @@ def training_tiles(num_columns: int, seed: Seed) -> tuple[np.ndarray, np.ndarray
     """The tiles of the training curriculum: a row a level from 0 up, a column a type.
 
     Columns go to :data:`TILE_TYPES` in order, in shares .1, .1, .35, .25, .2, which 20 and its multiples give exactly;
-    every other smooth slope is inverted.
-
-    Returns:
-        Heights [m] float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS, NUM_COLS), the tile of a level and a column at
-        index level * num_columns + column, and types (num_columns,) int, indices into :data:`TILE_TYPES`.
+    every other smooth slope is inverted. Heights [m] are float32 of shape (NUM_LEVELS * num_columns, NUM_ROWS,
+    NUM_COLS), the tile of a level and a column at index level * num_columns + column; types are indices into
+    :data:`TILE_TYPES`, int of shape (num_columns,).
     """
     ends = np.cumsum(TILE_SHARES_PERCENT) * num_columns
     types = np.searchsorted(ends, 100 * np.arange(num_columns), side="right")

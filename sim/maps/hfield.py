@@ -16,12 +16,13 @@ from sim.terrain import SPACING
 LEAST_EXTENT = 1e-3
 """Of flat ground, whose range is 0 where a size or scale may not be [m]."""
 _THICKNESS = 1.0  # of the ground below its lowest point [m]
-_QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+"""Of the geom, quaternion w x y z: its x axis is the grid's y, its y axis the grid's -x."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hfield:
-    """What an ``hfield`` asset and the ``geom`` that shows it need; world axes are those of the height grid."""
+    """What an ``hfield`` asset and the ``geom`` that shows it need beside :data:`QUARTER_TURN`; axes are the grid's."""
 
     data: NDArray[np.float64]
     """0 to 1, as in ``MjModel.hfield_data``; an asset's ``elevation`` has its rows in reverse."""
@@ -29,8 +30,6 @@ class Hfield:
     """Half lengths along the asset's x and y, height of data 1, thickness below data 0 [m]."""
     position: tuple[float, float, float]
     """Of the geom [m]."""
-    quaternion: tuple[float, float, float, float] = _QUARTER_TURN
-    """Of the geom, w x y z: its x axis is the grid's y, its y axis the grid's -x."""
 
 
 Margins = tuple[tuple[int, int], tuple[int, int]]

@@ -21,7 +21,7 @@ from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
 from sim.ground import GroundMaps
-from sim.maps.hfield import LEAST_EXTENT, as_hfield, surface_of
+from sim.maps.hfield import LEAST_EXTENT, QUARTER_TURN, as_hfield, surface_of
 from sim.terrain import SPACING
 
 STEP_M = 1e-3
@@ -124,7 +124,7 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", name="sun", directional="true", pos="8 4 10", dir="0.3 0.4 -1", diffuse="0.8 0.8 0.8")
     shape = {"type": "hfield", "hfield": "terrain", "friction": str(GROUND_FRICTION), "rgba": "0.7 0.66 0.6 1"}
-    shape |= {"pos": _words(field.position), "quat": _words(field.quaternion)}
+    shape |= {"pos": _words(field.position), "quat": _words(QUARTER_TURN)}
     ET.SubElement(world, "geom", {"name": "terrain", **shape})
     for name, place, color in (("start", CrossingCfg.start, "1 1 1 1"), ("goal", CrossingCfg.goal, "0 0.62 0.45 1")):
         position = _words(terrain.on_ground(*place))
@@ -151,13 +151,8 @@ def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([top, below, below.mean(axis=0, keepdims=True)]), faces, process=False)
 
 
-def stl_of(terrain: ExportedTerrain) -> bytes:
-    """The block of :func:`block_of` as binary STL [m]."""
-    return _exported(block_of(terrain.heights), "stl")
-
-
 def glb_of(terrain: ExportedTerrain) -> bytes:
-    """The same with its heights as colours; a node turns it, since y is up in glTF."""
+    """The block with its heights as colours; a node turns it, since y is up in glTF."""
     block, scene = block_of(terrain.heights), trimesh.Scene()
     colors = interpolate(block.vertices[:, 2].clip(terrain.heights.min()), "viridis")
     mesh = trimesh.Trimesh(block.vertices, block.faces, vertex_colors=colors, process=False)
@@ -171,15 +166,12 @@ def _exported(shape: trimesh.Trimesh | trimesh.Scene, ending: str) -> bytes:
     return content
 
 
-def sdf_of(terrain: ExportedTerrain) -> bytes:
-    """A model for Gazebo, round the STL beside it."""
-    return _SIX_LINES.format(name=escape(terrain.name, {'"': "&quot;"})).encode()
-
-
 FORMATS: dict[str, Callable[[ExportedTerrain], bytes]] = {
-    "npz": npz_of, "png": png_of, "npy": npy_of, "xml": mjcf_of, "stl": stl_of, "glb": glb_of, "sdf": sdf_of,
+    "npz": npz_of, "png": png_of, "npy": npy_of, "xml": mjcf_of,
+    "stl": lambda terrain: _exported(block_of(terrain.heights), "stl"), "glb": glb_of,
+    "sdf": lambda terrain: _SIX_LINES.format(name=escape(terrain.name, {'"': "&quot;"})).encode(),
 }  # fmt: skip
-"""Formats by the ending of their files; ``xml`` is MJCF."""
+"""Formats by the ending of their files; ``xml`` is MJCF, ``sdf`` a model for Gazebo round the STL beside it."""
 
 
 def write_terrain(

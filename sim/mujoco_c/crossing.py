@@ -15,7 +15,6 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 import warp as wp
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from kernels.conditions import Condition
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
-from kernels.penalties import BASE, PENALTIES
+from kernels.penalties import PENALTIES
 from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
@@ -48,14 +47,13 @@ from sim.mujoco_c.model import (
 )
 from sim.policy.loaders import Policy, load_policy, prepare_torch
 from sim.policy.runner import forget_all
-from sim.robots.compiled import robot_spec
+from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.spaces.base import TerrainSpace
 
-_mj: Any = mujoco  # its types are not written down
 _WARNINGS = [
-    getattr(_mj.mjtWarning, f"mjWARN_{name}")
+    getattr(mj.mjtWarning, f"mjWARN_{name}")
     for name in ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
 ]
 
@@ -98,7 +96,7 @@ class Episodes:
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: NDArray[np.floating] = NOMINAL) -> None:
         """From ``starts`` on, under ``conditions`` (12,); payload, strength and friction are the model's."""
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
-        self.data = [_mj.MjData(model) for _ in starts.qpos]
+        self.data = [mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
             data.qpos[:], data.qvel[:] = qpos, qvel
         self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
@@ -124,7 +122,7 @@ class Episodes:
                 lost = stall * data.qvel[6 + self._joints] / limit
                 limits = np.clip([-stall - lost, stall - lost], -effort, effort).T
                 self._model.actuator_forcerange[:] = self._strength * limits
-            _mj.mj_step(self._model, data)
+            mj.mj_step(self._model, data)
             self.qpos[k], self.qvel[k] = data.qpos, data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
@@ -181,7 +179,7 @@ def cross(
     width = float(conditions[Condition.NOISE]) * noise_widths(robot)
     rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))  # of the episodes' own
     push_at = rounded_steps(conditions[Condition.PUSH_TIME], robot.physics_dt)
-    count, base = len(starts.qpos), np.array([robot.role_of(name) == BASE for name in robot.geom_names])
+    count, base = len(starts.qpos), np.array([name in robot.base_geoms for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
     outcome = np.full(count, Outcome.RUNNING)

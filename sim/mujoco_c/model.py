@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,15 +18,14 @@ from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.ground import PATCHES, GroundMaps
-from sim.maps.hfield import Margins, as_hfield
-from sim.robots.compiled import robot_spec, rotation_matrix
+from sim.maps.hfield import QUARTER_TURN, Margins, as_hfield
+from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = 4 << 20  # bytes
-_mj: Any = mujoco  # its types are not written down
 
 Array = NDArray[np.float64]
 
@@ -82,20 +80,20 @@ def crossing_model(
     spec.memory = _MEMORY
     option = spec.option
     option.timestep, option.iterations, option.ls_iterations = robot.physics_dt, 100, 50
-    option.integrator, option.cone = _mj.mjtIntegrator.mjINT_IMPLICITFAST, _mj.mjtCone.mjCONE_ELLIPTIC
-    option.disableflags = _mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
+    option.integrator, option.cone = mj.mjtIntegrator.mjINT_IMPLICITFAST, mj.mjtCone.mjCONE_ELLIPTIC
+    option.disableflags = mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     plain = ground is None or ((ground.friction == 1.0).all() and (ground.time_constant_s == FIRM).all())
     patches = [] if ground is None or plain else _patches_of(ground)
     if patches:
         _add_patches(spec, heights, patches)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
-        _add_geom(spec, _GROUND, (0.0, 0.0, float(heights[0, 0])), type=_mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
+        _add_geom(spec, _GROUND, (0.0, 0.0, float(heights[0, 0])), type=mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     else:
         _add_field(spec, heights, _GROUND)
     for name in robot.geom_names:
         spec.add_sensor(
-            name=name, type=_mj.mjtSensor.mjSENS_CONTACT, objtype=_mj.mjtObj.mjOBJ_GEOM, objname=name,
-            intprm=[1 << _mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
+            name=name, type=mj.mjtSensor.mjSENS_CONTACT, objtype=mj.mjtObj.mjOBJ_GEOM, objname=name,
+            intprm=[1 << mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
         )  # fmt: skip
     model = spec.compile()
     of_ground = np.flatnonzero([model.geom(k).name.startswith(_GROUND) for k in range(model.ngeom)])
@@ -124,8 +122,8 @@ def _add_field(
     rows, columns = field.data.shape
     spec.add_hfield(name=name, nrow=rows, ncol=columns, size=field.size, userdata=field.data.ravel())
     x, y, z = field.position
-    _add_geom(spec, name, (x + low[0], y + low[1], z), type=_mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
-              quat=field.quaternion)  # fmt: skip
+    _add_geom(spec, name, (x + low[0], y + low[1], z), type=mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
+              quat=QUARTER_TURN)  # fmt: skip
 
 
 def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **looks: Any) -> None:
@@ -185,7 +183,7 @@ def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]
         ends = [(nodes.start - before, nodes.stop - 1 + behind) for nodes, (before, behind) in axes]
         (y, half_y), (x, half_x) = ((SPACING * (low + high) / 2, SPACING * (high - low) / 2) for low, high in ends)
         size = half_x, half_y, _DEPTH / 2
-        _add_geom(spec, name, (x, y, float(part[0, 0]) - _DEPTH / 2), type=_mj.mjtGeom.mjGEOM_BOX, size=size)
+        _add_geom(spec, name, (x, y, float(part[0, 0]) - _DEPTH / 2), type=mj.mjtGeom.mjGEOM_BOX, size=size)
 
 
 def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: list[_Patch]) -> None:
@@ -234,7 +232,7 @@ def vary_model(model: Any, conditions: NDArray[np.floating]) -> None:
             inertia += kilograms * (d @ d * np.eye(3) - np.outer(d, d))
         moments, axes = np.linalg.eigh(inertia)
         axes[:, 2] *= np.linalg.det(axes)  # right-handed
-        _mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
+        mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
         model.body_inertia[base], model.body_mass[base] = moments, mass + added
         model.body_ipos[base] += moved
 

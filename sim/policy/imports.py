@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 
 from sim.files.command import command_line
@@ -175,8 +176,6 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
 
 
 def _onnx_metadata(file: Path) -> Mapping[str, str]:
-    import onnx  # takes long to load
-
     try:
         return {item.key: item.value for item in onnx.ModelProto.FromString(file.read_bytes()).metadata_props}
     except Exception as error:  # protobuf's errors have no base

@@ -135,9 +135,8 @@ class PolicyRunner:
             self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
 
     def reset(self) -> None:
-        """Let a policy forget that can only forget all robots."""
-        if self.memory == "reset()":
-            self._policy.reset()
+        """Let a policy forget all robots, of one that can forget no single one."""
+        self._policy.reset()
 
     def _call(self) -> None:
         """Calls the controller with a copy of the rows, which it may keep or change, and checks its actions."""

@@ -5,17 +5,15 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sim.ground import GroundMaps
 from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_CONTROLLER, TOUCH, scene_model
+from sim.robots.compiled import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import touches_of
-
-_mj: Any = mujoco  # its types are not written down
 
 _MAX_GEOMS = 20_000
 _GHOST_OPACITY = 0.4
@@ -82,15 +80,15 @@ class Renderer:
         self._feet = [self.model.geom(name).id for name in robot.foot_geoms]
         self._first_foot = len(robot.geom_names) - len(robot.foot_geoms)
         self._touches, self._ground = touches_of(self.model, robot), self.model.geom(GROUND).id
-        self._data, self._ghost_data = _mj.MjData(self.model), _mj.MjData(self.model)
-        self._scene = _mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
-        self._scene.flags[_mj.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._scene.flags[_mj.mjtRndFlag.mjRND_REFLECTION] = False
-        self._options, self._nudge, self._camera = _mj.MjvOption(), _mj.MjvPerturb(), _mj.MjvCamera()
-        self._camera.type = _mj.mjtCamera.mjCAMERA_FREE
-        self._gpu = _mj.MjrContext(self.model, _mj.mjtFontScale.mjFONTSCALE_100.value)
-        _mj.mjr_setBuffer(_mj.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
-        self._rectangle = _mj.MjrRect(0, 0, width, height)
+        self._data, self._ghost_data = mj.MjData(self.model), mj.MjData(self.model)
+        self._scene = mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
+        self._scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._scene.flags[mj.mjtRndFlag.mjRND_REFLECTION] = False
+        self._options, self._nudge, self._camera = mj.MjvOption(), mj.MjvPerturb(), mj.MjvCamera()
+        self._camera.type = mj.mjtCamera.mjCAMERA_FREE
+        self._gpu = mj.MjrContext(self.model, mj.mjtFontScale.mjFONTSCALE_100.value)
+        mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+        self._rectangle = mj.MjrRect(0, 0, width, height)
         self._image = np.empty((height, width, 3), np.uint8)
 
     def __enter__(self) -> "Renderer":
@@ -124,32 +122,32 @@ class Renderer:
         # The sun goes with the camera, so that its shadows are sharp where one looks.
         data.light_xpos[-1] = np.array(camera.target) - _SUN_AWAY * data.light_xdir[-1]
         self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
-        everything = _mj.mjtCatBit.mjCAT_ALL.value
-        _mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
+        everything = mj.mjtCatBit.mjCAT_ALL.value
+        mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
         if ghost is not None:
             self._add_ghost(ghost)
         if foot_force is not None:
             for place, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
                 self._add_arrow(place, force)
-        _mj.mjr_render(self._rectangle, self._scene, self._gpu)
-        _mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
+        mj.mjr_render(self._rectangle, self._scene, self._gpu)
+        mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         picture = self._image[::-1]  # OpenGL's lowest row is first
         return picture.copy() if ghost is None else self._named(picture, ghost[:3], ghost_name)
 
     def _pose(self, data: Any, qpos: NDArray[np.floating]) -> None:
         data.qpos[:] = qpos
-        _mj.mj_kinematics(self.model, data)
-        _mj.mj_comPos(self.model, data)
-        _mj.mj_camlight(self.model, data)
+        mj.mj_kinematics(self.model, data)
+        mj.mj_comPos(self.model, data)
+        mj.mj_camlight(self.model, data)
 
     def _dress(self, touching: NDArray[np.bool_] | None) -> None:
         """Colours what touches, and has the ground cast no shadow: it would speckle slopes."""
         for geom in self._scene.geoms[: self._scene.ngeom]:
-            if geom.objtype != _mj.mjtObj.mjOBJ_GEOM.value:
+            if geom.objtype != mj.mjtObj.mjOBJ_GEOM.value:
                 continue
             if geom.objid == self._ground:
-                geom.category = _mj.mjtCatBit.mjCAT_DECOR.value
+                geom.category = mj.mjtCatBit.mjCAT_DECOR.value
             columns = self._touches.get(geom.objid, ())
             if touching is not None and touching[list(columns)].any():
                 geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
@@ -157,8 +155,8 @@ class Renderer:
 
     def _add_ghost(self, qpos: NDArray[np.floating]) -> None:
         self._pose(self._ghost_data, qpos)
-        first, moving = self._scene.ngeom, _mj.mjtCatBit.mjCAT_DYNAMIC.value
-        _mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
+        first, moving = self._scene.ngeom, mj.mjtCatBit.mjCAT_DYNAMIC.value
+        mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
             geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
             geom.matid, geom.transparent = -1, 1
@@ -184,8 +182,8 @@ class Renderer:
         if size < _LEAST_FORCE:
             return
         tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
-        geom, kind = self._scene.geoms[self._scene.ngeom], _mj.mjtGeom.mjGEOM_ARROW.value
+        geom, kind = self._scene.geoms[self._scene.ngeom], mj.mjtGeom.mjGEOM_ARROW.value
         color = _ALARMED if size > limit else _CALM
-        _mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
-        _mj.mjv_connector(geom, kind, _ARROW_WIDTH, foot, tip)
+        mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
+        mj.mjv_connector(geom, kind, _ARROW_WIDTH, foot, tip)
         self._scene.ngeom += 1

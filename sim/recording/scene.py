@@ -5,7 +5,6 @@ Nothing in it is simulated: poses come from a recording.
 
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom
@@ -14,11 +13,10 @@ from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
 from sim.maps.hfield import surface_of
 from sim.maps.picture import height_colors, tinted
+from sim.robots.compiled import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, shown_spec
 from sim.terrain import SPACING
-
-_mj: Any = mujoco  # its types are not written down
 
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""
@@ -86,13 +84,13 @@ def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]
         uservert=vertices.ravel(),
         userface=faces.ravel(),
         usertexcoord=(places / places[-1]).ravel(),
-        inertia=_mj.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        inertia=mj.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
-    flat = {"type": _mj.mjtTexture.mjTEXTURE_2D, "builtin": _mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
+    flat = {"type": mj.mjtTexture.mjTEXTURE_2D, "builtin": mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
     spec.add_texture(name=GROUND, width=paint[1], height=paint[0], **flat)
     material = spec.add_material(name=GROUND, specular=0.0, shininess=0.0, reflectance=0.0)
-    material.textures[_mj.mjtTextureRole.mjTEXROLE_RGB] = GROUND
-    kind = {"type": _mj.mjtGeom.mjGEOM_MESH, "meshname": GROUND, "material": GROUND}
+    material.textures[mj.mjtTextureRole.mjTEXROLE_RGB] = GROUND
+    kind = {"type": mj.mjtGeom.mjGEOM_MESH, "meshname": GROUND, "material": GROUND}
     spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
 
 
@@ -101,14 +99,14 @@ def _add_goal(spec: Any, heights: NDArray[np.floating]) -> None:
     x, y = CrossingCfg.goal
     ground = float(heights[round(y / SPACING), round(x / SPACING)])
     green = [0.0, 0.62, 0.45, 1.0]
-    post = {"type": _mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
+    post = {"type": mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
     spec.worldbody.add_geom(pos=[x, y, ground + 0.5], size=[0.02, 0.5, 0.0], rgba=green, **post)
     disc = [*green[:3], 0.25]
     spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[CrossingCfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
 
 
 def _add_light(spec: Any) -> None:
-    sky = {"type": _mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": _mj.mjtBuiltin.mjBUILTIN_GRADIENT}
+    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT}
     spec.add_texture(
         name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], width=64, height=384, **sky
     )
@@ -116,7 +114,7 @@ def _add_light(spec: Any) -> None:
         light.active = False
     spec.worldbody.add_light(
         name="faultline_sun",
-        type=_mj.mjtLightType.mjLIGHT_DIRECTIONAL,
+        type=mj.mjtLightType.mjLIGHT_DIRECTIONAL,
         pos=[8.0, 4.0, 20.0],
         dir=[-0.25, 0.45, -1.0],
         diffuse=[0.55, 0.55, 0.53],

@@ -19,8 +19,9 @@ from sim.files.command import with_traceback
 from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
 
-_mj: Any = mujoco  # its types are not written down
-_JOINT, _TRN, _BIAS = _mj.mjtJoint, _mj.mjtTrn.mjTRN_JOINT, _mj.mjtBias
+mj: Any = mujoco
+"""MuJoCo, whose types are not written down."""
+_JOINT, _TRN, _BIAS = mj.mjtJoint, mj.mjtTrn.mjTRN_JOINT, mj.mjtBias
 _URDF_FRICTION = 1.0
 _URDF_TIME_CONSTANT_S = 0.01
 _SLACK = 1e-3  # files round [rad]
@@ -67,7 +68,7 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
     """Reads a robot's file; an error says all that is wrong with it."""
     files = read_model_files(model_file, visuals=visuals)
     try:
-        spec = _of_urdf(files.root) if files.is_urdf else _mj.MjSpec.from_file(str(model_file))
+        spec = _of_urdf(files.root) if files.is_urdf else mj.MjSpec.from_file(str(model_file))
         home = next((list(key.qpos) for key in spec.keys if key.name == "home"), [])
         strange = _keep_robot(spec)
         spec.fuse_static()
@@ -118,7 +119,7 @@ def _of_urdf(root: ET.Element) -> Any:
     compiler.attrib.setdefault("inertiafromgeom", "false")
     compiler.attrib |= dict.fromkeys(("strippath", "fusestatic", "discardvisual"), "false")
     ET.indent(root)  # every element on a line of its own
-    spec = _mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    spec = mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     for body in spec.bodies:
         touching = touching_geoms(body)
         for number, geom in enumerate(touching):
@@ -145,7 +146,8 @@ def _sum_masses(body: Any) -> list[Any]:
     if body.joints and parts:
         mass = sum(part for part, _, _ in parts)
         centre = sum(part * at for part, at, _ in parts) / mass
-        whole = np.sum([own + part * _of_point(at - centre) for part, at, own in parts], axis=0)
+        shifts = [(part, at - centre, own) for part, at, own in parts]
+        whole = np.sum([own + part * (d @ d * np.eye(3) - np.outer(d, d)) for part, d, own in shifts], axis=0)
         if body.joints[0].type == _JOINT.mjJNT_HINGE:
             whole = _without_rotor(whole, body.joints[0])
         body.explicitinertial, body.mass, body.ipos, body.iquat = True, mass, centre, (1.0, 0.0, 0.0, 0.0)
@@ -166,41 +168,36 @@ def _without_rotor(inertia: NDArray[np.float64], joint: Any) -> NDArray[np.float
     return inertia - excess * np.outer(axis, axis)
 
 
-def _of_point(at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inertia about the origin of a unit mass [m^2]."""
-    return at @ at * np.eye(3) - np.outer(at, at)
-
-
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """Of a quaternion w x y z, shape (3, 3)."""
     matrix = np.zeros(9)
-    _mj.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
+    mj.mju_quat2Mat(matrix, np.asarray(quaternion, dtype=np.float64))
     return matrix.reshape(3, 3)
 
 
 def _keep_robot(spec: Any) -> list[str]:
     """Leaves what simulations take of a file, under names; returns what they cannot take, by its place."""
     option, gravity = spec.option, spec.option.gravity.copy()
-    flags = [name for name in _NEEDED if option.disableflags & getattr(_mj.mjtDisableBit, f"mjDSBL_{name.upper()}")]
+    flags = [name for name in _NEEDED if option.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{name.upper()}")]
     others = [name for name in ("density", "viscosity", "wind", "disableactuator") if np.any(getattr(option, name))]
     problems = [f'<flag {name}="disable"> in <option>' for name in flags] + [f"<option {name}>" for name in others]
-    problems += ['<flag override="enable">'] * bool(option.enableflags & _mj.mjtEnableBit.mjENBL_OVERRIDE)
+    problems += ['<flag override="enable">'] * bool(option.enableflags & mj.mjtEnableBit.mjENBL_OVERRIDE)
     if gravity[0] or gravity[1] or not gravity[2] < 0.0:
         problems.append(f"<option gravity> that does not point down, {gravity}")
-    followers, plain = [equality.name1 for equality in spec.equalities], _mj.MjSpec().add_equality()
+    followers, plain = [equality.name1 for equality in spec.equalities], mj.MjSpec().add_equality()
     for equality in spec.equalities:
-        follows = equality.type == _mj.mjtEq.mjEQ_JOINT and equality.name2 and not np.any(equality.data[2:5])
+        follows = equality.type == mj.mjtEq.mjEQ_JOINT and equality.name2 and not np.any(equality.data[2:5])
         once = followers.count(equality.name1) == 1 and equality.name2 not in followers
         usual = all(np.array_equal(getattr(equality, name), getattr(plain, name)) for name in ("solref", "solimp"))
         if not (follows and once and usual and equality.active):
-            kind = _mj.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
+            kind = mj.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
             problems.append(f"<equality> {kind} of {equality.name1} ({equality.info})")
 
     def refuse(kind: str, part: Any, **values: Any) -> None:
         strange = [name for name, value in values.items() if np.any(value)]
         problems.extend(f"<{kind} {name}> of {part.name} ({part.info})" for name in strange)
 
-    from_geoms = spec.compiler.inertiafromgeom == _mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    from_geoms = spec.compiler.inertiafromgeom == mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     lost = [body for body in spec.bodies if from_geoms and body.explicitinertial and not (body.joints or body.geoms)]
     problems += [f'<inertial> of {body.name} ({body.info}) beside inertiafromgeom="true"' for body in lost]
     problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
@@ -210,7 +207,7 @@ def _keep_robot(spec: Any) -> list[str]:
         for number, geom in enumerate(touching_geoms(body)):
             geom.name = geom.name or f"{body.name}_geom_{number}"
             geom.contype, geom.conaffinity = 1, 0
-            if geom.type in (_mj.mjtGeom.mjGEOM_HFIELD, _mj.mjtGeom.mjGEOM_SDF):
+            if geom.type in (mj.mjtGeom.mjGEOM_HFIELD, mj.mjtGeom.mjGEOM_SDF):
                 problems.append(f"a height field or distance field as geom {geom.name} ({geom.info})")
             refuse("geom", geom, margin=geom.margin, gap=geom.gap, adhesion=geom.adhesion, surfacevel=geom.surfacevel)
         refuse("body", body, gravcomp=body.gravcomp, mocap=body.mocap)
@@ -222,7 +219,7 @@ def _keep_robot(spec: Any) -> list[str]:
     for part in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs):
         spec.delete(part)
     impratio = option.impratio
-    spec.option = _mj.MjSpec().option
+    spec.option = mj.MjSpec().option
     spec.option.gravity, spec.option.impratio = gravity, impratio
     return problems
 
@@ -348,7 +345,7 @@ class _Drives:
 
     def _kind(self, model: Any, k: int) -> str:
         gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
-        simple = model.actuator_gaintype[k] == _mj.mjtGain.mjGAIN_FIXED and not model.actuator_dyntype[k]
+        simple = model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED and not model.actuator_dyntype[k]
         if simple and model.actuator_biastype[k] == _BIAS.mjBIAS_NONE and not gain[1:].any():
             return "motor"
         if model.actuator_dyntype[k]:
@@ -377,7 +374,7 @@ def _set_drives(spec: Any, drives: _Drives, robot: RobotCfg) -> None:
         control, limited = drives.control[k], np.isfinite(effort)
         spec.add_actuator(
             name=name, target=name, trntype=_TRN, gear=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-            gaintype=_mj.mjtGain.mjGAIN_FIXED, gainprm=(stiffness, *(0.0,) * 9), dyntype=_mj.mjtDyn.mjDYN_NONE,
+            gaintype=mj.mjtGain.mjGAIN_FIXED, gainprm=(stiffness, *(0.0,) * 9), dyntype=mj.mjtDyn.mjDYN_NONE,
             biastype=_BIAS.mjBIAS_AFFINE, biasprm=(0.0, -stiffness, -damping, *(0.0,) * 7),
             forcelimited=limited, forcerange=(-effort, effort) if limited else (0.0, 0.0),
             ctrllimited=not np.isnan(control[0]), ctrlrange=np.nan_to_num(control),

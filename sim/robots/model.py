@@ -2,17 +2,15 @@
 
 from typing import Any
 
-import mujoco
 import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.robots.compiled import mesh_of, robot_spec, rotation_matrix
+from sim.robots.compiled import mesh_of, mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 
-_mj: Any = mujoco  # its types are not written down
-_GEOM, _TYPE = _mj.mjtGeom, newton.GeoType
+_GEOM, _TYPE = mj.mjtGeom, newton.GeoType
 _TYPES = {getattr(_GEOM, f"mjGEOM_{name}"): getattr(_TYPE, name)
           for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "ELLIPSOID", "MESH", "PLANE")}  # fmt: skip
 _FREE_RANGE = 1e10  # limits of a joint that turns freely [rad]
@@ -74,7 +72,7 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
         return base
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
-    turns = model.jnt_type[joint] == _mj.mjtJoint.mjJNT_HINGE
+    turns = model.jnt_type[joint] == mj.mjtJoint.mjJNT_HINGE
     add = builder.add_joint_revolute if turns else builder.add_joint_prismatic
     effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _NO_EFFORT_LIMIT
     return add(

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import warp as wp
 
@@ -17,7 +16,7 @@ from kernels.penalties import PENALTIES
 from sim.device import host_device
 from sim.files.settings import from_builtins, problems, read_toml, to_toml
 from sim.policy.spec import run_file
-from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, read_robot_file
+from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import extents, make_probes, start_height
@@ -114,8 +113,8 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
     point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
     the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
-    ``file``, the robot.toml; a controller.toml beside it says the scan. ``given`` has one value a joint where a setting
-    is of joints.
+    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it. ``given`` has
+    one value a joint where a setting is of joints.
     """
     model = of_file.model
     low, high = model.jnt_range[1:].T
@@ -140,24 +139,20 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
     found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))
-    return _scan(file.with_name("controller.toml")) | found
+    controller = file.with_name("controller.toml")
+    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
+    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
+    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"} | found
 
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
     """Half length and half width of the rectangle about the base that holds the feet in the default pose [m]."""
-    data: Any = mujoco.MjData(model)  # type: ignore
+    data = mj.MjData(model)
     data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), pose
-    mujoco.mj_kinematics(model, data)  # type: ignore
+    mj.mj_kinematics(model, data)
     numbers = [k for k in range(model.ngeom) if model.geom(k).name in feet]
     reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
     return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
-
-
-def _scan(controller: Path) -> dict[str, Any]:
-    """Points of the height scan: those of the first one in a controller's observation, or none."""
-    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
-    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
-    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"}
 
 
 def describe_inferred(robot: RobotCfg) -> str:

@@ -174,7 +174,6 @@ MAX_SAG = 0.005
 """Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
-_MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
 
 
 def _max_spacing(radius: float) -> float:
@@ -249,7 +248,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     """
     num_sizes, make_strips = _PRIMITIVES.get(shape_type, (0, None))
     sizes = np.asarray(scale, dtype=np.float64)[:num_sizes]
-    vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale if shape_type in _MESHES else np.zeros((1, 3))
+    is_mesh = shape_type == newton.GeoType.MESH
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) * scale if is_mesh else np.zeros((1, 3))
     if not (np.isfinite(vertices).all() and (sizes > 0.0).all()):
         raise ValueError(f"its sizes must be positive numbers, got {', '.join(f'{size:g}' for size in sizes)} m")
     longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
@@ -257,7 +257,7 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
         raise ValueError(f"it is {longest:g} m long, more than {_MAX_SIDE:g} m: give lengths in m, a mesh its scale")
     if make_strips is not None:
         return make_strips(*map(float, sizes))
-    if shape_type in _MESHES:
+    if is_mesh:
         return hull_probes(vertices)[0]
     kind = newton.GeoType(shape_type).name
     raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the robot's file")
@@ -265,34 +265,28 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
-    centres, radius, spread, body, shape, problems = [], [], [], [], [], []
+    shape, strips, problems = list[int](), list[Strip](), list[str]()
     vec3: Any = wp.vec3
     for k in range(builder.shape_count):
-        if not builder.shape_flags[k] & newton.ShapeFlags.COLLIDE_SHAPES:
-            continue
-        pose: Any = builder.shape_transform[k]
+        kind, scale = newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k])
         try:
-            strips = shape_strips(
-                newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k]), builder.shape_source[k]
-            )
+            strips += shape_strips(kind, scale, builder.shape_source[k])
         except ValueError as error:
             problems.append(f"geom {builder.shape_label[k]}: {error}")
-            continue
-        for strip in strips:
-            centres.append([wp.transform_point(pose, vec3(*centre)) for centre in strip.centres])
-            radius.append(strip.radius)
-            spread.append(strip.spread)
-            body.append(builder.shape_body[k])
-            shape.append(k)
+        shape += [k] * (len(strips) - len(shape))
     if problems:
         raise ValueError("; ".join(problems))
+    poses: list[Any] = [builder.shape_transform[k] for k in shape]
+    centres = [[wp.transform_point(pose, vec3(*centre)) for centre in strip.centres]
+               for pose, strip in zip(poses, strips, strict=True)]  # fmt: skip
+    radius, body = [strip.radius for strip in strips], [builder.shape_body[k] for k in shape]
     bundles = _bundles(body)
     balls = [_ball_round(centres[a:b], radius[a:b]) for a, b in itertools.pairwise(bundles)]
     probes = Probes()
     probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
     probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
     probes.strip_radius = wp.array(radius, dtype=float)
-    probes.strip_spread = wp.array(spread, dtype=float)
+    probes.strip_spread = wp.array([strip.spread for strip in strips], dtype=float)
     probes.strip_shape = wp.array(shape, dtype=int)
     probes.bundle_start = wp.array(bundles, dtype=int)
     probes.bundle_body = wp.array([body[first] for first in bundles[:-1]], dtype=int)

@@ -156,12 +156,6 @@ class RobotCfg:
         """Folder of its published pack (``faultline evaluate --pack``)."""
         return self.home / self.name / "pack"
 
-    def role_of(self, geom: str) -> int:
-        """Role bits of a geom (:mod:`kernels.penalties`)."""
-        from kernels.penalties import BASE, FOOT, LIMB  # with Warp too
-
-        return BASE * (geom in self.base_geoms) + FOOT * (geom in self.foot_geoms) + LIMB * (geom in self.limb_geoms)
-
     def scan_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Scan points in observation order (x slowest), two arrays of shape (num_scan_points,) [m]."""
         x, y = np.meshgrid(self.scan_x, self.scan_y, indexing="ij")

@@ -7,16 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.compiled import mesh_of, robot_spec, touching_geoms
+from sim.robots.compiled import mesh_of, mj, robot_spec, touching_geoms
 from sim.robots.robot import RobotCfg
 
-_mj: Any = mujoco  # its types are not written down
-_KIND = _mj.mjtGeom
+_KIND = mj.mjtGeom
 _SEGMENTS = 20  # round a capsule
 _CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
@@ -104,7 +102,7 @@ def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
     looks = dict[str, list[dict[str, Any]]]()
     if not file.is_file():
         return looks
-    model = _compiled(lambda: _mj.MjModel.from_xml_path(str(file)), file)
+    model = _compiled(lambda: mj.MjModel.from_xml_path(str(file)), file)
     for k in range(model.ngeom):
         shape = {name: getattr(model, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
         looks.setdefault(model.body(model.geom_bodyid[k]).name, []).append(shape)
@@ -145,11 +143,11 @@ class Skeleton:
         Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
         (num_frames, nq), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
         """
-        data = _mj.MjData(self.model)
+        data = mj.MjData(self.model)
         positions, quaternions = (np.empty((len(qpos), self.num_bodies, count)) for count in (3, 4))
         for frame, row in enumerate(qpos):
             data.qpos[:] = row
-            _mj.mj_kinematics(self.model, data)
+            mj.mj_kinematics(self.model, data)
             positions[frame], quaternions[frame] = data.xpos[1:], data.xquat[1:]
         return positions, quaternions
 

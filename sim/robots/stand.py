@@ -63,14 +63,15 @@ class Standing:
         return upright and sum(self.carried.values()) > 0.5
 
 
-def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32, seed: int = 0) -> Standing:
+def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32) -> Standing:
     """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    rough = heights_of(SUPER_GAUSSIAN.hard_random(_TERRAINS, seed))
+    rough = heights_of(SUPER_GAUSSIAN.hard_random(_TERRAINS, 0))
     heights = np.concatenate([np.zeros_like(rough[:1]), rough])
     bank.set_heights(heights)
-    sim = Simulation(robot, bank, np.concatenate([[0], 1 + np.arange(drops) % _TERRAINS]))
+    terrain_of_env = np.concatenate([[0], 1 + np.arange(drops) % _TERRAINS])
+    sim = Simulation(robot, bank, terrain_of_env)
     q = np.zeros((1 + drops, 7 + robot.num_joints), dtype=np.float32)
     q[:, :3], q[:, 6], q[:, 7:] = (8.0, 4.0, robot.default_base_height), 1.0, robot.default_joint_pos
     sim.targets.assign(q)
@@ -78,16 +79,14 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     q[1:, :2] = rng.uniform([5.0, 2.0], [11.0, 6.0], (drops, 2))
     turn = rng.normal(size=(drops, 4))
     q[1:, 3:7] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
-    q[1:, 2] = [
-        reach + _ground(heights[k], x, y) for k, (x, y) in zip(1 + np.arange(drops) % _TERRAINS, q[1:, :2], strict=True)
-    ]
+    q[1:, 2] = [reach + _ground(heights[k], x, y) for k, (x, y) in zip(terrain_of_env[1:], q[1:, :2], strict=True)]
     sim.joint_q.assign(q)
     contacts, overflowed, forces = _let_fall(sim, seconds)
     first = sim.joint_q.numpy()[0].astype(np.float64)
     weight = float(sim.model.body_mass.numpy()[: sim.body_q.shape[1]].sum()) * _GRAVITY
     up = 1.0 - 2.0 * (first[3] ** 2 + first[4] ** 2)
-    on_feet = forces[:, [name in robot.foot_geoms for name in sim.geom_names]] / weight
-    carried = zip(sim.geom_names, forces.mean(axis=0) / weight, strict=True)
+    on_feet = forces[:, [name in robot.foot_geoms for name in robot.geom_names]] / weight
+    carried = zip(robot.geom_names, forces.mean(axis=0) / weight, strict=True)
     return Standing(
         height=(robot.default_base_height, float(first[2])),
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
 from sim.conditions import NOMINAL
+from sim.ground import joined_name
 from sim.terrain import Seed
 
 MOST_HEIGHT = 0.25
@@ -44,7 +45,6 @@ class TerrainSpace:
         Heights [m] have shape (num_terrains, nrow, ncol), row along y, column along x, at nodes ``spacing`` [m] apart.
         ``origin`` is x and y of the first node [m] where they are not 0, in spaces of any spacing alone.
         """
-        ...
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
@@ -108,9 +108,14 @@ class WiderSpace(TerrainSpace):
 
     Attributes:
         inner: The other space.
+        kinds: What its own genes are of.
     """
 
-    inner: TerrainSpace
+    def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
+        """``kinds`` are what its own genes are of, in their order; a class sets :attr:`num_genes`."""
+        self.inner, self.kinds, self.name = inner, kinds, joined_name(inner.name, kinds)
+        for name in ("sha256", "sigma0", "any_spacing", "height_share"):
+            setattr(self, name, getattr(inner, name))
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes into heights on the device, by the other space."""

@@ -1,6 +1,5 @@
 """Any terrain space, and some genes more for the conditions under which robots cross."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,11 +20,9 @@ class UnderConditions(WiderSpace):
 
     def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
         """``kinds`` are some of :data:`sim.conditions.KINDS`, in their order."""
-        self.inner, self.conditions = inner, kinds
-        self.name = joined_name(inner.name, kinds)
-        self.num_genes = inner.num_genes + len(genes_of(kinds))
-        for name in ("sha256", "sigma0", "any_spacing", "height_share", "ground", "genes_per_part"):
-            setattr(self, name, getattr(inner, name))
+        super().__init__(inner, kinds)
+        self.conditions, self.num_genes = kinds, inner.num_genes + len(genes_of(kinds))
+        self.ground, self.genes_per_part = inner.ground, inner.genes_per_part
 
     def _split(self, genes: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Clipped genes of terrains and of conditions."""
@@ -100,7 +97,8 @@ def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray
     Conditions that the space has genes of stay as they are. Shape (number of seeds, its num_genes).
     """
     first = space.num_genes - len(genes_of(space.conditions))
-    own = dict(zip(space.conditions, _kinds_of(genes[first:], space.conditions), strict=True))
+    ends = np.cumsum([len(KINDS[kind]) for kind in space.conditions], dtype=int)
+    own = dict(zip(space.conditions, np.split(genes[first:], ends[:-1]), strict=False))  # without any, one empty part
     rows = []
     for seed in seeds.tolist():
         rng, parts = np.random.default_rng(seed), [genes[:first]]
@@ -113,8 +111,3 @@ def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray
                 parts.append(np.array([value, *(other.absent for other in others)], np.float32))
         rows.append(np.concatenate(parts))
     return np.stack(rows)
-
-
-def _kinds_of(genes: NDArray[np.float32], kinds: Sequence[str]) -> list[NDArray[np.float32]]:
-    """Genes of each kind, of a row of all."""
-    return np.split(genes, np.cumsum([len(KINDS[kind]) for kind in kinds])[:-1]) if kinds else []

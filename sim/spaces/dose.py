@@ -156,10 +156,8 @@ class Dose:
         """Terrains of all values, ``count`` each: those of the first place, value by value, then those of the next.
 
         An obstacle begins at ``count`` places that are spread evenly over 1 m. A cross slope leans to a side that is
-        drawn for each place, rubble is another one at each. All else is the same, and equal for all values.
-
-        Returns:
-            Heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
+        drawn for each place, rubble is another one at each. All else is the same, and equal for all values. What comes
+        are heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
         """
         if self.kind is None:
             return np.tile(self._level(), (count, 1))
@@ -172,7 +170,12 @@ class Dose:
         for name, value in {**self.others, self.parameter: np.array(self.values)}.items():
             quantity = self.quantities[name]
             elements[quantity.field] = np.rint(value / SPACING) if quantity.cells else value
-        return _heights_of(elements.reshape(-1))
+        with wp.ScopedDevice(host_device()):  # each alone on flat ground, before x = 12 m
+            laid: Any = wp.array(elements.reshape(-1, 1), dtype=Element)
+            course.place(laid)
+            heights: Any = wp.empty((len(laid), NUM_ROWS, NUM_COLS), dtype=float)
+            course.rasterise_elements(laid, heights)
+            return np.array(heights.numpy(), np.float32)
 
     def _turns(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         if self.kind is Kind.CROSS_SLOPE:
@@ -195,16 +198,6 @@ class Dose:
         maps = genes[:, SUPER_GAUSSIAN.num_genes :].reshape(len(genes), len(GROUND_KINDS), -1)
         maps[:, GROUND_KINDS.index(self.parameter)] = gene_of(self.parameter, np.array(self.values))[:, None]
         return genes
-
-
-def _heights_of(elements: Any) -> NDArray[np.float32]:
-    """Heights [m] of records of :class:`kernels.course.Element`, each alone on flat ground, before x = 12 m."""
-    with wp.ScopedDevice(host_device()):
-        laid: Any = wp.array(elements[:, None], dtype=Element)
-        course.place(laid)
-        heights: Any = wp.empty((len(elements), NUM_ROWS, NUM_COLS), dtype=float)
-        course.rasterise_elements(laid, heights)
-        return np.array(heights.numpy(), np.float32)
 
 
 _LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)

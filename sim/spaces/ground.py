@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, joined_name, patches_at
+from sim.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, patches_at
 from sim.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
@@ -24,10 +24,8 @@ class OnGround(WiderSpace):
 
     def __init__(self, inner: TerrainSpace, ground: tuple[str, ...]) -> None:
         """Heights are those of ``inner``; ``ground`` are some of :data:`sim.ground.GROUND_KINDS`, in their order."""
-        self.inner, self.ground, self.name = inner, ground, joined_name(inner.name, ground)
-        self.num_genes = inner.num_genes + NUM_PATCHES * len(ground)
-        for name in ("sha256", "sigma0", "any_spacing", "height_share"):
-            setattr(self, name, getattr(inner, name))
+        super().__init__(inner, ground)
+        self.ground, self.num_genes = ground, inner.num_genes + NUM_PATCHES * len(ground)
         # Where maps divide by the parts of the space too: eight patches are a row along the way.
         per_part = inner.genes_per_part
         self.genes_per_part = per_part if per_part and NUM_PATCHES % per_part == 0 else None

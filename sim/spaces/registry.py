@@ -9,7 +9,7 @@ from sim.ground import GROUND_KINDS, joined_name, split_name
 from sim.policy.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace
+from sim.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace, WiderSpace
 from sim.spaces.conditions import UnderConditions
 from sim.spaces.course import COURSE
 from sim.spaces.ground import OnGround
@@ -82,10 +82,8 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
 
 def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     """A shipped space whose heights are those of a robot for which the highest bump is ``height`` [m]."""
-    if isinstance(space, UnderConditions):
-        return UnderConditions(at_height(space.inner, height), space.conditions)
-    if isinstance(space, OnGround):
-        return OnGround(at_height(space.inner, height), space.ground)
+    if isinstance(space, WiderSpace):
+        return type(space)(at_height(space.inner, height), space.kinds)
     if not isinstance(space, ShippedSpace):
         raise ValueError(f"height is for shipped spaces, got {space.name}: a space of your own has its own heights")
     if not 0.0 < height <= MOST_HEIGHT:

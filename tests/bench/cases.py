@@ -286,7 +286,7 @@ def _geom_forces_case(scene: Scene) -> Case:
         launch=sim.read_geom_forces,
         output=sim.geom_force,
         counterpart=counterparts.geom_forces,
-        arguments=(*tensors, len(sim.geom_names)),
+        arguments=(*tensors, len(sim.robot.geom_names)),
         work=Work(bytes=moved, flops=3 * count),
         atol=5e-3,
         rtol=2e-5,

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
+from sim.bank import TerrainBank
 from sim.files.records import robot_identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.model import build_robot
+from sim.simulation import Simulation
 from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE
 
 
@@ -86,8 +88,8 @@ def test_what_is_asked_of_each_robot(anymal, cassie):
 
 def test_roles(robot, c_model):
     roles = {"anymal": [BASE] + [LIMB] * 8 + [FOOT] * 4, "cassie": [BASE, FOOT, FOOT]}[robot.name]
-    assert [robot.role_of(name) for name in robot.geom_names] == roles
-    assert robot.role_of("ground") == 0
+    simulation = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
+    assert simulation.geom_role.numpy().tolist() == roles
     assert {c_model.geom(k).name for k in range(c_model.ngeom)} == set(robot.geom_names)
 
 
