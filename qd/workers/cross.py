@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from qd.run.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
-from qd.workers.shards import join_results
+from qd.workers.shards import arrays_of, join_results
 from sim.files.atomic import write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
@@ -42,7 +42,6 @@ _LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under w
 _LOT_TERRAINS = 3_200  # of a worker at most: their height maps take 600 MB
 _MUJOCO_C_LOT = 4  # terrains of a process
 _KEY, _ROWS = "key", "rows"
-_ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position")
 
 
 class Cache:
@@ -130,8 +129,7 @@ class _Stored:
         """Stores a lot."""
         rows = _row_keys(terrains, seeds)
         key = f"{self._way}-{hashlib.sha256(b''.join(rows)).hexdigest()[:32]}"
-        arrays = {name: getattr(result, name) for name in (*_ARRAYS, "reward") if getattr(result, name) is not None}
-        self._cache.write(key, {_ROWS: np.array([[*row] for row in rows], np.uint8), **arrays})
+        self._cache.write(key, {_ROWS: np.array([[*row] for row in rows], np.uint8), **arrays_of(result)})
         self._places.update({row: (key, place) for place, row in enumerate(rows)})
 
 
@@ -341,8 +339,7 @@ def _in_order(parts: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> Rollou
     """One result of parts that hold some of the terrains each."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
     result = join_results([result for _, result in parts], join=1)
-    arrays = {field.name: getattr(result, field.name) for field in fields(result)}
-    return replace(result, **{name: value[order] for name, value in arrays.items() if isinstance(value, np.ndarray)})
+    return replace(result, **{name: values[order] for name, values in arrays_of(result).items()})
 
 
 def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutResult:
