@@ -261,11 +261,13 @@ class Pipeline:
         """How Ray workers fare; None without them."""
         return None
 
-    def __call__(self, terrains: NDArray, seeds: NDArray) -> RolloutResult:
+    def __call__(
+        self, terrains: NDArray, seeds: NDArray, progress: Callable[[float], None] | None = None
+    ) -> RolloutResult:
         """Crosses each terrain once a replica, as :meth:`in_lots` does; all in one result."""
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
-        return join_results([result for _, result in self.in_lots(terrains, seeds, size)], join=1)
+        return join_results([result for _, result in self.in_lots(terrains, seeds, size, progress)], join=1)
 
     def in_lots(
         self, terrains: NDArray, seeds: NDArray, size: int, progress: Callable[[float], None] | None = None
