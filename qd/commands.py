@@ -16,6 +16,13 @@ from sim.policy.spec import controllers_of
 from sim.robots.find import get_robot, robot_of
 
 
+def _compute(flags: WorkerFlags) -> Any:
+    """Where the flags of a command let terrains be crossed, a :class:`qd.workers.evaluator.Compute`."""
+    from qd.workers.evaluator import Compute
+
+    return Compute.resolve(flags.device, flags.workers, flags.num_envs)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ArchiveFitness:
     """What makes a terrain an elite."""
@@ -78,12 +85,8 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.run.directory import RunDirectory
 
         cfg = RunDirectory(Path(folder)).read_cfg()
-        fitness = ArchiveFitness(
-            penalties=cfg.fitness.penalties,
-            alpha=cfg.fitness.alpha,
-            lam=cfg.fitness.lam,
-            intervals=cfg.intervals,
-        )
+        weights = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam")}
+        fitness = ArchiveFitness(**weights, intervals=cfg.intervals)
         sizes = {name: getattr(cfg, name) for name in ("preset", "iterations", "seed", "replicas", "scheduler")}
         return cls(**sizes, fitness=fitness)
 
@@ -94,11 +97,10 @@ class Archive(ControllerFlags, WorkerFlags):
         from qd.run.directory import free_path
         from qd.run.settings import preset
         from qd.search import say_what_stops_the_robot, search
-        from qd.workers.evaluator import Compute
         from sim.spaces.registry import at_height, load_space, space_at
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
-        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        compute = _compute(self)
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:
             robot, policy, space = get_robot(self.robot), None, load_space(self.space)
@@ -146,11 +148,10 @@ class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
     def named(self) -> tuple[Path, dict[str, Any]]:
         """The run, and what the command line names beside it."""
         from qd.run.directory import find_run
-        from qd.workers.evaluator import Compute
 
         robot = get_robot(self.robot)
         return find_run(robot, self.run, published="never"), {
-            "compute": Compute.resolve(self.device, self.workers, self.num_envs),
+            "compute": _compute(self),
             "certifiers": controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
             "robot": self.robot,
             "policy": self.policy,
@@ -250,9 +251,8 @@ class Check(ControllerFlags, WorkerFlags):
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
         from qd.check import check
-        from qd.workers.evaluator import Compute
 
-        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        compute = _compute(self)
         return 0 if check(get_robot(self.robot), self.policy, compute=compute) else 1
 
 
@@ -291,9 +291,8 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
         from qd.evaluate.tables import is_regression
-        from qd.workers.evaluator import Compute
 
-        compute = Compute.resolve(self.device, self.workers, self.num_envs)
+        compute = _compute(self)
         size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
         makes_tables = self.policies or self.sets or self.archive or self.independent
         if self.pack is not None:
@@ -365,13 +364,12 @@ class Dose(RobotFlag, WorkerFlags):
     def execute(self) -> None:
         """Measures."""
         from qd.evaluate.dose import measure_dose
-        from qd.workers.evaluator import Compute
         from sim.spaces.dose import parse_doses
 
         robot = get_robot(self.robot)
         measure_dose(
             robot, controllers_of(self.policies, robot), parse_doses(self.elements, self.at),
-            compute=Compute.resolve(self.device, self.workers, self.num_envs), resolved=self.resolved,
+            compute=_compute(self), resolved=self.resolved,
             terrains=self.terrains, episodes=self.episodes, seed=self.seed, out=self.out,
         )  # fmt: skip
 

@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import Outcome
 from qd.descriptors import Cells, terrain_ratios
 from sim.files.settings import PositiveFloat, check
 from sim.rates import MAX_INVALID_SHARE, typical_outcome
-
-if TYPE_CHECKING:
-    from sim.rollout import RolloutResult
+from sim.rollout import RolloutResult
 
 FITNESS_FLOOR = -20.0
 """Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
@@ -116,7 +115,7 @@ def rows_of(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
     return Evaluation(**{name: np.array(values[rows]) for name, values in vars(terrains).items()})
 
 
-def evaluation_of(result: "RolloutResult", cells: Cells, cfg: FitnessCfg) -> Evaluation:
+def evaluation_of(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evaluation:
     """Fitness, ratios, cells and rates of the terrains of a rollout; ``cells`` have one ratio a penalty of ``cfg``.
 
     The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
@@ -183,15 +182,13 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     )
 
 
-def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Where the typical episode of each terrain ended: the median, by coordinate, of those that ended alike.
 
     Those are the episodes at the goal where at least half reach it. Else they are those that ended in the commonest of
     the other ways, which are a base collision, the end of the time, and leaving the terrain. ``counted`` says which
     episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
-    from kernels.episode import Outcome  # which imports Warp: not for `--help`
-
     outcome = np.where(counted, result.outcome, Outcome.INVALID)
     alike = counted & (outcome == typical_outcome(outcome)[:, None])
     places = np.sort(np.where(alike[..., None], result.final_position[..., :2], np.inf), axis=1)
@@ -200,7 +197,7 @@ def typical_ends(result: "RolloutResult", counted: NDArray[np.bool_]) -> NDArray
     return np.where(count[:, None] > 0, ends, np.nan).astype(np.float32)
 
 
-def _scaled_penalties(result: "RolloutResult", cfg: FitnessCfg) -> NDArray[np.float64]:
+def _scaled_penalties(result: RolloutResult, cfg: FitnessCfg) -> NDArray[np.float64]:
     """Penalties of ``cfg`` divided by their scales, shape (T, R, P)."""
     columns = [result.penalty_names.index(name) for name in cfg.penalties]
     return np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)

@@ -30,6 +30,7 @@ from sim.policy.spec import ControllerSpec, controller_hash, spec_of, weights_fi
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout, RolloutResult
+from sim.spaces.base import TerrainSpace
 from sim.spaces.conditions import varied_genes, varied_name
 from sim.spaces.registry import get_space, load_space
 
@@ -83,8 +84,8 @@ class Search:
     robot: RobotCfg
     policy: str
     """The controller that was searched, as :func:`sim.policy.loaders.load_policy` takes it."""
-    space: str
-    """Terrain space, as :func:`sim.spaces.registry.load_space` takes it."""
+    space: TerrainSpace
+    """What genes mean, with its code where it is now."""
 
     def read_archive(self) -> Archive:
         """Its archive, which must be of the settings beside it."""
@@ -106,8 +107,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     controller = find_policy(run, cfg, robot_cfg) if policy is None else spec_of(policy, robot_cfg)
     if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
-    space_now = get_space(cfg.space, cfg.space_sha256).name  # where its code is now
-    return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=space_now)
+    return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=get_space(cfg.space, cfg.space_sha256))
 
 
 def controllers_in(folder: Path) -> dict[str, str]:
@@ -138,7 +138,7 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
 
 def check_varied(search: Search, device: str) -> None:
     """Builds a simulation of one robot under varied conditions; a ValueError if it cannot have any."""
-    under = load_space(varied_name(get_space(search.cfg.space, search.cfg.space_sha256)))
+    under = load_space(varied_name(search.space))
     Rollout(search.robot, search.policy, num_terrains=1, num_replicas=1, device=device, space=under)
 
 
@@ -189,7 +189,7 @@ def vary(archive: Archive, certifiers: Mapping[str, str], search: Search, crossi
 
     All cross each fault under the same 20 draws, an episode each.
     """
-    faults, space = archive.counts, get_space(search.cfg.space, search.cfg.space_sha256)
+    faults, space = archive.counts, search.space
     under = load_space(varied_name(space))
 
     rows = np.flatnonzero(archive.is_fault)
@@ -230,8 +230,9 @@ def _cross(
     """Outcomes of 20 episodes on some elites, shape (len(rows), 4)."""
     seeds = elite_seeds(archive, search.cfg.seed, stream=stream)[rows]
     result = crossings.cross(
-        policy, archive.genes[rows], seeds, replicas=EPISODES, space=search.space, how=how, label=label, invalid_ok=True
-    )
+        policy, archive.genes[rows], seeds, replicas=EPISODES, space=search.space.name, how=how, label=label,
+        invalid_ok=True,
+    )  # fmt: skip
     return outcome_counts(result)
 
 
@@ -289,13 +290,12 @@ def judge(
         before = stages[: stages.index("varied")] if "varied" in stages else ()
         if "varied" in stages and "others" not in before and (archive.faults is None or "fresh" in before):
             raise ValueError(f"{run} must have faults, got none judged: begin with the stages resolved, others")
-        families = None
         for stage in stages:
             failing = np.flatnonzero(archive.failing)
             if stage == "fresh":
                 found, seeds = archive, elite_seeds(archive, search.cfg.seed, stream=FRESH_STREAM)
                 result = crossings.cross(
-                    search.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=search.space,
+                    search.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=search.space.name,
                     label="fresh episodes",
                 )  # fmt: skip
                 archive = archive.corrected_by(fresh_values(archive, result, search.cfg.fitness))
@@ -307,26 +307,23 @@ def judge(
                 archive = vary(archive, certifiers, search, crossings)
             else:
                 archive = confirm(archive, failing, search, crossings)
-            if families is None or stage == "fresh":
-                space_now = get_space(search.cfg.space, search.cfg.space_sha256)
-                families = families_of(archive.genes, space_now)
-                causes = causes_of(elites_of(archive), archive, space_now)
+            if stage in ("fresh", stages[0]):
+                families = families_of(archive.genes, search.space)
+                causes = causes_of(elites_of(archive), archive, search.space)
                 archive = replace(archive, family=families, cause=causes)
             origin = compute.origin(search.cfg.seed) | identity(search.robot, search.policy)
-            _write(archive, families, search, certifiers, {stage: origin})
+            _write(archive, search, certifiers, {stage: origin})
     return archive
 
 
-def _write(
-    archive: Archive, families: NDArray[np.int64], search: Search, certifiers: Mapping[str, str], by: dict[str, Any]
-) -> None:
+def _write(archive: Archive, search: Search, certifiers: Mapping[str, str], by: dict[str, Any]) -> None:
     """Writes archive, numbers and figures of a run."""
     file = search.run / SUMMARY_FILE
-    assert archive.fresh is not None
-    seen = None if archive.faults is None else seen_by(archive, families, certifiers)
+    assert archive.fresh is not None and archive.family is not None
+    seen = None if archive.faults is None else seen_by(archive, archive.family, certifiers)
     numbers = read_json(file) if file.exists() else {}
     numbers = {name: value for name, value in numbers.items() if name not in OF_VARIED}
-    numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, families, seen)
+    numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, archive.family, seen)
     numbers["judged_by"] = numbers.get("judged_by", {}) | by
     write_archive(search.run / ARCHIVE_FILE, archive)
     write_atomically(file, to_json(numbers))

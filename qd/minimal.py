@@ -209,9 +209,7 @@ def case_of(
     )
 
 
-def take_apart(
-    archive: Archive, cases: Mapping[int, Case], space: TerrainSpace, search: Search, crossings: Crossings
-) -> dict[int, Minimal]:
+def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crossings: Crossings) -> dict[int, Minimal]:
     """Finds the minimal terrains of some elites, all of them together, by number of the elite; counts of cases grow.
 
     All subsets of an elite are crossed from the same starts; the fresh episodes have others. Starts follow from the
@@ -235,10 +233,10 @@ def take_apart(
                 del steps[number]
         if not trials:
             return dict(sorted(minima.items()))
-        rows = [np.repeat(genes_of(archive.genes[n], trial, space)[None], trial.rows, axis=0) for n, trial in trials]
+        rows = [[genes_of(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
         result = crossings.cross(
             search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
-            replicas=_ROW_EPISODES, space=search.space, at_most=most_rows, invalid_ok=True,
+            replicas=_ROW_EPISODES, space=search.space.name, at_most=most_rows, invalid_ok=True,
             label=f"{len(minima)} of {len(cases)} elites done",
         )  # fmt: skip
         ends = np.cumsum([trial.rows for _, trial in trials])

@@ -25,7 +25,6 @@ from sim.files.command import chosen_elites
 from sim.files.npz import npz_bytes
 from sim.files.records import identity
 from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import get_space
 
 FIGURE_FILE = "minimal.png"
 
@@ -47,7 +46,7 @@ def minimise(
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
     Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
-    certified, confirmed and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
+    confirmed, certified and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
     terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.judge.judge` takes it.
     Returns what the run has now; None without a failing elite.
     """
@@ -56,15 +55,15 @@ def minimise(
     certifiers = certifiers_of(search) if certifiers is None else certifiers
     if judged:
         check_certifiers(certifiers, search, compute.device)
-    terrain_space, half_width = get_space(search.cfg.space, search.cfg.space_sha256), search.robot.footprint[1]
+    half_width = search.robot.footprint[1]
     kind = compute.device.partition(":")[0]
     with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crossings:
         archive = search.read_archive()
         numbers = _failing(archive, elite, run, _MOST_ELITES[kind])
         on_gpu = kind == "cuda"
-        cases = {n: case_of(archive, n, terrain_space, half_width, how, on_gpu=on_gpu) for n in numbers}
-        minima = take_apart(archive, cases, terrain_space, search, crossings)
-        elites = _as_elites(archive, minima, terrain_space)
+        cases = {n: case_of(archive, n, search.space, half_width, how, on_gpu=on_gpu) for n in numbers}
+        minima = take_apart(archive, cases, search, crossings)
+        elites = _as_elites(archive, minima, search.space)
         if judged:
             rows = np.arange(len(elites))
             elites = certify(confirm(elites, rows, search, crossings), rows, certifiers, search, crossings)
@@ -72,7 +71,7 @@ def minimise(
         entries = {} if before is None else {entry["elite"]: entry for entry in before.numbers["elites"]}
         genes = {} if before is None else dict(before.genes)
         for place, (number, minimal) in enumerate(minima.items()):
-            entry = _entry(archive, number, cases[number], minimal, terrain_space, half_width)
+            entry = _entry(archive, number, cases[number], minimal, search.space, half_width)
             entries[number] = entry | {"verdict": verdict_of(elites, place), **judgement(elites, place)}
             genes[number] = elites.genes[place]
         if not numbers:
@@ -87,7 +86,7 @@ def minimise(
         arrays |= {"elite": np.array(sorted(genes)), "genes": np.array([genes[number] for number in sorted(genes)])}
         write_atomically(run / MINIMAL_FILE, npz_bytes(arrays))
         write_atomically(run / NUMBERS_FILE, to_json(content))
-        save_figure(run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, terrain_space))
+        save_figure(run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, search.space))
     found = MinimalTerrains(numbers=content, genes=genes)
     for number in minima:
         print(f"Elite {number}: {found.words(number)}.")

@@ -29,10 +29,8 @@ _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not a
 class RandomEmitter:
     """Asks for terrains drawn anew each time by ``uniform_random`` or ``hard_random``."""
 
-    def __init__(
-        self, archive: GridArchive, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence
-    ) -> None:
-        self.archive, self.method, self.batch_size = archive, method, batch_size
+    def __init__(self, space: TerrainSpace, method: str, batch_size: int, stream: np.random.SeedSequence) -> None:
+        self.method, self.batch_size = method, batch_size
         self.space, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
 
@@ -44,10 +42,10 @@ class RandomEmitter:
 
 
 class SurrogateEmitter:
-    """Asks for what a surrogate proposes: one surrogate for all such emitters of a search."""
+    """Asks for what the surrogate proposes, of which a scheduler has one for all such emitters."""
 
-    def __init__(self, archive: GridArchive, surrogate: Surrogate, batch_size: int) -> None:
-        self.archive, self.surrogate, self.batch_size = archive, surrogate, batch_size
+    def __init__(self, batch_size: int) -> None:
+        self.batch_size = batch_size
 
 
 class Asked(NamedTuple):
@@ -96,10 +94,9 @@ class Scheduler:
 
     def _make_emitter(self, cfg: SchedulerCfg, method: str, space: TerrainSpace, stream: Any) -> Emitter:
         if method.endswith("random"):
-            return RandomEmitter(self.result, space, method, cfg.batch_size, stream)
+            return RandomEmitter(space, method, cfg.batch_size, stream)
         if method == "surrogate":
-            assert self.surrogate is not None
-            return SurrogateEmitter(self.result, self.surrogate, cfg.batch_size)
+            return SurrogateEmitter(cfg.batch_size)
         if method == "map_elites":
             first, later = stream.spawn(2)
             return IsoLineEmitter(

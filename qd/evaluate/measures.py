@@ -85,9 +85,7 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
 
 
 def _group(rates: dict[str, np.ndarray], members: np.ndarray) -> dict[str, Any]:
-    chosen = {name: values[members & ~np.isnan(values)] for name, values in rates.items()}
-    means = {name: float(values.mean()) if len(values) else None for name, values in chosen.items()}
-    return {"terrains": int(members.sum()), **means}
+    return {"terrains": int(members.sum())} | {name: mean_of(values[members]) for name, values in rates.items()}
 
 
 def summarise(
@@ -97,8 +95,7 @@ def summarise(
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
     everywhere = np.ones(len(result.outcome), bool)
     summary = _group(rates, everywhere)
-    for name, values in rates.items():
-        summary[f"{name}_interval"] = bootstrap_interval(values[~np.isnan(values)], seed)
+    summary |= {f"{name}_interval": interval_of(values, seed, None) for name, values in rates.items()}
     summary["episodes"] = int(result.outcome.size)
     ends = [outcome for outcome in Outcome if outcome != Outcome.TILT]
     summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in ends}

@@ -60,8 +60,6 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """Reads the state of a search that :func:`save_checkpoint` wrote, as data; a file of anything else is refused."""
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no checkpoint at {path}: give the directory of a search's run") from None
     except OSError as error:
         raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {_REMEDY}") from None
     header = len(_MAGIC) + _HASH_BYTES

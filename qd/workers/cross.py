@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from qd.run.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
-from qd.workers.shards import join_results
+from qd.workers.shards import arrays_of, join_results
 from sim.files.atomic import write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
@@ -42,7 +42,6 @@ _LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under w
 _LOT_TERRAINS = 3_200  # of a worker at most: their height maps take 600 MB
 _MUJOCO_C_LOT = 4  # terrains of a process
 _KEY, _ROWS = "key", "rows"
-_ARRAYS = ("penalties", "outcome", "invalidity", "fallen", "duration_s", "final_position")
 
 
 class Cache:
@@ -130,8 +129,7 @@ class _Stored:
         """Stores a lot."""
         rows = _row_keys(terrains, seeds)
         key = f"{self._way}-{hashlib.sha256(b''.join(rows)).hexdigest()[:32]}"
-        arrays = {name: getattr(result, name) for name in (*_ARRAYS, "reward") if getattr(result, name) is not None}
-        self._cache.write(key, {_ROWS: np.array([[*row] for row in rows], np.uint8), **arrays})
+        self._cache.write(key, {_ROWS: np.array([[*row] for row in rows], np.uint8), **arrays_of(result)})
         self._places.update({row: (key, place) for place, row in enumerate(rows)})
 
 
@@ -221,7 +219,8 @@ class Crossings:
         done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in parts)])
         missing = np.setdiff1d(np.arange(len(terrains)), done)
         try:
-            for numbers, result in self._cross_missing(cfg, how, terrains, seeds, missing, label, at_most):
+            for part, result in self._cross_lots(cfg, how, terrains[missing], seeds[missing], label, at_most):
+                numbers = missing[part]
                 if stored:
                     stored.write(terrains[numbers], seeds[numbers], result)
                 parts.append((numbers, result))
@@ -245,29 +244,21 @@ class Crossings:
             self._stored[key] = _Stored(self._cache, key, self.robot.penalties)
         return self._stored[key]
 
-    def _cross_missing(
-        self,
-        cfg: EvaluatorCfg,
-        how: How,
-        terrains: NDArray[Any],
-        seeds: NDArray[Any],
-        missing: NDArray[np.intp],
-        label: str,
-        at_most: int | None,
-    ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
-        """Numbers and results of the terrains that are not in the cache, lot by lot."""
-        if not len(missing):
+    def _cross_lots(
+        self, cfg: EvaluatorCfg, how: How, terrains: NDArray[Any], seeds: NDArray[Any], label: str, at_most: int | None
+    ) -> Iterator[tuple[slice, RolloutResult]]:
+        """Which of the terrains a lot has, and its result."""
+        if not len(terrains):
             return
         if how == "mujoco_c":
-            yield from self._cross_in_mujoco_c(cfg, terrains, seeds, missing, label)
+            yield from self._cross_in_mujoco_c(cfg, terrains, seeds, label)
             return
-        count = max(len(missing), at_most or 0)
+        count = max(len(terrains), at_most or 0)
         lot = _lot_size(replace(cfg, num_terrains=count))
         try:
             pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
             with Bar(label) as bar:
-                for part, result in pipeline.in_lots(terrains[missing], seeds[missing], lot, bar.move_to):
-                    yield missing[part], result
+                yield from pipeline.in_lots(terrains, seeds, lot, bar.move_to)
         except BaseException:
             self.close()  # what failed is not used again
             raise
@@ -285,20 +276,20 @@ class Crossings:
         return pipeline
 
     def _cross_in_mujoco_c(
-        self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], missing: NDArray[np.intp], label: str
-    ) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
+        self, cfg: EvaluatorCfg, terrains: NDArray[Any], seeds: NDArray[Any], label: str
+    ) -> Iterator[tuple[slice, RolloutResult]]:
         workers, done = parse_workers(cfg.workers), list[RolloutResult]()
         processes = (None if workers.on_ray else workers.count) or available_cores()  # Ray has no part in it
-        with Bar(label, len(missing)) as bar:
+        with Bar(label, len(terrains)) as bar:
             crossings = cross_terrains(
-                self.robot, cfg.policy, terrains[missing], seeds[missing], space=load_space(cfg.space),
+                self.robot, cfg.policy, terrains, seeds, space=load_space(cfg.space),
                 num_episodes=cfg.num_replicas, device=cfg.device, processes=processes, resolved=True,
             )  # fmt: skip
             for count, crossed in enumerate(crossings, 1):
                 bar.move_to(count)
                 done.append(crossed)
-                if len(done) == _MUJOCO_C_LOT * processes or count == len(missing):
-                    yield missing[count - len(done) : count], join_results(done, join=1)
+                if len(done) == _MUJOCO_C_LOT * processes or count == len(terrains):
+                    yield slice(count - len(done), count), join_results(done, join=1)
                     done.clear()
 
 
@@ -341,8 +332,7 @@ def _in_order(parts: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> Rollou
     """One result of parts that hold some of the terrains each."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
     result = join_results([result for _, result in parts], join=1)
-    arrays = {field.name: getattr(result, field.name) for field in fields(result)}
-    return replace(result, **{name: value[order] for name, value in arrays.items() if isinstance(value, np.ndarray)})
+    return replace(result, **{name: values[order] for name, values in arrays_of(result).items()})
 
 
 def _no_terrains(cfg: EvaluatorCfg, penalty_names: tuple[str, ...]) -> RolloutResult:

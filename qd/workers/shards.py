@@ -13,7 +13,7 @@ _STEPS = ("physics_steps", "robot_steps", "busy_steps")
 
 def copied(result: RolloutResult) -> RolloutResult:
     """A result that can be written to, which what Ray delivers cannot."""
-    return replace(result, **{name: value.copy() for name, value in _arrays(result).items()})
+    return replace(result, **{name: value.copy() for name, value in arrays_of(result).items()})
 
 
 def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResult:
@@ -21,7 +21,7 @@ def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResul
     if len(results) == 1:
         return results[0]
     changes: dict[str, Any] = {
-        name: np.concatenate([getattr(result, name) for result in results]) for name in _arrays(results[0])
+        name: np.concatenate([getattr(result, name) for result in results]) for name in arrays_of(results[0])
     }
     for name in (*_STEPS, "wall_s"):
         combine = max if join == 0 and name in ("physics_steps", "wall_s") else sum
@@ -38,7 +38,7 @@ def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
     shape = (count, num_replicas)
-    wrong = [f"{name} of shape {value.shape}" for name, value in _arrays(result).items() if value.shape[:2] != shape]
+    wrong = [f"{name} of shape {value.shape}" for name, value in arrays_of(result).items() if value.shape[:2] != shape]
     if wrong:
         return f"{', '.join(wrong)} for {count} terrains of {num_replicas} episodes"
     penalties, invalid = result.penalties, result.invalid
@@ -55,6 +55,7 @@ def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
     return None
 
 
-def _arrays(result: RolloutResult) -> dict[str, np.ndarray]:
+def arrays_of(result: RolloutResult) -> dict[str, np.ndarray]:
+    """The arrays of a result by their names, which lead with (num_terrains, num_replicas)."""
     values = {field.name: getattr(result, field.name) for field in fields(result)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -159,12 +159,12 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
         whose = np.abs(archive.genes[:, None] - genes).sum(axis=2).argmin(axis=0)
         return (np.abs(genes[:, 7::8]) > 0.6 * np.abs(archive.genes[whose, 7::8]))[:, [2, 5]].all(axis=1)
 
-    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space="super_gaussian")
+    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=SUPER_GAUSSIAN)
 
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
         with Crossings(ROBOT, compute_by(robots)) as crossings:
-            return cases, take_apart(archive, cases, SUPER_GAUSSIAN, search, crossings)
+            return cases, take_apart(archive, cases, search, crossings)
 
     together, alone = Robots(fails), Robots(fails)
     cases, minima = apart((2, 0), together)
@@ -187,7 +187,7 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
     genes[0, 8 * 3 : 8 * 4] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, 0.7)  # a bump across the way
     genes[0, [64, 68, 69]] = 0.5, 0.4, 0.4  # a payload and a push; motors as they are
     fresh = replace(fresh_values(archive), goal_rate=np.full(1, 0.1))
-    archive = replace(archive, fresh=fresh, genes=genes, space=space.name)
+    archive = replace(archive, fresh=fresh, genes=genes, space=space)
 
     def fails(cfg, genes, seeds):
         """With this payload, on the bump where it is higher than .6 of what the elite has."""
@@ -195,9 +195,9 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
 
     case = case_of(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
-    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space.name)
+    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
     with Crossings(ROBOT, compute_by(Robots(fails))) as crossings:
-        minimal = take_apart(archive, {0: case}, space, search, crossings)[0]
+        minimal = take_apart(archive, {0: case}, search, crossings)[0]
     assert (minimal.parts, minimal.scale) == ((3, 8), 0.625)
     effects = effects_of(genes[0], range(11), space)
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")
