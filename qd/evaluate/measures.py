@@ -121,5 +121,5 @@ def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
         "vx_error_mean": float(error[usable].mean()) if usable.any() else None,
         "vx_error_interval": bootstrap_interval(per_terrain, seed),
         "episodes": int(usable.sum()),
-        "goal_rate": float(result.reached_goal.mean()),
+        "goal_rate": float(result.reached_goal[~result.invalid].mean()) if not result.invalid.all() else None,
     }

@@ -49,7 +49,7 @@ def find_run(
     folder = RESULTS / robot.name / "archive"
     runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
     files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
-    newest = next((file.parent for file in files if read_archive(file).robot == robot.name), None)
+    newest = next((file.parent for file in files if _robot_of(file) == robot.name), None)
     if newest is not None:
         runs.insert(len(runs) if published == "first" else 0, newest)
     if not runs:
@@ -59,6 +59,15 @@ def find_run(
         )
     print(f"Run: {runs[0]}", flush=True)
     return runs[0]
+
+
+def _robot_of(file: Path) -> str | None:
+    """Robot of an archive; None, with a line, of one that cannot be read."""
+    try:
+        return read_archive(file).robot
+    except ValueError as error:
+        print(f"Passed over: {error}", flush=True)
+        return None
 
 
 def directory_of(run: Path) -> Path:

@@ -142,10 +142,11 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
 
 def _cache_remedy(error: Exception) -> str:
     """What helps where Warp's or numba's cache of compiled code is damaged, or cannot be written; else nothing."""
-    folder = os.environ.get("WARP_CACHE_PATH") or str(Path.home() / ".cache" / "warp")
+    folder = Path(os.environ.get("WARP_CACHE_PATH") or Path.home() / ".cache" / "warp").absolute()
     if re.search(r"Failed to load (CPU|CUDA) module", str(error)):
         return f": the compiled kernels in {folder} are damaged: remove that folder, they are compiled again"
-    if isinstance(error, OSError) and error.filename and str(error.filename).startswith((folder, str(Path.home()))):
+    file = Path(str(error.filename)).absolute() if isinstance(error, OSError) and error.filename else None
+    if file is not None and (file.is_relative_to(folder) or folder.is_relative_to(file)):
         return f": kernels are compiled into {folder}: let WARP_CACHE_PATH name a folder that can be written"
     if "no locator available" in str(error):
         return ": let NUMBA_CACHE_DIR name a folder that can be written"

@@ -87,16 +87,16 @@ def crossing_model(
     if patches:
         _add_patches(spec, heights, patches)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
-        _add_geom(spec, _GROUND, (0.0, 0.0, float(heights[0, 0])), type=mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
+        _add_geom(spec, GROUND, (0.0, 0.0, float(heights[0, 0])), type=mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     else:
-        _add_field(spec, heights, _GROUND)
+        _add_field(spec, heights, GROUND)
     for name in robot.geom_names:
         spec.add_sensor(
             name=name, type=mj.mjtSensor.mjSENS_CONTACT, objtype=mj.mjtObj.mjOBJ_GEOM, objname=name,
             intprm=[1 << mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
         )  # fmt: skip
     model = spec.compile()
-    of_ground = np.flatnonzero([model.geom(k).name.startswith(_GROUND) for k in range(model.ngeom)])
+    of_ground = np.flatnonzero([model.geom(k).name.startswith(GROUND) for k in range(model.ngeom)])
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
     if patches:
@@ -109,7 +109,7 @@ NO_SOFTNESS = (
     "aside by the facets beside it: leave MuJoCo C out, or +softness"
 )
 """Why spaces of soft ground are refused."""
-_GROUND = "ground"
+GROUND = "faultline/ground"  # no name of a robot's geom begins so
 _DEPTH = 2.0  # of a level patch [m]
 
 
@@ -172,7 +172,7 @@ def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
 def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> None:
     """Adds a geom a patch, a box where it is level and else a heightfield."""
     for number, patch in enumerate(patches):
-        part, name = heights[patch.rows, patch.cols], f"{_GROUND}-{number}" if number else _GROUND
+        part, name = heights[patch.rows, patch.cols], f"{GROUND}-{number}" if number else GROUND
         if np.ptp(part) > 0.0:
             if patch.time_constant_s:
                 raise ValueError(NO_SOFTNESS)

@@ -89,6 +89,7 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     for number in (1, 3, 2):
         make_run(Path(f"runs/{number}"), number)
     make_run(Path("runs/cassie"), 9, robot="cassie")
+    (make_run(Path("runs/damaged"), 10) / "archive.npz").write_bytes(b"no archive")
     assert find_run(robot) == find_run(robot, published="never") == Path("runs/3")
     assert folder_for(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
     assert find_run(robot, published="first") == published

@@ -32,6 +32,11 @@ ERRORS = {
         "error: [Errno 13] Permission denied: '/cache/warp/x': kernels "
         "are compiled into /cache/warp: let WARP_CACHE_PATH name a folder that can be written\n",
     ),
+    "file at home": (
+        OSError(2, "No such file", str(Path.home() / "hill.png")),
+        2,
+        f"error: [Errno 2] No such file: '{Path.home() / 'hill.png'}'\n",
+    ),
     "bug": (ZeroDivisionError(), 0, ""),
 }
 

@@ -11,7 +11,7 @@ from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
-from sim.mujoco_c.model import crossing_model, step_penalties, to_mujoco
+from sim.mujoco_c.model import GROUND, crossing_model, step_penalties, to_mujoco
 from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
@@ -41,7 +41,7 @@ def test_starts_are_those_of_the_rollout(robot):
 def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_converge(robot):
     heights = np.random.default_rng(6).uniform(-0.2, 0.2, FLAT.shape).astype(np.float32)
     model = crossing_model(robot, heights)
-    ground = model.geom("ground").id
+    ground = model.geom(GROUND).id
     assert model.geom_solmix[ground] == 0.0
     assert model.geom_friction[ground, 0] == GROUND_FRICTION
     assert model.opt.iterations == 100
@@ -60,7 +60,7 @@ def test_plain_mujoco_takes_any_robot_that_the_search_takes(tmp_path):
     model = crossing_model(get_robot(str(with_mesh(tmp_path / "mesh", "mjcf"))), FLAT)
     assert (model.nu, model.nq) == (8, 15)
     assert model.geom("trunk").type[0] == mujoco.mjtGeom.mjGEOM_MESH
-    assert model.geom("trunk").conaffinity[0] == 0 and model.geom("ground").conaffinity[0] == 1
+    assert model.geom("trunk").conaffinity[0] == 0 and model.geom(GROUND).conaffinity[0] == 1
     # A URDF says nothing of contact: friction 1, the time constant of the shipped robots.
     given = KINDS["urdf"] | {"more": f"{GAINS}\n    friction=0.6,\n    contact_time_constant_s=0.02,"}
     for number, (kind, contact) in enumerate((({}, [0.8, 0.01]), (KINDS["urdf"], [1.0, 0.01]), (given, [0.6, 0.02]))):
