@@ -11,7 +11,7 @@ from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
 from sim.ground import GroundMaps, joined_name, split_name
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.mujoco_c.model import crossing_model
+from sim.mujoco_c.model import GROUND, crossing_model
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -153,7 +153,7 @@ def test_mujoco_c_has_a_geom_where_the_ground_is_alike(anymal):
     ground, heights = GroundMaps.plain(1), FLAT.copy()
     ground.friction[0, :, 2], heights[:, 86:] = 0.25, 0.1
     model = crossing_model(anymal, heights, ground=ground)
-    geoms = [model.geom(name) for name in ("ground", "ground-1", "ground-2")]
+    geoms = [model.geom(GROUND + end) for end in ("", "-1", "-2")]
     assert model.ngeom - crossing_model(anymal, heights).ngeom == 4 * 3 - 1
     box, field = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
     assert [geom.type[0] for geom in geoms] == [box, field, box]

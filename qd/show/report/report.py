@@ -120,12 +120,12 @@ def cross_cases(
     wanted = [on_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
     recorded = dict(zip(crossings, recordings.all_of(wanted), strict=True))
     with Bar("drawing", len(heads) + len(others)) as bar:
-        for number in (*heads, *others):
+        for done, number in enumerate((*heads, *others), 1):
             name = names.get(number)
             other = None if name is None else (name, recorded[number, files[name]])
             case = _case(opened_run, ranking, number, recorded[number, policy], other, number in heads, pictured)
             cases |= {number: case} if case else {}
-            bar.move_to(len(cases))
+            bar.move_to(done)
     return cases
 
 

@@ -81,13 +81,16 @@ def find_show(
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
-    numbers = [terrain.number for terrain in opened_run.terrains(elite)] if elite else [None]
-    if len(numbers) > 1:
-        raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite}'")
-    (number,) = numbers
+    if elite and minimal:
+        raise ValueError(f"elite and minimal both say what to open, got '{elite}' and '{minimal}': leave one out")
     minima = read_minimal(opened_run.folder, opened_run.archive) if minimal is None else opened_run.minima()
     if minima is not None and minimal is not None:
-        number = minima.chosen(minimal, opened_run.path)[0]
+        numbers = minima.chosen(minimal, opened_run.path)
+    else:
+        numbers = [terrain.number for terrain in opened_run.terrains(elite)] if elite else [None]
+    if len(numbers) > 1:
+        raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite or minimal}'")
+    (number,) = numbers
     controllers, note = _controllers_of(policies, opened_run)
     return Show(
         opened_run=opened_run,

@@ -35,6 +35,7 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path, 
         ({"robot": "spot"}, "spot"),
         ({"elite": "5000"}, "5000"),
         ({"elite": "0 1"}, "0 1"),
+        ({"elite": "0", "minimal": "1"}, "leave one out"),
         ({"policies": ("shipped",)}, "policies"),
     ],
 )
