@@ -27,7 +27,9 @@ BATCH = 64
 FEWEST = 64
 """Valid terrains that must be known before the networks are asked."""
 MOST = 200_000
-"""Terrains that are learned from, the newest ones."""
+"""Terrains that are learned from, the newest ones; fewer where their maps would take more than 8 GB."""
+MOST_BYTES = 8 << 30
+"""Of the maps of these."""
 _AT_ONCE = {"cpu": 1024, "cuda": 8192}  # terrains that are judged at once
 _GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
@@ -93,6 +95,11 @@ class Surrogate:
         """What genes mean."""
         return get_space(self.space_name, self.space_sha256)
 
+    @property
+    def _most(self) -> int:
+        """Terrains that it learns from at most."""
+        return min(MOST, MOST_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
+
     def __len__(self) -> int:
         """Terrains that it learns from."""
         return len(self._genes)
@@ -140,8 +147,8 @@ class Surrogate:
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         units = np.rint(genes * _GENE_UNITS).astype(np.int16)
-        self._genes = np.concatenate([self._genes, units])[-MOST:]
-        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-MOST:]
+        self._genes = np.concatenate([self._genes, units])[-self._most :]
+        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-self._most :]
         self._num_unmapped = min(self._num_unmapped + len(units), len(self))
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
@@ -155,8 +162,8 @@ class Surrogate:
         """The ring of maps, once it has those of all terrains, and the place of each terrain in it."""
         self._num_mapped += self._num_unmapped
         size = len(self._maps)
-        while size < min(self._num_mapped, MOST):
-            size = min(max(FEWEST, 2 * size), MOST)
+        while size < min(self._num_mapped, self._most):
+            size = min(max(FEWEST, 2 * size), self._most)
         if size > len(self._maps):  # nothing was overwritten yet, so that maps stay in their places
             grown = self._maps.new_empty(size, *self._maps.shape[1:])
             grown[: len(self._maps)] = self._maps
