@@ -79,8 +79,8 @@ class Pool:
 
     def tell(
         self, solutions: NDArray[np.float32], number: NDArray[np.int64], told: Evaluation, iteration: int
-    ) -> tuple[Evaluation, NDArray[np.int64]]:
-        """Takes in crossings of T terrains, and returns what is known of these now, and their numbers.
+    ) -> Evaluation:
+        """Takes in crossings of T terrains, and returns what is known of these now.
 
         Args:
             solutions: Unclipped genes, shape (T, num_genes).
@@ -105,10 +105,8 @@ class Pool:
         self.iteration = np.append(self.iteration, np.full(len(new), iteration))
         self.number = np.append(self.number, self._next + np.arange(len(new)))
         self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
-        number = number.copy()
-        number[new] = self.number[len(self) - len(new) :]
         self._next += len(new)
-        return known, number
+        return known
 
     def least_known(self, count: int, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
         """Numbers of ``count`` terrains to cross again, those with the fewest crossings; none while there is none.

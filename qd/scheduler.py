@@ -177,11 +177,10 @@ class Scheduler:
         asked = self._asked[group]
         assert asked is not None
         self._asked[group] = None
-        number = None
         if self.pool is not None:
-            evaluation, number = self.pool.tell(*asked, evaluation, iteration)
+            evaluation = self.pool.tell(*asked, evaluation, iteration)
         if self.surrogate is not None:
-            self.surrogate.learn(asked.solutions, evaluation, number)
+            self.surrogate.learn(asked.solutions, evaluation)
         rows = _rows_of(asked.solutions, evaluation, iteration)
         added_to_result = self._add_to_result(rows, evaluation.valid & (evaluation.fitness > FITNESS_FLOOR))
         added = added_to_result if self.archive is self.result else self.archive.add(**rows)

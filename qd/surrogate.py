@@ -75,7 +75,6 @@ class Surrogate:
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
-        self._number = np.zeros(0, np.int64)
         self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
         self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
@@ -123,19 +122,15 @@ class Surrogate:
         with on_stream(self._stream):
             self._training = Training(self._networks.to(device), self._loss, device, moments)
 
-    def learn(
-        self, genes: NDArray[np.float32], evaluation: Evaluation, number: NDArray[np.int64] | None = None
-    ) -> None:
+    def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         """Remembers terrains, of genes (N, num_genes), and trains for their share of an iteration's steps.
 
-        Invalid ones are left out; each step draws from all that it remembers. A terrain that was crossed again is known
-        by its ``number``, (N,), and remembered once, by what is known of it now; without numbers all are new.
+        Invalid ones are left out; each step draws from all that it remembers.
         """
-        numbers = 1 + self._number.max(initial=-1) + np.arange(len(genes)) if number is None else number
         valid = evaluation.valid
         if valid.any():
             self._compare(clipped(genes[valid]), evaluation.ratios[valid])
-            self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid], numbers[valid])
+            self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
         if len(self) >= FEWEST:
             with on_stream(self._stream):
                 self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
@@ -150,15 +145,10 @@ class Surrogate:
         before = squared_error if self.squared_error is None else self.squared_error
         self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
 
-    def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32], number: NDArray[np.int64]) -> None:
-        last = len(number) - 1 - np.unique(number[::-1], return_index=True)[1]  # told of each
-        _, row, known = np.intersect1d(self._number, number[last], assume_unique=True, return_indices=True)
-        self._targets[row] = targets[last[known]]
-        new = np.delete(last, known)
-        units = np.rint(genes[new] * _GENE_UNITS).astype(np.int16)
+    def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
+        units = np.rint(genes * _GENE_UNITS).astype(np.int16)
         self._genes = np.concatenate([self._genes, units])[-self._most :]
-        self._targets = np.concatenate([self._targets, targets[new].astype(np.float16)])[-self._most :]
-        self._number = np.concatenate([self._number, number[new]])[-self._most :]
+        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-self._most :]
         self._num_unmapped = min(self._num_unmapped + len(units), len(self))
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
@@ -179,10 +169,10 @@ class Surrogate:
             grown[: len(self._maps)] = self._maps
             self._maps = grown
         places = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
-        for first in range(len(self) - self._num_unmapped, len(self), _AT_ONCE["cpu"]):
-            new = slice(first, first + _AT_ONCE["cpu"])
-            genes = torch.from_numpy(self._genes[new]).to(self.device) / _GENE_UNITS
-            self._maps[places[new]] = self._map_genes(genes).half()
+        new = slice(len(self) - self._num_unmapped, None)
+        units = torch.from_numpy(self._genes[new]).to(self.device)
+        for part, rows in zip(units.split(_AT_ONCE["cpu"]), places[new].split(_AT_ONCE["cpu"]), strict=True):
+            self._maps[rows] = self._map_genes(part / _GENE_UNITS).half()
         self._num_unmapped = 0
         return self._maps, places
 
@@ -330,7 +320,6 @@ class Surrogate:
             "space": (self.space_name, self.space_sha256),
             "rng": self._rng,
             "genes": self._genes,
-            "number": self._number,
             "targets": self._targets,
             "scale": self._scale,
             "squared_error": self.squared_error,
@@ -344,7 +333,6 @@ class Surrogate:
         self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
         self.space_name, self.space_sha256 = state["space"]
         self._rng, self._genes, self._targets = state["rng"], state["genes"], state["targets"]
-        self._number = state["number"]
         self._scale, self.squared_error = state["scale"], state["squared_error"]
         self._networks = Networks(1 + num_maps(self.space), self._targets.shape[1])
         moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state["learned"]]

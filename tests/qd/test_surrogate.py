@@ -243,26 +243,6 @@ def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name,
         assert len(search) == length
 
 
-def test_a_terrain_that_is_crossed_again_is_remembered_once_by_what_was_told_last(monkeypatch):
-    given = []
-    monkeypatch.setattr(Training, "run", lambda self, maps, targets, drawn, turned: given.append((maps, targets)))
-    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=60))
-    genes, (first, second) = (
-        SUPER_GAUSSIAN.hard_random(64, 0),
-        (crossed(SUPER_GAUSSIAN.hard_random(64, 0), k) for k in (0, 1)),
-    )
-    search.learn(genes, first, np.arange(64))
-    again = np.array([5, 7, 5, 3])
-    told = rows_of(second, np.array([60, 61, 62, 63]))
-    search.learn(genes[again], told, again)
-    assert len(search) == 64
-    (maps, targets), (maps_again, targets_again) = given
-    assert torch.equal(maps, maps_again)
-    before, after = (columns[:, : CELLS.num_ratios] for columns in (targets, targets_again))
-    assert (after != before).any(dim=1).nonzero().flatten().tolist() == [3, 5, 7]
-    np.testing.assert_allclose(after[[3, 5, 7]], told.ratios[[3, 2, 1]], atol=1e-3)
-
-
 def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(monkeypatch):
     """By what training is given: 60 terrains at a time up to 300, and then in place of the oldest."""
     monkeypatch.setattr(module, "MOST", 300)
