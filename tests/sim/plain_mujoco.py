@@ -3,14 +3,14 @@
 import mujoco
 import numpy as np
 
-from sim.mujoco_c.model import crossing_model
+from sim.mujoco_c.model import GROUND, crossing_model
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 
 def on_plane(robot, quat_wxyz=(1, 0, 0, 0)) -> mujoco.MjModel:
     """The robot on an infinite plane through (8, 4, 0), as MuJoCo has level ground."""
     model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS)))
-    ground = model.geom("ground").id
+    ground = model.geom(GROUND).id
     model.geom_pos[ground], model.geom_quat[ground] = (8.0, 4.0, 0.0), quat_wxyz
     model.geom_sameframe[ground] = 0  # else MuJoCo keeps the frame of its body
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its tree knows the level ground

@@ -9,9 +9,9 @@ import pytest
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
-from sim.ground import GroundMaps, joined_name, split_name
+from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.mujoco_c.model import crossing_model
+from sim.mujoco_c.model import GROUND, crossing_model
 from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -135,12 +135,6 @@ def test_maps_out_of_range_are_refused(changes, field):
         GroundMaps(**values | changes)
 
 
-def test_names_say_what_the_ground_has():
-    assert split_name("course") == ("course", ())
-    assert split_name("a+b/x.py:Ridges+softness+friction") == ("a+b/x.py:Ridges", ("friction", "softness"))
-    assert joined_name("course", ("friction",)) == "course+friction"
-
-
 def test_mujoco_c_has_no_soft_slopes_and_one_friction(anymal):
     with pytest.raises(ValueError, match="soft"):
         crossing_model(anymal, slope(0.1), ground=uniform(tau=[0.02]))
@@ -153,7 +147,7 @@ def test_mujoco_c_has_a_geom_where_the_ground_is_alike(anymal):
     ground, heights = GroundMaps.plain(1), FLAT.copy()
     ground.friction[0, :, 2], heights[:, 86:] = 0.25, 0.1
     model = crossing_model(anymal, heights, ground=ground)
-    geoms = [model.geom(name) for name in ("ground", "ground-1", "ground-2")]
+    geoms = [model.geom(GROUND + end) for end in ("", "-1", "-2")]
     assert model.ngeom - crossing_model(anymal, heights).ngeom == 4 * 3 - 1
     box, field = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
     assert [geom.type[0] for geom in geoms] == [box, field, box]
