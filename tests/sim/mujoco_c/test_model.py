@@ -182,7 +182,7 @@ def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
         cassie, "tests.sim.policies:stand", np.stack([FLAT, FLAT + np.float32(0.2)]), np.uint32([3, 4]),
         space=SUPER_GAUSSIAN, num_episodes=26, processes=2, resolved=False,
     )  # fmt: skip
-    for number, result in enumerate(crossed):
+    for number, result in zip(range(2), crossed, strict=True):
         heights = FLAT + np.float32(0.2 * number)
         starts = draw_starts(cassie, heights, 3 + number, 26, "cpu")
         expected = cross(cassie, stand, heights, starts[25:])
