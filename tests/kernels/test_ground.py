@@ -33,12 +33,6 @@ def test_genes_by_hand():
     np.testing.assert_allclose(decoded(decode_softness, genes)[0, :, 7], expected, rtol=1e-5)
 
 
-def test_the_first_genes_are_the_row_of_patches_at_low_y():
-    genes = np.ones((1, 32))
-    genes[0, 8 * 2 + 5] = -1
-    assert np.argwhere(decoded(decode_friction, genes)[0] < 1).tolist() == [[2, 5]]
-
-
 def test_a_map_of_another_shape_is_named():
     with pytest.raises(ValueError, match=r"must have shape \(1, 4, 8\) and 32 genes a terrain"):
         decode_friction(wp.zeros((1, 31), dtype=float), wp.zeros((1, 4, 8), dtype=float))

@@ -38,6 +38,7 @@ def saves(steps: list[str], checkpoint: str) -> int:
 def at_last_of_each(steps: list[str], names: tuple[str, ...], disturb: Callable[[int, str], None]) -> None:
     """Disturbs a run at each step of these names: the last at each file, when most has been saved before."""
     last = {step: at for at, step in enumerate(steps) if step.startswith(names)}
+    assert {step.split()[0] for step in last} == {*names}
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(disturb, last.values(), last))
 

@@ -81,22 +81,6 @@ def test_collision_bit_needs_one_collision_in_a_valid_episode():
     assert (evaluation_of(result, cells, CFG).cell >= len(cells.tuples)).tolist() == [False, True]
 
 
-def test_evaluations_merge_to_that_of_all_episodes():
-    rng, cells = np.random.default_rng(0), Cells(2, collision_bit=True)
-    penalties = rng.uniform(1.0, 9.0, (5, 12, 2))
-    invalid, collides = rng.random((5, 12)) < 0.06, rng.random((5, 12)) < 0.04
-    invalid[:, 10:] = False
-
-    def of(episodes: slice):
-        some = [values[:, episodes] for values in (penalties, collides, invalid)]
-        return evaluation_of(make_result(some[0], base_collision=some[1], invalid=some[2]), cells, CFG)
-
-    whole, joined = of(slice(0, 12)), merged(of(slice(0, 10)), of(slice(10, 12)), cells, CFG)
-    assert whole.valid.all() and whole.invalid_episodes.any() and (whole.collision_rate > 0.0).any()
-    for name, values in vars(whole).items():
-        np.testing.assert_allclose(getattr(joined, name), values, rtol=1e-12, atol=1e-12, err_msg=name)
-
-
 @pytest.mark.parametrize("part", [2, 4])
 def test_counts_and_statistics_agree_when_a_terrain_is_invalid_for_a_while(part):
     """Parts of 12 episodes, of which one or several are invalid, one after the other."""
@@ -117,17 +101,6 @@ def test_counts_and_statistics_agree_when_a_terrain_is_invalid_for_a_while(part)
         for name, values in vars(of(0, first + part)).items():
             np.testing.assert_allclose(getattr(joined, name), values, rtol=1e-12, atol=1e-12, err_msg=name)
     assert joined.valid.all()
-
-
-def test_an_invalid_crossing_adds_nothing_but_its_number_of_episodes():
-    def of(invalid):
-        return evaluation_of(make_result([[[1, 20], [3, 40], [1, 20]]], invalid=[invalid]), CELLS, CFG)
-
-    joined = merged(of([False] * 3), of([True] * 3), CELLS, CFG)
-    assert (joined.episodes.tolist(), joined.invalid_episodes.tolist(), joined.valid.tolist()) == ([6], [3], [False])
-    assert joined.fitness.tolist() == [-20.0]
-    assert joined.penalty_mean == pytest.approx(of([False] * 3).penalty_mean)
-    assert np.isfinite(joined.end_position).all()
 
 
 def test_few_episodes_show_too_little_spread():

@@ -193,15 +193,6 @@ def test_the_last_iterations_settle_what_was_found(tmp_path):
     assert [row["terrains"] for row in rows_of(path)][6:] == [12, 12, 0, 0]
 
 
-def test_a_search_that_crosses_again_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path):
-    scheduler = dataclasses.replace(AGAIN, settling=0)
-    run(tmp_path / "whole", scheduler=scheduler, iterations=6)
-    for iterations in (2, 6):
-        run(tmp_path / "pieces", scheduler=scheduler, iterations=iterations)
-    assert rows_of(tmp_path / "pieces") == rows_of(tmp_path / "whole")
-    assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
-
-
 def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):
     """The same if it is stopped before that is found out, behind it, or while it settles, and goes on."""
     path, settings = tmp_path / "run", {"scheduler": AGAIN, "iterations": 60, "until": 0.05}

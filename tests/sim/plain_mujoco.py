@@ -1,9 +1,14 @@
 """Robots in plain MuJoCo C, as the truth to compare with."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
+import pytest
 
+from sim.mujoco_c.crossing import Episodes, cross
 from sim.mujoco_c.model import GROUND, crossing_model
+from sim.policy.loaders import load_policy
 from sim.terrain import NUM_COLS, NUM_ROWS
 
 
@@ -30,6 +35,22 @@ def run(model: mujoco.MjModel, joint_q, duration_s: float):
     for _ in range(round(duration_s / model.opt.timestep)):
         mujoco.mj_step(model, data)
     return np.concatenate([data.qpos[:3], data.qpos[[4, 5, 6, 3]], data.qpos[7:]])
+
+
+def cross_and_keep(robot, policy, heights, starts, seconds, **how):
+    """Crosses for so long [s]; the robots as they are then, and the result."""
+    kept = []
+
+    class Kept(Episodes):
+        def __init__(self, *given):
+            super().__init__(*given)
+            kept.append(self)
+
+    robot = dataclasses.replace(robot, max_duration_s=seconds)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim.mujoco_c.crossing.Episodes", Kept)
+        result = cross(robot, load_policy(policy, robot, "cpu"), heights, starts, **how)
+    return kept[0], result
 
 
 def rays_from_above(model: mujoco.MjModel, points, qpos=None, groups=None):

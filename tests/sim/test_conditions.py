@@ -12,9 +12,8 @@ from sim.bank import terrains_of
 from sim.conditions import KINDS, NOMINAL, genes_of
 from sim.crossing import CrossingCfg
 from sim.ground import GroundMaps
-from sim.mujoco_c.crossing import cross, draw_starts
+from sim.mujoco_c.crossing import draw_starts
 from sim.mujoco_c.model import crossing_model, noise_widths, rounded_steps, vary_model
-from sim.policy.loaders import load_policy
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
@@ -22,6 +21,7 @@ from sim.spaces.registry import get_space, identity
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_dog
+from tests.sim.plain_mujoco import cross_and_keep
 
 ALL = "super_gaussian+" + "+".join(KINDS)
 SPACE = get_space(ALL)
@@ -76,7 +76,10 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, roll
     order = np.argsort(rollout.episode.numpy())
     ours = rollout.sim.joint_q.numpy()[order]
     starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
-    plain, nominal = (crossed(anymal, heights, starts, seconds, row) for row in (conditions, NOMINAL))
+    plain, nominal = (
+        cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=under(row))[0].qpos
+        for row in (conditions, NOMINAL)
+    )
     np.testing.assert_allclose(ours[:, :3], plain[:, :3], atol=1e-3)
     np.testing.assert_allclose(ours[:, 7:], plain[:, 7:], atol=0.02)
     columns = [0, 1, 2, *range(7, ours.shape[1])]
@@ -86,23 +89,6 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, roll
 
 def under(conditions):
     return dataclasses.replace(GroundMaps.plain(1), conditions=conditions[None])
-
-
-def crossed(robot, heights, starts, seconds, conditions):
-    """Final states in plain MuJoCo C."""
-    seen = []
-    policy = load_policy(robot.policy_file, robot, "cpu")
-    with pytest.MonkeyPatch.context() as patch:
-        import sim.mujoco_c.crossing as module
-
-        class Seen(module.Episodes):
-            def __init__(self, *given):
-                super().__init__(*given)
-                seen.append(self)
-
-        patch.setattr(module, "Episodes", Seen)
-        cross(dataclasses.replace(robot, max_duration_s=seconds), policy, heights, starts, ground=under(conditions))
-    return seen[0].qpos
 
 
 CFG = CrossingCfg(start=(10.0, 4.0))  # 3.5 m to the goal

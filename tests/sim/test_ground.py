@@ -9,7 +9,7 @@ import pytest
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.bank import TerrainBank
-from sim.ground import GroundMaps, joined_name, split_name
+from sim.ground import GroundMaps
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.mujoco_c.model import GROUND, crossing_model
 from sim.policy.loaders import load_policy
@@ -133,12 +133,6 @@ def test_maps_out_of_range_are_refused(changes, field):
     values = {"friction": np.ones((1, 4, 8)), "time_constant_s": np.zeros((1, 4, 8))}
     with pytest.raises(ValueError, match=field):
         GroundMaps(**values | changes)
-
-
-def test_names_say_what_the_ground_has():
-    assert split_name("course") == ("course", ())
-    assert split_name("a+b/x.py:Ridges+softness+friction") == ("a+b/x.py:Ridges", ("friction", "softness"))
-    assert joined_name("course", ("friction",)) == "course+friction"
 
 
 def test_mujoco_c_has_no_soft_slopes_and_one_friction(anymal):

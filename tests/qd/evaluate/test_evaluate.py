@@ -12,13 +12,12 @@ from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
-from qd.evaluate.measures import velocity_error
 from qd.evaluate.sets import split_elites
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from tests.builders import make_archive
 from tests.qd.robots import Robots
-from tests.qd.stand_in import PENALTIES, compute_by, make_result
+from tests.qd.stand_in import PENALTIES, compute_by
 from tests.train.starts import write_trained
 
 STAND, STRETCH = "tests.sim.policies:stand", "tests.sim.policies:stretch"
@@ -84,12 +83,6 @@ def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive
     with pytest.raises(ValueError, match="C-G"):
         tables_of(anymal, Robots(arrives), {"C-G": str(write_trained(tmp_path, trained_on))}, **given)
     assert not Path("runs").exists()
-
-
-def test_invalid_episodes_count_in_no_rate_of_level_ground():
-    bad, late = [[False, True], [False, False]], [[False, False], [True, False]]
-    result = make_result(np.ones((2, 2, 6)), invalid=bad, late=late)
-    assert velocity_error(result, 0)["goal_rate"] == pytest.approx(2 / 3)
 
 
 def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):

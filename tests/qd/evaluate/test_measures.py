@@ -67,3 +67,4 @@ def test_velocity_error_is_a_mean_over_time():
     outcomes, duration_s = [[GOAL, GOAL], [HIT, BAD]], [[12.0, 8.0], [1.5, 12.0]]
     error = velocity_error(result_of(outcomes, duration_s=duration_s, vel_x=[[0.9, 0.24], [0.0, 9.0]]), 0)
     assert error["vx_error_mean"] == pytest.approx((0.3 + 0.2) / 2) and error["episodes"] == 2
+    assert error["goal_rate"] == pytest.approx(2 / 3)

@@ -47,8 +47,9 @@ def test_archive_figure_has_a_line_an_elite_and_the_worst_on_top():
 
 @pytest.mark.parametrize("num_elites", [0, 1])
 def test_figures_are_files_for_archives_of_any_size(tmp_path, num_elites):
-    for file in write_figures(tmp_path, small_archive(num_elites), rows(1)):
-        assert matplotlib.image.imread(file).std() > 0.01  # something is drawn
+    files = write_figures(tmp_path, small_archive(num_elites), rows(1))
+    assert [file.name for file in files] == ["curves.png", "archive.png"]
+    assert all(matplotlib.image.imread(file).std() > 0.01 for file in files)  # something is drawn
 
 
 @pytest.mark.parametrize("every", [1, 2])

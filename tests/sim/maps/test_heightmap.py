@@ -96,7 +96,6 @@ NPZ_MISTAKES = {
     "too deep": ({"heights": np.full((5, 9), -10.5)}, "-10.5"),
     "too small": ({"size_m": np.array([16.0, 0.5])}, "size_m"),
     "x and y swapped": ({"heights": np.zeros((9, 5))}, "swapped"),
-    "a size in words": ({"size_m": np.array(["a", "b"])}, "size_m"),
     "friction of a part": ({"friction": np.ones((4, 8)), "size_m": np.array([8.0, 8.0])}, "friction"),
 }
 
@@ -105,8 +104,6 @@ GRAY, SIZE = np.zeros((5, 9), np.uint16), {"size_m": [16, 8]}
 PNG_MISTAKES = {
     "no scale": (GRAY, SIZE, "scale_m"),
     "a scale in words": (GRAY, SIZE | {"scale_m": "1 cm"}, "scale_m"),
-    "a scale that is nothing": (GRAY, SIZE | {"scale_m": None}, "scale_m"),
-    "millimetres for metres": (GRAY + 700, SIZE | {"scale_m": 1.0}, "700"),
     "colours": (np.zeros((5, 9, 3), np.uint8), SIZE | {"scale_m": 0.1}, "RGB"),
 }
 

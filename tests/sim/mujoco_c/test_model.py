@@ -19,7 +19,7 @@ from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
 from tests.kernels import oracle
 from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
-from tests.sim.plain_mujoco import rays_from_above
+from tests.sim.plain_mujoco import cross_and_keep, rays_from_above
 from tests.sim.policies import Remembers, stand
 from tests.sim.scenes import put, simulate, standing
 
@@ -75,27 +75,13 @@ FINE = {"physics_dt": 0.001, "decimation": 20}
 DRIVES = {"saturation_effort": (90.0,) * 12, "velocity_limit": (6.0,) * 12, "drive_delay_steps": 3}
 
 
-def crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s=None):
-    """Robots as :func:`cross` leaves them on level ground, which is a plane in MuJoCo, and what that cost them."""
-    seen = []
-
-    class Seen(Episodes):
-        def __init__(self, *given):
-            super().__init__(*given)
-            seen.append(self)
-
-    monkeypatch.setattr("sim.mujoco_c.crossing.Episodes", Seen)
-    robot = dataclasses.replace(robot, max_duration_s=seconds)
-    result = cross(robot, load_policy(policy, robot, "cpu"), FLAT, starts, time_constant_s=time_constant_s)
-    return seen[0], result.penalties[0]
-
-
 @pytest.mark.parametrize(
     ("changes", "time_constant_s"),
     [({}, None), (FINE, 0.003), (FINE, 0.02), (DRIVES, None)],
     ids=["shipped", "stiff", "soft", "motors and delay"],
 )
-def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s, monkeypatch):
+def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_constant_s):
+    # Level ground is a plane in MuJoCo.
     # ANYmal walks for 0.2 s. Cassie needs 0.15 s to come down, and swings on its legs for 0.25 s, since to balance it
     # lets every difference grow. The softer a contact, the more of a toe lies on the ground, where MuJoCo has the two
     # ends alone.
@@ -108,7 +94,7 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
     rollout.put(FLAT[None], np.array([1000], np.uint32))
     starts = draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
-    plain, penalties = crossed(monkeypatch, robot, policy, starts, seconds, time_constant_s)
+    plain, result = cross_and_keep(robot, policy, FLAT, starts, seconds, time_constant_s=time_constant_s)
     for _ in range(round(seconds / robot.control_dt)):
         rollout.control_step()
     joint_q = rollout.sim.joint_q.numpy()
@@ -118,9 +104,9 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     np.testing.assert_allclose(joint_q[:, :3], plain.qpos[:, :3], atol=metres)
     np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
     sums = rollout.penalty_sums.numpy()[:, [PENALTIES.index(name) for name in robot.penalties]]
-    np.testing.assert_allclose(sums, penalties, rtol=share, atol=1e-6)
+    np.testing.assert_allclose(sums, result.penalties[0], rtol=share, atol=1e-6)
     if changes is DRIVES:
-        ideal, _ = crossed(monkeypatch, shipped, policy, starts, seconds)
+        ideal, _ = cross_and_keep(shipped, policy, FLAT, starts, seconds)
         assert np.abs(ideal.qpos[:, 7:] - plain.qpos[:, 7:]).max() > 0.2
 
 
@@ -196,7 +182,7 @@ def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
         cassie, "tests.sim.policies:stand", np.stack([FLAT, FLAT + np.float32(0.2)]), np.uint32([3, 4]),
         space=SUPER_GAUSSIAN, num_episodes=26, processes=2, resolved=False,
     )  # fmt: skip
-    for number, result in enumerate(crossed):
+    for number, result in zip(range(2), crossed, strict=True):
         heights = FLAT + np.float32(0.2 * number)
         starts = draw_starts(cassie, heights, 3 + number, 26, "cpu")
         expected = cross(cassie, stand, heights, starts[25:])

@@ -108,9 +108,6 @@ MODELS = {
     "doubles": graph_model(
         [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
     ),
-    "two inputs": graph_model(
-        [helper.make_node("Sum", ["a", "b"], ["c"])], [port(name, ["n", 12]) for name in "ab"], [port("c", ["n", 12])]
-    ),
     "no state that comes out": graph_model(
         [helper.make_node("Identity", [name], [name + "_x"]) for name in ("obs", "h_in")],
         [port("obs", ["n", OBSERVATIONS]), port("h_in", [1, "n", 3])],

@@ -30,8 +30,7 @@ def old_checkpoints():
     }
 
 
-@pytest.mark.parametrize("version", ["2", "3", "5"])
-@pytest.mark.parametrize("place", ["agent.yaml", "params/agent.yaml"])
+@pytest.mark.parametrize(("version", "place"), [("2", "agent.yaml"), ("3", "params/agent.yaml"), ("5", "agent.yaml")])
 def test_a_checkpoint_of_any_rsl_rl_acts_as_its_training_says(tmp_path, anymal, version, place):
     path, agent = tmp_path / "model_9.pt", tmp_path / place
     torch.save(old_checkpoints()[version], path)

@@ -162,7 +162,6 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("py", MORE, f"{MORE} stiffness=(60.0,) * 8,", "damping"),
     ("py", MORE, f"{MORE} velocity_limit=(20.0,) * 8,", "saturation_effort"),
     ("py", MORE, f"{MORE} saturation_effort=(30.0,) * 8, velocity_limit=(9.0,) * 7,", "velocity_limit needs 8"),
-    ("py", MORE, f"{MORE} drive_delay_steps=1001,", "drive_delay_steps"),
     ("py", MORE, f"{MORE} max_duration_s=0.001,", "max_duration_s"),
     ("py", MORE, f"{MORE} contact_time_constant_s=0.004,", "contact_time_constant_s"),
     ("xml", FIRST_DRIVE, "", "FL_hip"),
@@ -206,8 +205,6 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("urdf", FIRST_MASS, '<mass value="${m}"/>', "xacro"),
     ("urdf", 'effort="30"', 'effort="-30"', "effort"),
     ("urdf", '<child link="FL_thigh"/>', '<child link="leg"/>', "leg"),
-    ("urdf", '"revolute"', '"hinge"', '<joint name="FL_hip" type="hinge">'),
-    ("urdf", '"trunk">', '"">', "no link named trunk"),
 ]
 
 

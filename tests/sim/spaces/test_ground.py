@@ -96,7 +96,7 @@ def test_ground_is_named_by_the_space(tmp_path):
     assert load_space("super_gaussian+softness+friction").name == BOTH.name
     with pytest.raises(ValueError, match="ice"):
         load_space("course+ice")
-    ridges = write_ridges(tmp_path)
+    ridges = write_ridges(tmp_path / "a+b")
     space = load_space(f"{ridges}+friction")
     assert (space.num_genes, space.name) == (3 + 32, f"{ridges}+friction")
     assert get_space(space.name, space.sha256).num_genes == 35

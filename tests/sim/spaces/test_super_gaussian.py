@@ -32,10 +32,9 @@ def test_hard_random_genes_have_every_bump_at_full_height():
         (lambda: SUPER_GAUSSIAN.uniform_random(-1, 0), "count"),
         (lambda: SUPER_GAUSSIAN.validate(np.zeros(64)), "genes"),
         (lambda: SUPER_GAUSSIAN.validate([[0.0] * 64, [np.nan] * 64]), "row 1"),
-        (lambda: get_space("blocks"), "blocks"),
     ],
 )
-def test_what_is_no_space_and_no_genes_is_refused(call, field):
+def test_what_are_no_genes_is_refused(call, field):
     with pytest.raises(ValueError, match=field):
         call()
 
