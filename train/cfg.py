@@ -199,6 +199,10 @@ class HardenCfg:
         """The settings of a robot."""
         return cls(tune=FinetuneCfg.of(robot))
 
+    def sized_tune(self, robot: RobotCfg, device: str) -> FinetuneCfg:
+        """Each training with sizes that suit the robot and the Warp device in place of those that are 0."""
+        return self.tune.sized(robot, device, **({} if robot.name == "cassie" else LARGE))
+
 
 def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:
     return replace(cfg, **{name: getattr(cfg, name) or size for name, size in sizes.items() if hasattr(cfg, name)})

@@ -31,7 +31,7 @@ from sim.files.records import identity
 from sim.files.settings import check
 from sim.robots.robot import RobotCfg
 from sim.spaces.registry import load_space, space_at
-from train.cfg import LARGE, FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
+from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
 from train.ppo.checkpoint import CHECKPOINT, read_start
 
@@ -91,7 +91,7 @@ class _Hardening:
         base = cfg.policy or str(robot.policy_file)
         read_start(Path(base), robot)
         check_policy(base, robot, compute.device)
-        tune = cfg.tune.sized(robot, compute.device, **({} if robot.name == "cassie" else LARGE))
+        tune = cfg.sized_tune(robot, compute.device)
         tune.check(robot)
         full = (paper_terrains(robot.name), EPISODES)
         terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None

@@ -16,6 +16,7 @@ from qd.judge import FRESH_STREAM, elite_seeds, fresh_values
 from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.workers.cross import Crossings
+from qd.workers.shards import arrays_of
 from results.make.common import ONCE, parse
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
@@ -30,8 +31,7 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossin
     genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=FRESH_STREAM)
     label = "fresh episodes"
     result = crossings.cross(policy, genes, seeds, replicas=cfg.replicas, space=cfg.space, label=label)
-    arrays = {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
-    by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in arrays.items()}
+    by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in arrays_of(result).items()}
     result = replace(result, **{name: value[:, :FRESH_EPISODES] for name, value in by_elite.items()})
     return fresh_numbers(some, fresh_values(some, result, cfg.fitness)) | {"elites": len(archive)}
 

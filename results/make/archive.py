@@ -5,7 +5,6 @@ Then it is judged: fresh episodes, contact resolved, a specialist trained on wha
 On the way its elites cross fresh episodes, and curve.json has what they say. A third seed is searched for that alone.
 """
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -65,11 +64,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     script = parse(__doc__, argv, "archive/archive.json", parts=tuple(SEARCHES))
     for name in script.parts or SEARCHES:
         run = make_archive(script, name)
-        for pattern in PUBLISHED if name != "third" else ("curve.json",):
-            for file in run.glob(pattern):
-                target = script.out.parent.parent / name / file.relative_to(run)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, target)
+        files = PUBLISHED if name != "third" else ("curve.json",)
+        script.publish(run, script.out.parent.parent / name, files)
 
 
 if __name__ == "__main__":

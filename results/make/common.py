@@ -73,11 +73,12 @@ class Script:
         made = Path("runs/make") / sources_sha256()[:12] / self.robot.name
         return self.out.parent / "runs" if self.small else made
 
-    def search_cfg(self, iterations: int | None = None, **changes: Any) -> SearchCfg:
+    def search_cfg(self, iterations: int | None = None, *, episodes: int | None = None, **changes: Any) -> SearchCfg:
         """Settings of a search of preset wide; in a trial of four terrains, which no specialist can be trained on.
 
         Args:
-            iterations: The preset's if None.
+            iterations: As many as make ``episodes``, if these are given; else the preset's if None.
+            episodes: Rounded to whole iterations.
             changes: Of its settings or its scheduler's, by name, and ``policy`` and ``space``.
         """
         named = {name: changes.pop(name) for name in ("policy", "space") if name in changes}
@@ -86,8 +87,17 @@ class Script:
         if self.small:
             iterations, of_scheduler = 1, {**of_scheduler, "emitters": 2, "batch_size": 2, "groups": 1}
             changes["replicas"] = 1
-        scheduler = replace(cfg.scheduler, **of_scheduler)
-        return replace(cfg, scheduler=scheduler, iterations=iterations or cfg.iterations, **changes)
+        cfg = replace(cfg, scheduler=replace(cfg.scheduler, **of_scheduler), **changes)
+        if episodes is not None and not self.small:
+            iterations = round(episodes / cfg.episodes_per_iteration)
+        return replace(cfg, iterations=iterations or cfg.iterations)
+
+    def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
+        """Copies files of a run into a folder of what is published."""
+        for file in (file for pattern in patterns for file in run.glob(pattern)):
+            target = folder / file.relative_to(run)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, target)
 
     def read_archive(self, name: str = "archive") -> Archive:
         """A published archive of archive.py; in a trial too."""
@@ -124,6 +134,11 @@ class Script:
         return content
 
 
+def file_name(words: str) -> str:
+    """Words as a name of a file or folder."""
+    return re.sub(r"\W+", "-", words)
+
+
 def run_parts(words: Sequence[str], parts: Sequence[str], at_once: int) -> None:
     """Runs a script's parts, ``at_once`` on each GPU, each in a process of its own with a log under runs/make/logs.
 
@@ -137,7 +152,7 @@ def run_parts(words: Sequence[str], parts: Sequence[str], at_once: int) -> None:
         gpus.put(gpu)
 
     def run(part: str) -> int:
-        gpu, name = gpus.get(), re.sub(r"\W+", "-", f"{module.name} {' '.join(words)} {part}")
+        gpu, name = gpus.get(), file_name(f"{module.name} {' '.join(words)} {part}")
         try:
             print(f"{part} on GPU {gpu}: {logs / name}.log", flush=True)
             command = [sys.executable, "-m", module.name, *words, "--parts", part]

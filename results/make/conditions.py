@@ -5,7 +5,6 @@ conditions, and without each kind of condition alone. Some that need one kind al
 published in results/<robot>/conditions.
 """
 
-import shutil
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,10 +34,8 @@ _PUBLISHED = ("archive.npz", "archive.json", "config.json", "minimal.npz", "mini
 
 def search_under_conditions(script: Script) -> tuple[Archive, dict[str, Any]]:
     """The judged archive of a search of terrains and conditions, and its numbers."""
-    cfg = script.search_cfg(seed=script.seed, space=SPACE)
-    iterations = None if script.small else round(EPISODES_SEARCHED / cfg.episodes_per_iteration)
     run = script.runs / "conditions"
-    search(script.search_cfg(iterations, seed=script.seed, space=SPACE), run, script.compute)
+    search(script.search_cfg(episodes=EPISODES_SEARCHED, seed=script.seed, space=SPACE), run, script.compute)
     stages = ("fresh",) if script.small else ("fresh", "resolved", "others")
     archive = judge(run, stages=stages, compute=script.compute)
     summary = RunDirectory(run).read_summary()
@@ -105,11 +102,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     script = parse(__doc__, argv, "conditions.json")
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
-    for name in _PUBLISHED:
-        if (file := script.runs / "conditions" / name).exists():
-            target = script.out.parent / "conditions" / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, target)
+    script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
     file = script.out.with_name("dose.json")
     dose = [row for row in read_made(file).get("dose", []) if row["parameter"] in KINDS]
     return script.write(

@@ -163,13 +163,12 @@ def noise() -> str:
         for robot, words in ROBOTS.items()
         for design, rows in searches_of(robot).items()
     }
-    columns: dict[str, Column] = {name.replace("_", " "): name for name in NOISE_COUNTS}
+    columns: dict[str, Column] = {
+        name.replace("_", " "): name for name in ("elites", "corrected_elites", "failing", "families")
+    }
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
     columns["at most"] = shown("same_cell_ceiling", ".2f")
     return table(rows, columns)
-
-
-NOISE_COUNTS = ("elites", "corrected_elites", "failing", "families")
 
 
 def searches_of(robot: str) -> dict[str, list[Any]]:

@@ -3,7 +3,6 @@
 They lie beside the published archive, results/<robot>/archive, of whose elites they are.
 """
 
-import shutil
 from collections.abc import Sequence
 
 from qd.minimise import minimise
@@ -16,9 +15,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     run = script.run_of_archive()
     elite = str(int(script.read_archive().failing.argmax())) if script.small else None
     minimise(run, compute=script.compute, elite=elite, how="greedy" if script.small else None, judged=not script.small)
-    script.out.parent.mkdir(parents=True, exist_ok=True)
-    for file in run.glob("minimal.*"):
-        shutil.copyfile(file, script.out.with_name(file.name))
+    script.publish(run, script.out.parent, ("minimal.*",))
 
 
 if __name__ == "__main__":

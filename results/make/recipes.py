@@ -12,10 +12,9 @@ import numpy as np
 
 from qd.evaluate.evaluate import cross_sets
 from qd.evaluate.sets import generated_set, paper_terrains, plain_set
-from results.make.common import Script, crossing_rates, parse
-from results.make.tables import MIXES, SIZES
-from train.cfg import FinetuneCfg, RunCfg
-from train.finetune import finetune
+from results.make.common import Script, crossing_rates, file_name, parse
+from results.make.tables import MIXES, SIZES, train
+from train.cfg import FinetuneCfg
 from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
 
@@ -34,22 +33,19 @@ def recipe_of(script: Script, name: str) -> FinetuneCfg:
 TRAININGS = {f"{recipe}: {kind}": (recipe, kind) for recipe in RECIPES for kind in MIXES}
 
 
-def train(script: Script, training: str) -> str:
+def train_by(script: Script, training: str) -> str:
     """File of the controller that a recipe makes of a kind."""
     recipe, kind = TRAININGS[training]
-    cfg = replace(recipe_of(script, recipe), mix=MIXES[kind], seed=script.seed)
-    if cfg.mix == "generated":
-        cfg = replace(cfg, archive=(str(script.results / "archive"),))
-    cfg = replace(cfg, **({"num_envs": 4, "terrains": 4, "iterations": 1} if script.small else SIZES["tables"]))
-    run = script.runs / "recipes" / f"{RECIPES.index(recipe)}-{kind}"
-    return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
+    sizes = {"num_envs": 4, "terrains": 4, "iterations": 1} if script.small else SIZES["tables"]
+    run = script.runs / "recipes" / file_name(training)
+    return train(script, replace(recipe_of(script, recipe), **sizes), kind, script.seed, run)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Trains and evaluates on validation terrains; parts are trainings alone, a trial has one."""
     script = parse(__doc__, argv, "recipes.json", parts=tuple(TRAININGS))
     names = script.parts or (list(TRAININGS)[-1:] if script.small else tuple(TRAININGS))
-    controllers = {name: train(script, name) for name in names}
+    controllers = {name: train_by(script, name) for name in names}
     if script.parts:
         return {}
     terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)

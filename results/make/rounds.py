@@ -14,7 +14,7 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse
-from train.cfg import LARGE, HardenCfg, RunCfg
+from train.cfg import HardenCfg, RunCfg
 from train.finetune import finetune
 from train.harden import harden
 
@@ -43,7 +43,7 @@ def search_again(script: Script, name: str, policy: Path | None, seed: int) -> d
 
 def train_at_once(script: Script, cfg: HardenCfg) -> Path:
     """A controller that has the steps of all rounds in one training, on the published archive."""
-    tune = cfg.tune.sized(script.robot, script.device, **({} if script.robot.name == "cassie" else LARGE))
+    tune = cfg.sized_tune(script.robot, script.device)
     tune = replace(
         tune, seed=script.seed, archive=(str(script.results / "archive"),), iterations=cfg.rounds * tune.iterations
     )

@@ -13,7 +13,7 @@ import numpy as np
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.search import search
-from results.make.common import ONCE, SEEDS, Script, mean_over_seeds, parse
+from results.make.common import ONCE, SEEDS, Script, file_name, mean_over_seeds, parse
 
 DEFAULT = "surrogate"
 METHODS: dict[str, dict[str, Any]] = {
@@ -36,10 +36,9 @@ JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 def follow_search(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """The numbers of a run's archive.json after each step."""
     changes = {} if script.small else METHODS[method]
-    run, rows = script.runs / "search" / f"{method}-{seed}".replace(", ", "-").replace(" ", "-"), []
-    each = script.search_cfg(seed=seed, **changes).episodes_per_iteration
+    run, rows = script.runs / "search" / file_name(f"{method}, seed {seed}"), []
     for episodes in STEPS[:1] if script.small else STEPS:
-        search(script.search_cfg(episodes // each, seed=seed, **changes), run, script.compute)
+        search(script.search_cfg(episodes=episodes, seed=seed, **changes), run, script.compute)
         is_last = episodes == STEPS[-1]
         judge(run, stages=("fresh", "resolved", "others") if is_last else ("fresh",), compute=script.compute)
         rows.append(RunDirectory(run).read_summary())

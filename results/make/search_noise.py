@@ -18,7 +18,7 @@ from qd.pool import chance_to_stay
 from qd.run.directory import RunDirectory
 from qd.search import search
 from qd.workers.cross import Crossings
-from results.make.common import ONCE, Script, parse
+from results.make.common import ONCE, Script, file_name, parse
 from sim.spaces.registry import get_space
 
 SEED, EPISODES = 9, 200_000
@@ -86,10 +86,8 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     """The row of one search."""
     design_name, seed, episodes = SEARCHES[name]
     design = {} if script.small else DESIGNS[design_name]
-    cfg = script.search_cfg(seed=seed, **design)
-    if not script.small:
-        cfg = script.search_cfg(round(episodes / cfg.episodes_per_iteration), seed=seed, **design)
-    run = script.runs / "search_noise" / name.replace(", ", "-").replace(" ", "-")
+    cfg = script.search_cfg(episodes=episodes, seed=seed, **design)
+    run = script.runs / "search_noise" / file_name(name)
     search(cfg, run, script.compute)
     archive = judge(run, stages=("fresh",), compute=script.compute)
     assert archive.fresh is not None

@@ -9,6 +9,7 @@ import itertools
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,16 +35,22 @@ TRAININGS |= {f"tables_paper_sizes: {name}": ("tables_paper_sizes", name, SEEDS[
 """File, kind and seed of each."""
 
 
+def train(script: Script, cfg: FinetuneCfg, kind: str, seed: int, run: Path) -> str:
+    """File of a controller of a kind that a fine-tuning makes, of the published archive if it needs one."""
+    cfg = replace(cfg, mix=MIXES[kind], seed=seed)
+    if cfg.mix == "generated":
+        cfg = replace(cfg, archive=(str(script.results / "archive"),))
+    return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
+
+
 def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str]:
     """Trains kinds with seeds of one file; returns the files by name, those of further seeds as C-G@1."""
-    controllers, options = {}, RunCfg(device=script.device)
+    controllers = {}
     for training in trainings:
         file, name, seed = TRAININGS[training]
-        cfg = replace(FinetuneCfg.of(script.robot), mix=MIXES[name], seed=seed, **SIZES[file])
-        if cfg.mix == "generated":
-            cfg = replace(cfg, archive=(str(script.results / "archive"),))
-        policy = finetune(script.robot, cfg, script.runs / file / f"{name}-{seed}", options)
-        controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = str(policy)
+        cfg = replace(FinetuneCfg.of(script.robot), **SIZES[file])
+        policy = train(script, cfg, name, seed, script.runs / file / f"{name}-{seed}")
+        controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = policy
         if (file, seed) == ("tables", SEEDS[0]):
             shutil.copyfile(policy, script.results / f"{name}.pt")
     return controllers
