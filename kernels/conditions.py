@@ -72,7 +72,7 @@ class Disturbed:
     former: wp.array3d[float]
     """Observations of the last control steps, shape (num_envs, 1 + most steps, observation_size)."""
     age: wp.array2d[int]
-    """Observations since the episode began, shape (num_envs, 1)."""
+    """Observations since the episode began, shape (num_envs, observation_size): each column counts for itself."""
 
 
 @wp.func
@@ -101,7 +101,8 @@ def _begin_conditions_kernel(
     t = terrain_of_env[env]
     for k in range(conditions.shape[1]):
         disturbed_out.row[env, k] = conditions[t, k]
-    disturbed_out.age[env, 0] = 0
+    for k in range(disturbed_out.age.shape[1]):
+        disturbed_out.age[env, k] = 0
     delay_out.steps[env] = own_delay + int(wp.round(conditions[t, int(Condition.DELAY)] / physics_dt))
     robots_out.strength[env] = conditions[t, int(Condition.STRENGTH)]
     mass, rotation = nominal.mass[env], nominal.frame[env]
@@ -173,7 +174,7 @@ def _disturb_observation_kernel(
 ):  # fmt: skip
     """Grid (num_envs, num_columns)."""
     env, k = wp.tid()
-    age, size = disturbed_out.age[env, 0], disturbed_out.former.shape[1]
+    age, size = disturbed_out.age[env, k], disturbed_out.former.shape[1]
     column = observation_out[env, k]
     width = disturbed_out.row[env, int(Condition.NOISE)] * noise_width(disturbed_out.noise, k, num_joints)
     if width > 0.0:
@@ -183,12 +184,7 @@ def _disturb_observation_kernel(
     disturbed_out.former[env, age % size, k] = column
     lag = int(wp.round(disturbed_out.row[env, int(Condition.LAG)] / control_dt))
     observation_out[env, k] = disturbed_out.former[env, wp.max(age - lag, 0) % size, k]
-
-
-@wp.kernel
-def _grow_older_kernel(disturbed_out: Disturbed):
-    """Grid (num_envs,)."""
-    disturbed_out.age[wp.tid(), 0] += 1
+    disturbed_out.age[env, k] = age + 1
 
 
 def disturb_observation(
@@ -196,6 +192,5 @@ def disturb_observation(
 ) -> None:
     """Add noise to observation rows, and show those of ``LAG`` ago: the first ones until there are some so old."""
     inputs, outputs = [episodes, num_joints, control_dt], [disturbed_out, observation_out]
-    device = observation_out.device
-    wp.launch(_disturb_observation_kernel, observation_out.shape, inputs, outputs=outputs, device=device)
-    wp.launch(_grow_older_kernel, observation_out.shape[0], outputs=[disturbed_out], device=device)
+    shape, device = observation_out.shape, observation_out.device
+    wp.launch(_disturb_observation_kernel, shape, inputs, outputs=outputs, device=device)

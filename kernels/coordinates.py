@@ -36,10 +36,37 @@ class SolverState:
     base_com: wp.vec3
 
 
+@wp.struct
+class Delay:
+    """Targets that have yet to count; empty where all count at once."""
+
+    steps: wp.array[int]
+    """Physics steps after which a target counts, shape (num_envs,)."""
+    age: wp.array2d[int]
+    """Physics steps since the episode began, shape (num_envs, num_actuators): each counts for itself."""
+    former: wp.array3d[float]
+    """Targets of the last steps [rad], shape (num_envs, 1 + most steps, num_actuators)."""
+    at_first: wp.array[float]
+    """Joint targets that count until there are some [rad], shape (num_joints,)."""
+
+
+@wp.func
+def _due_target(target: float, at_first: float, env: int, actuator: int, delay_out: Delay) -> float:
+    """Keep the target of a physics step, and find the one that counts in it."""
+    age = delay_out.age[env, actuator]
+    size, before = delay_out.former.shape[1], age - delay_out.steps[env]
+    delay_out.former[env, age % size, actuator] = target
+    delay_out.age[env, actuator] = age + 1
+    if before < 0:
+        return at_first
+    return delay_out.former[env, before % size, actuator]
+
+
 @wp.kernel
 def _tell_solver_kernel(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], targets: wp.array2d[float], solver_out: SolverState
-):
+    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], targets: wp.array2d[float], delay_out: Delay,
+    solver_out: SolverState,
+):  # fmt: skip
     """Grid (num_envs, 1 + the larger of num_joints and num_actuators): the base, then a joint and an actuator each."""
     env, thread = wp.tid()
     k = thread - 1
@@ -49,9 +76,12 @@ def _tell_solver_kernel(
             solver_out.qpos[env, column] = joint_q[env, 7 + k]
             solver_out.qvel[env, column - 1] = joint_qd[env, 6 + k]
         if k < solver_out.target_of_actuator.shape[0]:
-            target = solver_out.target_of_actuator[k]
-            if target >= 0:
-                solver_out.ctrl[env, k] = targets[env, target]
+            column = solver_out.target_of_actuator[k]
+            if column >= 0:
+                target = targets[env, column]
+                if delay_out.steps.shape[0] > 0:
+                    target = _due_target(target, delay_out.at_first[column - 7], env, k, delay_out)
+                solver_out.ctrl[env, k] = target
         return
     of_com = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
     rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
@@ -65,46 +95,11 @@ def _tell_solver_kernel(
     solver_out.qpos[env, 3] = joint_q[env, 6]
 
 
-def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, solver_out: SolverState) -> None:
-    """Write coordinates, velocities and targets into mujoco_warp's data."""
+def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState) -> None:
+    """Write coordinates, velocities and the targets that count into mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
-    inputs = [joint_q, joint_qd, targets]
-    wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=[solver_out], device=joint_q.device)
-
-
-@wp.struct
-class Delay:
-    """Joint targets that have yet to count."""
-
-    steps: wp.array[int]
-    """Physics steps after which a target counts, shape (num_envs,)."""
-    age: wp.array2d[int]
-    """Physics steps since the episode began, shape (num_envs, 1)."""
-    former: wp.array3d[float]
-    """Targets of the last steps [rad], shape (num_envs, 1 + most steps, num_joints)."""
-
-
-@wp.kernel
-def _delay_targets_kernel(
-    targets: wp.array2d[float], default_joint_pos: wp.array[float], delay_out: Delay, due_out: wp.array2d[float]
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    age, size = delay_out.age[env, 0], delay_out.former.shape[1]
-    before = age - delay_out.steps[env]
-    for joint in range(default_joint_pos.shape[0]):
-        delay_out.former[env, age % size, joint] = targets[env, 7 + joint]
-        if before >= 0:
-            due_out[env, 7 + joint] = delay_out.former[env, before % size, joint]
-        else:
-            due_out[env, 7 + joint] = default_joint_pos[joint]
-    delay_out.age[env, 0] = age + 1
-
-
-def delay_targets(targets: Any, default_joint_pos: Any, delay_out: Delay, due_out: Any) -> None:
-    """Keep the targets of a physics step, and find those that count in it: the default pose until there are some."""
-    inputs, outputs = [targets, default_joint_pos], [delay_out, due_out]
-    wp.launch(_delay_targets_kernel, targets.shape[0], inputs, outputs=outputs, device=targets.device)
+    inputs, outputs = [joint_q, joint_qd, targets], [delay_out, solver_out]
+    wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=outputs, device=joint_q.device)
 
 
 @wp.kernel

@@ -11,7 +11,7 @@ import warp as wp
 
 from kernels.conditions import Condition, Disturbed, begin_conditions, disturb_observation, push
 from kernels.contact import collide_strips, make_contacts, sum_forces
-from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, delay_targets, limit_torques, tell_solver
+from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, limit_torques, tell_solver
 from kernels.episode import Episodes
 from kernels.ground import Ground
 from kernels.observation import Sensors
@@ -186,7 +186,7 @@ class Simulation:
 
     def _build_drives(self) -> None:
         """What ideal drives lack: torque limits that depend on the speed, and a delay of targets."""
-        robot, self.motors, self._delay, self._due_targets = self.robot, None, None, self.targets
+        robot, self.motors, delay = self.robot, None, Delay()
         if robot.saturation_effort is not None:
             effort = self.solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
             joints = self._coordinates.target_of_actuator.numpy() - 7
@@ -196,11 +196,12 @@ class Simulation:
         if self.bank.conditions is not None:
             most += math.ceil(MOST_DELAY_S / robot.physics_dt)
         if most:
-            delay = self._delay = Delay()
+            actuators = len(self._coordinates.target_of_actuator)
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
-            delay.age = wp.zeros((self.num_envs, 1), dtype=int)
-            delay.former = wp.zeros((self.num_envs, 1 + most, robot.num_joints), dtype=float)
-            self._due_targets = wp.zeros_like(self.targets)
+            delay.age = wp.zeros((self.num_envs, actuators), dtype=int)
+            delay.former = wp.zeros((self.num_envs, 1 + most, actuators), dtype=float)
+            delay.at_first = self.sensors.default_joint_pos
+        self._delay = delay
 
     def _build_conditions(self) -> None:
         self.disturbed = None
@@ -214,7 +215,7 @@ class Simulation:
         self._varied = self._dynamics.vary_bases()
         most, size = math.ceil(MOST_LAG_S / self.robot.control_dt), self.robot.observation_size
         disturbed = make_zeros(
-            Disturbed, str(self.device), row=(self.num_envs, len(Condition)), age=(self.num_envs, 1),
+            Disturbed, str(self.device), row=(self.num_envs, len(Condition)), age=(self.num_envs, size),
             former=(self.num_envs, 1 + most, size),
         )  # fmt: skip
         for name, width in asdict(NoiseCfg()).items():
@@ -241,7 +242,6 @@ class Simulation:
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""
         if self.disturbed is not None:
-            assert self._delay is not None
             tree, robots, nominal = self._varied
             begin_conditions(
                 begins, self.terrain_of_env, self.bank.conditions, nominal, self.robot.drive_delay_steps,
@@ -279,9 +279,7 @@ class Simulation:
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
-            if self._delay is not None:
-                delay_targets(self.targets, self.sensors.default_joint_pos, self._delay, self._due_targets)
-            tell_solver(self.joint_q, self.joint_qd, self._due_targets, coordinates)
+            tell_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self._dynamics.find()
@@ -299,7 +297,7 @@ class Simulation:
         data = self.solver.mjw_data
         clear_rows(mask, data.qacc_warmstart)
         clear_rows(mask, self.parked.reshape((-1, 1)).view(float))  # whose 0 has the same bits
-        if self._delay is not None:
+        if self._delay.age is not None:
             clear_rows(mask, self._delay.age.view(float))
         if isinstance(self._dynamics, TheirDynamics):
             # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not

@@ -20,6 +20,8 @@ ROOT = Path(__file__).parents[2]
 ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}
 CONTROLLERS = ("base", "C-HC", "C-HR", "C-G", "hardened")
 NONE = "-"
+BUMPS = 8
+"""Parts of a terrain of the paper, behind which its conditions stand."""
 MARKED = re.compile(r"<!-- table: (\w+)((?: \w+)?) -->\n.*?<!-- end -->", re.DOTALL)
 PAPER_ARCHIVES = {
     "cassie": {"elites": 930, "with_collision": 598, "without_collision": 332, "fitness": 4.7},
@@ -159,9 +161,9 @@ def methods(robot: str) -> str:
 def noise() -> str:
     """Designs of a search under noise: means over their seeds."""
     rows = {
-        f"{words}, {design}": mean_of(rows)
+        f"{words}, {name} ({len(rows)})": mean_of(rows)
         for robot, words in ROBOTS.items()
-        for design, rows in searches_of(robot).items()
+        for name, rows in searches_of(robot).items()
     }
     columns: dict[str, Column] = {
         name.replace("_", " "): name for name in ("elites", "corrected_elites", "failing", "families")
@@ -172,12 +174,12 @@ def noise() -> str:
 
 
 def searches_of(robot: str) -> dict[str, list[Any]]:
-    """Rows of searches under noise by design, those that have several seeds."""
+    """Rows of searches under noise by design: those that have several seeds, and the long ones."""
     searches = dict[str, list[Any]]()
     for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
-        if row["search"].endswith(f"seed {row['seed']}"):
-            searches.setdefault(row["design"], []).append(row)
-    return {design: rows for design, rows in searches.items() if len(rows) > 1}
+        if row["search"] != row["design"]:
+            searches.setdefault(row["search"].partition(", seed")[0], []).append(row)
+    return {name: rows for name, rows in searches.items() if len(rows) > 1 or name.endswith("a million")}
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -190,11 +192,30 @@ def conditions() -> str:
     """Searches of terrains and conditions, and which of their failing elites need a condition."""
     rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
             for words, numbers in of_robots("results/{}/conditions.json").items() if numbers}  # fmt: skip
-    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "faults")
+    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
     columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
     columns["failing, and crossed under nominal conditions"] = "nominal_passes"
-    columns |= {f"... without {kind}": kind for kind in KINDS}
+    columns["... and faults"] = "faults_and_nominal_passes"
+    columns |= {f"... crossed with a nominal {kind} alone": kind for kind in KINDS}
     return table(rows, columns, upright=True)
+
+
+def condition_examples() -> str:
+    """The smallest failing terrains that keep the condition that their elites need; of each kind the least."""
+    lines = ["|  | the terrain | and | reach the goal |  |", "| --- | --- | --- | --- | --- |"]
+    for robot, words in ROBOTS.items():
+        examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
+        minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
+        for number, kind in enumerate(KINDS):
+            of_kind = [one for one in minima if examples[one["elite"]]["needs"] == kind]
+            least = min((one for one in of_kind if BUMPS + number in one["bumps"]),
+                        key=lambda one: len(one["bumps"]), default=None)  # fmt: skip
+            if least is not None:
+                bumps = sum(part < BUMPS for part in least["bumps"])
+                ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"
+                left, fault = "; ".join(least["words"][bumps:]), "fault" * examples[least["elite"]]["fault"]
+                lines.append(f"| {words}: {kind} | {ground} | {left} | {least['goal_rate']:.2f} | {fault} |")
+    return "\n".join(lines)
 
 
 def hardening() -> str:
@@ -408,7 +429,8 @@ def kernels() -> str:
 
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
     archives, growth, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement,
-    minimal, packs, public_controllers, speed, kernels, noise, conditions)}  # fmt: skip
+    minimal, packs, public_controllers, speed, kernels, noise, conditions,
+    condition_examples)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:

@@ -1,27 +1,32 @@
-"""The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures [film] [pages] [curves]``.
+"""The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures`` with some of their kinds.
 
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
-robots' controllers of the day cross them. ``pages`` takes the pictures of the viewer and of the report. ``curves``
-draws what the published files say of searches.
+robots' controllers of the day cross them. ``stills`` shows one that a payload breaks. ``pages`` takes the pictures of
+the viewer and of the report. ``curves`` draws what the published files say of searches.
 """
 
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 from qd.judge import controllers_in
 from qd.show.crossed import title_of, typical_episode
+from qd.show.elites import open_run
 from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
-from qd.show.replay import save, source_of_map
+from qd.show.replay import Source, save, source_of_map, source_of_run
 from results.make.docs import PAPER_ARCHIVES, ROBOTS, read
 from sim.files.figures import new_figure
 from sim.robots.find import get_robot
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
+STILL_SIZE = (640, 360)
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
 """Robot, terrain, what it is in words, and the controller of the panel that is shown beside."""
 
@@ -37,22 +42,39 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     return [*pictures_of(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
 
 
+def take_still(source: Source, name: str) -> None:
+    """The moment at which the robot fails on a terrain: needs no GPU, but a renderer."""
+    (recording,) = source.record("cpu")
+    shot = Shot(recording=recording, episode=typical_episode(recording, source.scales), title=title_of(recording))
+    moment = shot.end if shot.moment is None else shot.moment
+    (picture,) = pictures_of(shot, source.robot, np.array([moment]), STILL_SIZE)
+    Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
+
+
+def payload_source() -> Source:
+    """The first minimal terrain of the published search under conditions whose cause is a payload."""
+    run = Path("results/anymal/conditions")
+    minima = read(f"{run}/minimal.json")["elites"]
+    number = next(minimal["elite"] for minimal in minima if minimal["cause"]["kind"] == "payload")
+    return source_of_run(open_run("anymal", run), minimal=str(number))
+
+
 def draw_noise() -> Figure:
     """Searches under noise: corrected elites against the share of elites that is in its cell again."""
-    figure = new_figure(10.5, 4.2)
+    figure, handles = new_figure(12, 4.2), dict[str, Any]()
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="share of elites in their cell again", ylabel="corrected elites")
         rows = read(f"results/{robot}/search_noise.json")["rows"]
-        searches, short = dict[str, list[tuple[float, float]]](), "other designs, half as long"
+        finals = [*dict.fromkeys(row["design"] for row in rows if row["search"] != row["design"])]
         for row in rows:
             place = row["elites_same_cell"] / row["elites"], row["corrected_elites"]
-            name = short if row["search"] == row["design"] else row["search"].partition(", seed")[0]
-            searches.setdefault(name, []).append(place)
-        for name, places in searches.items():
-            mark = {"color": "0.6", "marker": "."} if name == short else {"marker": "o"}
-            axes.plot(*zip(*places, strict=True), linestyle="", label=name, **mark)
-        axes.legend(fontsize=7)
+            label, mark, color = "other designs, half as long", ".", "0.6"
+            if row["search"] != row["design"]:
+                label = row["search"].partition(", seed")[0]
+                mark, color = "*" if label.endswith("a million") else "o", f"C{finals.index(row['design'])}"
+            (handles[label],) = axes.plot(*place, mark, color=color)
         axes.grid(alpha=0.3)
+    figure.legend([*handles.values()], [*handles], fontsize=7, loc="outside right center")
     return figure
 
 
@@ -76,10 +98,12 @@ def draw_growth() -> Figure:
 
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
-    wanted = sys.argv[1:] or ["film", "pages", "curves"]
+    wanted = sys.argv[1:] or ["film", "stills", "pages", "curves"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
+    if "stills" in wanted:
+        take_still(payload_source(), "payload")
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         if read("results/anymal/archive/curve.json"):

@@ -13,21 +13,18 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from PIL import Image
 
 from qd.check import made_ready, walk
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.run.settings import preset
 from qd.search import search
-from qd.show.crossed import title_of, typical_episode
 from qd.show.elites import open_run
-from qd.show.film import Shot, pictures_of
 from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
 from results.make.common import agreement, crossing_rates
-from results.make.pictures import FOLDER
+from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
 from sim.device import resolve_device
@@ -63,7 +60,6 @@ WITH_SPECIALIST = "go2-robot-lab"
 """Whose network is plain layers, and whose failures a specialist certifies."""
 PICTURES = ("go2-robot-lab", "go1-playground", "g1-unitree")
 """Of whose worst failure the pages show a still."""
-SIZE = (640, 360)
 """Of a still, width and height [pixels]."""
 
 
@@ -132,17 +128,6 @@ def agree(crossings: Crossings, space: str, seed: int, terrains: int) -> dict[st
     return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 
-def take_picture(name: str, runs: Path) -> None:
-    """A still of the worst failure that a search found, at its moment: needs no GPU, but a renderer."""
-    opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
-    source = source_of_run(opened)
-    (recording,) = source.record("cpu")
-    shot = Shot(recording=recording, episode=typical_episode(recording, source.scales), title=title_of(recording))
-    moment = shot.end if shot.moment is None else shot.moment
-    (picture,) = pictures_of(shot, source.robot, np.array([moment]), SIZE)
-    Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
-
-
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures all of them, or those named, and writes what came of it as each is done."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -162,7 +147,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         shutil.rmtree(runs, ignore_errors=True)
     if args.pictures:
         for name in set(args.only) & set(PICTURES):
-            take_picture(name, runs)
+            opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
+            take_still(source_of_run(opened), name)
         return {}
     prepare_output(out)
     now = provenance(compute.device, args.seed)

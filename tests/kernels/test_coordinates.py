@@ -6,6 +6,7 @@ import warp as wp
 
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import (
+    Delay,
     SolverContacts,
     SolverState,
     ask_forces,
@@ -43,7 +44,7 @@ def solver():
 def told(solver):
     q, qd = random_states(ENVS, 3)
     targets = q + np.float32(1.0)
-    tell_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), solver)
+    tell_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), Delay(), solver)
     return q, qd, targets
 
 
