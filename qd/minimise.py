@@ -11,7 +11,7 @@ import numpy as np
 from qd.archive import OUTCOMES, Archive, goal_rates
 from qd.causes import effects_of
 from qd.faults import judgement, rate_of
-from qd.groups import elites_of, verdict_of
+from qd.groups import elites_of, verdict_of, verdicts_of
 from qd.judge import CROSSINGS_FOLDER, certifiers_of, certify, check_certifiers, confirm, find_search
 from qd.minima import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
 from qd.minimal import Case, How, Minimal, Trial, case_of, genes_of, take_apart
@@ -100,8 +100,8 @@ def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[
         raise ValueError(f"{run} must have fresh episodes of its elites, got none: let `faultline judge` cross them")
     failing = np.flatnonzero(archive.failing).tolist()
     if elite is None:
-        order = ("fault", "confirmed", "certified", "failing")
-        return sorted(sorted(failing, key=lambda number: order.index(verdict_of(archive, number)))[:most])
+        verdict = verdicts_of(archive)
+        return sorted(sorted(failing, key=lambda number: -verdict[number])[:most])
     if elite.strip() == "all":
         return failing
     numbers = chosen_elites(elite, range(len(archive)), f"{run} has no elite")

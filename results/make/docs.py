@@ -165,9 +165,8 @@ def noise() -> str:
         for robot, words in ROBOTS.items()
         for name, rows in searches_of(robot).items()
     }
-    columns: dict[str, Column] = {
-        name.replace("_", " "): name for name in ("elites", "corrected_elites", "failing", "families")
-    }
+    names = ("episodes", "elites", "corrected_elites", "failing", "families")
+    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
     columns["at most"] = shown("same_cell_ceiling", ".2f")
     return table(rows, columns)
@@ -271,9 +270,12 @@ def spaces() -> str:
 
 
 def sizes() -> str:
-    """The size of an obstacle that half of the robots get over; in brackets the last one tried, if more do."""
+    """The size of an obstacle that half of the robots get over; in brackets the last one tried, if more do.
+
+    Obstacles that at no size tried stop half of the robots are left out.
+    """
     columns, rows = {}, {}
-    for words, numbers in of_robots("results/{}/spaces.json").items():
+    for words, numbers in of_robots("results/{}/dose.json").items():
         last = {(row["element"], row["controller"]): row["value"] for row in numbers["dose"]}
         for half in numbers["half"]:
             name, tried = f"{words}: {half['controller']}", last[half["element"], half["controller"]]
@@ -281,7 +283,8 @@ def sizes() -> str:
             row = rows.setdefault(f"{obstacle}, {half['parameter']} {half['unit']}".strip(), {})
             row[name] = f"({tried:g})" if half["value"] is None else f"{half['value']:.2f}"
             columns[name] = lambda row, name=name: row.get(name, NONE)
-    return table(rows, columns)
+    stopping = {name: row for name, row in rows.items() if not all(size.startswith("(") for size in row.values())}
+    return table(stopping, columns)
 
 
 def agreement() -> str:

@@ -23,7 +23,11 @@ COUNTS = (
     "faults_unseen", "fault_families",
 )  # fmt: skip
 
-PARTS = ("hardening", "base", "at_once")
+EPISODES = 416_000
+SEEDS = (1000, 1001, 1002)
+"""Of the further searches, which are as long as those of the rounds, and whose seeds are far from theirs."""
+TRAINED = ("hardening", "at_once")
+SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
 
 
 def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
@@ -35,14 +39,20 @@ def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
 def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
     """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
     run = script.runs / "rounds" / f"{name}-{seed}"
-    cfg = script.search_cfg(13, seed=seed, policy=None if policy is None else str(policy))
+    cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
     search(cfg, run, script.compute)
     counts = judge_with_specialist(script, run)
     return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
 
 
-def train_at_once(script: Script, cfg: HardenCfg) -> Path:
+def cfg_of(script: Script) -> HardenCfg:
+    """Settings of the hardening."""
+    return replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
+
+
+def train_at_once(script: Script) -> Path:
     """A controller that has the steps of all rounds in one training, on the published archive."""
+    cfg = cfg_of(script)
     tune = cfg.sized_tune(script.robot, script.device)
     tune = replace(
         tune, seed=script.seed, archive=(str(script.results / "archive"),), iterations=cfg.rounds * tune.iterations
@@ -50,24 +60,9 @@ def train_at_once(script: Script, cfg: HardenCfg) -> Path:
     return finetune(script.robot, tune, script.runs / "at_once", RunCfg(device=script.device))
 
 
-def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Hardens in three rounds, and searches both ends again; a trial is one tiny round alone.
-
-    Parts are the hardening with the searches of its last controller, those of the base, and the one training.
-    """
-    script = parse(__doc__, argv, "rounds.json", parts=PARTS)
-    seeds = () if script.small else (1000, 1001, 1002)  # far from those of the rounds
-    parts = script.parts or PARTS
-    cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
-    searches = dict[str, list[dict[str, Any]]]()
-    if "base" in parts:
-        searches["base"] = [search_again(script, "base", None, seed) for seed in seeds]
-    if "at_once" in parts and not script.small:
-        policy = train_at_once(script, cfg)
-        searches["at_once"] = [search_again(script, "at_once", policy, seed) for seed in seeds]
-    if "hardening" not in parts:
-        return searches
-    run = script.runs / "hardening"
+def hardening_of(script: Script) -> tuple[dict[str, Any], Path | None]:
+    """Three rounds, or in a trial a tiny one alone; and the last controller."""
+    cfg, run = cfg_of(script), script.runs / "hardening"
     if script.small:
         cfg = replace(
             cfg, rounds=1, search=replace(cfg.search, episodes=16),
@@ -75,19 +70,36 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
         )  # fmt: skip
     hardening = harden(script.robot, cfg, run, script.compute, certifiers={} if script.small else None)
-    policy = last_policy(hardening["rounds"], run)
-    searches["last"] = [search_again(script, "last", policy, seed) for seed in seeds]
+    return hardening, last_policy(hardening["rounds"], run)
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
+
+    Parts are the two trainings, and each search by what it is of and its seed; those of a training come after it.
+    """
+    script = parse(__doc__, argv, "rounds.json", parts=(*TRAINED, *SEARCHES))
+    parts = script.parts or (TRAINED[:1] if script.small else (*TRAINED, *SEARCHES))
+    trained = {name: make(script) for name, make in {"hardening": hardening_of, "at_once": train_at_once}.items()
+               if any(part.startswith(name) for part in parts)}  # fmt: skip
+    hardening, hardened = trained.get("hardening", ({}, None))
+    policies = {"base": None, "hardening": hardened, "at_once": trained.get("at_once")}
+    searches: dict[str, list[dict[str, Any]]] = {name: [] for name in policies}
+    for part in parts:
+        if part in SEARCHES:
+            name, seed = SEARCHES[part]
+            searches[name].append(search_again(script, name, policies[name], seed))
     if script.parts:
         return searches
-    if policy is not None and not script.small:
-        shutil.copyfile(policy, script.results / "hardened.pt")
+    if hardened is not None and not script.small:
+        shutil.copyfile(hardened, script.results / "hardened.pt")
     return script.write(
         {
             **hardening,
             "seed": script.seed,
-            "searches": searches["last"],
+            "searches": searches["hardening"],
             "base_searches": searches["base"],
-            "at_once_searches": searches.get("at_once", []),
+            "at_once_searches": searches["at_once"],
         }
     )
 
