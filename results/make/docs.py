@@ -220,12 +220,10 @@ def condition_examples() -> str:
 def hardening() -> str:
     """Rounds of hardening: what a search finds of each controller, and its goal rates."""
     rows = {}
-    for robot, words in ROBOTS.items():
-        for seed, file in enumerate(("rounds", "rounds-1", "rounds-2")):
-            numbers = read(f"results/{robot}/{file}.json")
-            for one in numbers.get("rounds", ()):
-                goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
-                rows[f"{words}, seed {seed}: {one['controller']}"] = {**one, **goal}
+    for words, numbers in of_robots("results/{}/rounds.json").items():
+        for one in numbers.get("rounds", ()):
+            goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
+            rows[f"{words}: {one['controller']}"] = {**one, **goal}
     counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel")
     columns: dict[str, Column] = {name.replace("_", " "): name for name in counts}
     sets = {"hand_crafted": "hand-crafted", "hard_random": "hard-random", "search-0": "first archive"}
