@@ -12,6 +12,8 @@ NOMINAL = np.array([condition in (Condition.STRENGTH, Condition.FRICTION) for co
 """A row of conditions that change nothing, shape (12,)."""
 MOST_DELAY_S = MOST_LAG_S = 0.06
 """Longest delay of actions, beside the robot's own, and largest age of observations [s]."""
+DELAY_STEP_S, LAG_STEP_S = 0.005, 0.02
+"""What these are multiples of: physics and control steps of the shipped robots, which are late by whole steps alone."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +26,13 @@ class Gene:
     most: float
     absent: float = 0.0
     """The gene that changes nothing."""
+    step: float = 0.0
+    """What conditions are multiples of; 0 if they may be any number."""
 
     def value(self, genes: NDArray[np.floating]) -> NDArray[np.float64]:
         """Conditions of genes, any shape."""
-        return np.interp(genes, (-1.0, 0.0, 1.0), (self.least, self.middle, self.most))
+        values = np.interp(genes, (-1.0, 0.0, 1.0), (self.least, self.middle, self.most))
+        return np.floor(values / self.step + 0.5) * self.step if self.step else values
 
     def gene(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Genes of conditions, any shape; outside of the limits those at the limit."""
@@ -41,8 +46,8 @@ KINDS: dict[str, tuple[Gene, ...]] = {
         Gene(Condition.PAYLOAD_Y, -0.2, 0.0, 0.2),
     ),
     "motors": (Gene(Condition.STRENGTH, 0.4, 1.0, 1.2),),
-    "delay": (Gene(Condition.DELAY, 0.0, MOST_DELAY_S / 2, MOST_DELAY_S, absent=-1.0),),
-    "lag": (Gene(Condition.LAG, 0.0, MOST_LAG_S / 2, MOST_LAG_S, absent=-1.0),),
+    "delay": (Gene(Condition.DELAY, 0.0, MOST_DELAY_S / 2, MOST_DELAY_S, absent=-1.0, step=DELAY_STEP_S),),
+    "lag": (Gene(Condition.LAG, 0.0, MOST_LAG_S / 2, MOST_LAG_S, absent=-1.0, step=LAG_STEP_S),),
     "noise": (Gene(Condition.NOISE, 0.0, 2.0, 4.0, absent=-1.0),),
     "push": (
         Gene(Condition.PUSH_X, -2.0, 0.0, 2.0),
@@ -83,20 +88,22 @@ def rows_of(genes: NDArray[np.floating], kinds: Sequence[str]) -> NDArray[np.flo
     return rows
 
 
-_SIDES = {(True, 1): "ahead of", (True, -1): "behind", (False, 1): "left of", (False, -1): "right of"}
+def _directions(values: NDArray[np.floating], form: str, least: float, ways: Sequence[str]) -> str:
+    """Two numbers along the axes in words, each with one of the four ``ways``: ahead, back, left, right."""
+    said = [f"{abs(value):{form}} {ways[2 * axis + (value < 0)]}"
+            for axis, value in enumerate(values) if abs(value) >= least]  # fmt: skip
+    return " and ".join(said)
 
 
 def words_of(kind: str, row: NDArray[np.float32]) -> str:
     """One kind of a row of conditions in words; empty where it changes nothing to speak of."""
     payload, strength, push = row[Condition.PAYLOAD], row[Condition.STRENGTH], row[[Condition.PUSH_X, Condition.PUSH_Y]]
     if kind == "payload" and abs(payload) >= 0.0005:
-        offsets = row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y]]
-        places = [
-            f"{abs(offset):.2f} m {_SIDES[axis == 0, 1 if offset > 0 else -1]}"
-            for axis, offset in enumerate(offsets) if abs(offset) >= 0.005
-        ]  # fmt: skip
-        where = f", {' and '.join(places)} its centre" if places else ""
-        return f"payload of {payload:.1%} of its mass{where}" if payload > 0 else f"{-payload:.1%} of its mass less"
+        if payload < 0:
+            return f"base lighter by {-payload:.1%} of the robot's mass"
+        ways = ("m ahead of", "m behind", "m left of", "m right of")
+        place = _directions(row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y]], ".2f", 0.005, ways)
+        return f"payload of {payload:.1%} of the robot's mass{place and f', {place} the centre of the base'}"
     if kind == "motors" and abs(strength - 1.0) >= 0.005:
         return f"motors at {strength:.0%}"
     if kind == "delay" and row[Condition.DELAY] >= 0.0005:
@@ -106,8 +113,8 @@ def words_of(kind: str, row: NDArray[np.float32]) -> str:
     if kind == "noise" and row[Condition.NOISE] >= 0.05:
         return f"noise {row[Condition.NOISE]:.1f} times legged_gym's"
     if kind == "push" and np.abs(push).max() >= 0.05:
-        return f"pushed by {push[0]:+.1f} m/s along and {push[1]:+.1f} m/s across the way after " \
-               f"{row[Condition.PUSH_TIME]:.0f} s"  # fmt: skip
+        ways = ("m/s ahead", "m/s back", "m/s to the left", "m/s to the right")
+        return f"pushed by {_directions(push, '.1f', 0.05, ways)} after {row[Condition.PUSH_TIME]:.0f} s"
     if kind == "grip" and abs(row[Condition.FRICTION] - 1.0) >= 0.005:
         return f"friction times {row[Condition.FRICTION]:.2f}"
     return ""

@@ -151,6 +151,11 @@ def make_pack(
     ``seed`` draws. Without ``out`` the folder lies under runs/.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
+    if search.space.ground or search.space.conditions:
+        raise ValueError(
+            f"a pack holds heights alone, got terrains of {search.space.name}, which have ground or conditions of "
+            "their own"
+        )
     body, searched, archive = search.robot, search.policy, search.read_archive()
     controllers = {**(controllers or {"base": str(body.policy_file), **certifiers_of(search)})}
     if not any(is_same(searched, other) for other in controllers.values()):
@@ -169,11 +174,6 @@ def make_pack(
     if not chosen:
         raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
     print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
-    if search.space.ground or search.space.conditions:
-        raise ValueError(
-            f"a pack holds heights alone, got terrains of {search.space.name}, which have ground or conditions of "
-            "their own"
-        )
     genes = np.array([genes for _, genes in chosen], np.float32)
     heights = round_heights(heights_of(genes, search.space))
     out = out or RUNS / f"{body.name}-pack"

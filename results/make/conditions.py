@@ -1,8 +1,8 @@
 """What breaks the controller under conditions and terrain alone does not, and the dose beside it: conditions.json.
 
-Terrains and conditions are searched together. Then the terrains of the elites that fail are crossed under nominal
-conditions, and without each kind of condition alone. Some that need one kind alone are taken apart. The archive is
-published in results/<robot>/conditions.
+Terrains and conditions are searched together. Then the elites that fail are crossed once more, under nominal
+conditions, and without each kind of condition alone, from the same starts, so that a kind that does nothing changes
+nothing. Some that need one kind alone are taken apart. The archive is published in results/<robot>/conditions.
 """
 
 from collections.abc import Sequence
@@ -58,16 +58,17 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             )
             return goal_rates(outcome_counts(result)) >= FAILING_GOAL_RATE
 
-        nominal = passes(rows, range(len(KINDS)), "nominal conditions")
-        cured = rows[nominal]
+        again = rows[~passes(rows, (), "as they are")]
+        cured = again[passes(again, range(len(KINDS)), "nominal conditions")]
         needed = {kind: passes(cured, [number], f"without {kind}") for number, kind in enumerate(KINDS)}
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
     examples = examples_of(archive, cured, needed)
     minima = None
     if examples and not script.small:
-        minima = minimise(run, compute=script.compute, elite=" ".join(map(str, examples)))
+        minima = minimise(run, compute=script.compute, elite=" ".join(map(str, examples)), judged=True)
     return {
         "failing": len(rows),
+        "failing_again": len(again),
         "nominal_passes": len(cured),
         "confirmed_and_nominal_passes": int(archive.confirmed[cured].sum()),
         "faults_and_nominal_passes": int(archive.is_fault[cured].sum()),

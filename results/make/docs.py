@@ -190,10 +190,12 @@ def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def conditions() -> str:
     """Searches of terrains and conditions, and which of their failing elites need a condition."""
     rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
-            for words, numbers in of_robots("results/{}/conditions.json").items() if numbers}  # fmt: skip
+            if "failing_again" in numbers["conditions"] else numbers["archive"]  # before, chance was among the needs
+            for words, numbers in of_robots("results/{}/conditions.json").items()}  # fmt: skip
     names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
     columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
-    columns["failing, and crossed under nominal conditions"] = "nominal_passes"
+    columns["... again, from other starts"] = "failing_again"
+    columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults"] = "faults_and_nominal_passes"
     columns |= {f"... crossed with a nominal {kind} alone": kind for kind in KINDS}
     return table(rows, columns, upright=True)
@@ -201,7 +203,7 @@ def conditions() -> str:
 
 def condition_examples() -> str:
     """The smallest failing terrains that keep the condition that their elites need; of each kind the least."""
-    lines = ["|  | the terrain | and | reach the goal |  |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| needs | what is left | under | reach the goal | verdict |", "| --- | --- | --- | --- | --- |"]
     for robot, words in ROBOTS.items():
         examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
         minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
@@ -212,8 +214,8 @@ def condition_examples() -> str:
             if least is not None:
                 bumps = sum(part < BUMPS for part in least["bumps"])
                 ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"
-                left, fault = "; ".join(least["words"][bumps:]), "fault" * examples[least["elite"]]["fault"]
-                lines.append(f"| {words}: {kind} | {ground} | {left} | {least['goal_rate']:.2f} | {fault} |")
+                left, verdict = "; ".join(least["words"][bumps:]), least["verdict"]
+                lines.append(f"| {words}: {kind} | {ground} | {left} | {least['goal_rate']:.2f} | {verdict} |")
     return "\n".join(lines)
 
 

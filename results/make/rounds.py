@@ -1,6 +1,6 @@
 """Rounds of hardening, and how much the count of faults differs between searches of one controller: rounds.json.
 
-The base and the last controller are searched twice more, each time with a specialist of its own. The last controller is
+The base and the last controller are searched three times more, each with a specialist of its own. The last one is
 published as results/<robot>/hardened.pt. Beside it one training on the published archive alone, of as many steps as
 all rounds together, is searched as often.
 """

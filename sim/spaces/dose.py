@@ -47,11 +47,13 @@ class Quantity(NamedTuple):
     unit: str = "m"
     cells: int = 0
     """It is a multiple of so many cells, and the field counts cells. If 0 it is any number, and the field holds it."""
+    of_gene: float = 0.0
+    """Step of a condition."""
 
     @property
     def step(self) -> float:
         """What values are multiples of; 0 if they may be any number."""
-        return 1.0 if self.unit == "steps" else self.cells * SPACING
+        return 1.0 if self.unit == "steps" else self.of_gene or self.cells * SPACING
 
     def in_words(self, value: float) -> str:
         """A value with its unit: ``0.30 m``, ``5 steps``."""
@@ -86,8 +88,8 @@ QUANTITIES: dict[Kind, dict[str, Quantity]] = {
 _OF_CONDITION = {gene.condition: gene for gene in genes_of(tuple(KINDS))}
 _UNITS = {"delay": "s", "lag": "s", "push": "m/s"}
 _GROUND = {
-    name: Quantity("", max(0.0, _OF_CONDITION[condition].least), _OF_CONDITION[condition].most, _UNITS.get(name, ""))
-    for name, condition in _CONDITIONS.items()
+    name: Quantity("", max(0.0, gene.least), gene.most, _UNITS.get(name, ""), of_gene=gene.step)
+    for name, gene in ((name, _OF_CONDITION[condition]) for name, condition in _CONDITIONS.items())
 } | {
     "friction": Quantity("", LEAST_FRICTION, 1.0, ""),
     "softness": Quantity("", 1.1 * LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, "s"),

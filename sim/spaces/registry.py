@@ -42,11 +42,14 @@ def load_space(name: str | None) -> TerrainSpace:
     ``course+friction+softness``; None is the paper's space.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
+    once = joined_name(base, kinds)
+    if name and len(once) < len(name):
+        raise ValueError(f"a space must have each kind of ground and condition once, got {name}: give {once}")
     if is_own(base):
         sha256 = controller_hash(base)
         if sha256 is None or not any((space.name, space.sha256) == (base, sha256) for space in _loaded):
             _loaded.insert(0, load_own(base))
-    return get_space(joined_name(base, kinds))
+    return get_space(once)
 
 
 def get_space(name: str, sha256: str | None = None) -> TerrainSpace:

@@ -17,7 +17,7 @@ from sim.mujoco_c.model import crossing_model, noise_widths, rounded_steps, vary
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.spaces.registry import get_space, identity
+from sim.spaces.registry import get_space, identity, load_space
 from sim.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrain import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_dog
@@ -267,17 +267,26 @@ def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing()
     changed = SPACE.conditions_of(only) != SPACE.conditions_of(rows)
     assert changed[:, [Condition.PUSH_X, Condition.PUSH_Y]].all() and changed[:, : Condition.PUSH_X].sum() == 0
     described = SPACE.describe(genes(payload=0.08, payload_x=-0.12, delay=0.02, friction=0.7)).splitlines()[-1]
-    assert described == "payload of 8.0% of its mass, 0.12 m behind its centre, actions 20 ms late, friction times 0.70"
+    payload = "payload of 8.0% of the robot's mass, 0.12 m behind the centre of the base"
+    assert described == f"{payload}, actions 20 ms late, friction times 0.70"
     assert SPACE.describe(genes()).splitlines()[-1] == "nominal conditions"
+    pushed = SPACE.condition_words(genes(push_x=-0.3, push_y=1.2, push_time=4.0))
+    assert pushed == "pushed by 0.3 m/s back and 1.2 m/s to the left after 4 s"
+    assert SPACE.condition_words(genes(push_x=0.04, push_y=-1.2)) == "pushed by 1.2 m/s to the right after 6 s"
+    assert SPACE.condition_words(genes(delay=0.002, lag=0.009)) == "nominal conditions"  # no whole steps
+    assert SPACE.condition_words(genes(delay=0.0126, lag=0.033)) == "actions 15 ms late, observations 40 ms old"
     on_ice = get_space("course+friction+push")
     assert (on_ice.ground, on_ice.conditions, on_ice.num_genes) == (("friction",), ("push",), 36 + 32 + 3)
     assert identity("course+push", None) == "course+push"
+    with pytest.raises(ValueError, match=r"each .* once, got course\+push\+push: give course\+push$"):
+        load_space("course+push+push")
 
 
 def test_values_and_genes_are_each_others_inverse():
     for gene in genes_of(KINDS):
         if gene.condition != Condition.PUSH_TIME:  # which means nothing without a push
             assert gene.value(np.array([gene.absent])) == NOMINAL[gene.condition]
-        values = np.linspace(gene.least, gene.most, 9)
+        count = round((gene.most - gene.least) / gene.step) + 1 if gene.step else 9
+        values = np.linspace(gene.least, gene.most, count)
         np.testing.assert_allclose(gene.value(gene.gene(values)), values, atol=1e-12)
         np.testing.assert_allclose(gene.value(np.array([-5.0, 5.0])), [gene.least, gene.most])

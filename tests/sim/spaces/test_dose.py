@@ -92,6 +92,7 @@ def test_a_command_line_names_doses():
     [
         ("stair", "", "stair"),
         ("ditch=0.12", "", "width"),  # no multiple of 5 cm
+        ("lag=0.009", "", "lag"),  # nor of a control step
         ("stairs_up=0.9", "", "rise"),
         ("stairs_up=high", "", "stairs_up=high"),
         ("ditch=nan", "", "width"),
