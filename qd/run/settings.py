@@ -15,6 +15,8 @@ from sim.policy.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 
+_MOST_EPISODES = 10_000_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class SearchCfg:
@@ -48,6 +50,11 @@ class SearchCfg:
 
     def __post_init__(self) -> None:
         check(self)
+        if self.episodes_per_iteration > _MOST_EPISODES:
+            raise ValueError(
+                f"an iteration must have at most {_MOST_EPISODES:,} episodes, got {self.episodes_per_iteration:,}: "
+                "give fewer replicas or terrains"
+            )
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
         self.scheduler.check_iterations(self.iterations)
 
