@@ -49,7 +49,7 @@ def test_iterations_that_settle_need_terrains_to_cross_again_and_others_before_t
     cfg = dataclasses.replace(preset("small", robot()), scheduler=SchedulerCfg(again=2, settling=2))
     with pytest.raises(ValueError, match="settling must be below the iterations, 2, got 2"):
         dataclasses.replace(cfg, iterations=2)
-    with pytest.raises(ValueError, match="at most 10,000,000 episodes, got .*: give fewer replicas"):
+    with pytest.raises(ValueError, match=r"at most 10,000,000 episodes, got .*: give fewer replicas"):
         dataclasses.replace(cfg, replicas=10**9)
 
 
