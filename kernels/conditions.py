@@ -174,16 +174,17 @@ def _disturb_observation_kernel(
 ):  # fmt: skip
     """Grid (num_envs, num_columns)."""
     env, k = wp.tid()
-    age, size = disturbed_out.age[env, k], disturbed_out.former.shape[1]
-    column = observation_out[env, k]
-    width = disturbed_out.row[env, int(Condition.NOISE)] * noise_width(disturbed_out.noise, k, num_joints)
-    if width > 0.0:
+    age = disturbed_out.age[env, k]
+    factor = disturbed_out.row[env, int(Condition.NOISE)]
+    if factor > 0.0:
         # Of the episode's own stream, so that neither robot nor slot changes an episode.
         state = wp.rand_init(int(episodes.rng[env]), age * observation_out.shape[1] + k)
-        column += width * wp.randf(state, -1.0, 1.0)
-    disturbed_out.former[env, age % size, k] = column
+        observation_out[env, k] += factor * noise_width(disturbed_out.noise, k, num_joints) * wp.randf(state, -1.0, 1.0)
     lag = int(wp.round(disturbed_out.row[env, int(Condition.LAG)] / control_dt))
-    observation_out[env, k] = disturbed_out.former[env, wp.max(age - lag, 0) % size, k]
+    if lag > 0:
+        size = disturbed_out.former.shape[1]
+        disturbed_out.former[env, age % size, k] = observation_out[env, k]
+        observation_out[env, k] = disturbed_out.former[env, wp.max(age - lag, 0) % size, k]
     disturbed_out.age[env, k] = age + 1
 
 

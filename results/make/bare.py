@@ -14,6 +14,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
+from kernels.conditions import Condition
 from kernels.episode import Outcome, make_episodes
 from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
@@ -133,7 +134,7 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
     Returns:
         ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
         motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and
-        ``conditions``, under conditions that change nothing on such ground.
+        ``conditions``, under conditions on such ground: noise and lag of observations, and others that change nothing.
     """
     sim, robot = rollout.sim, rollout.robot
     segments = record_segments(rollout, terrains, seeds)
@@ -147,10 +148,13 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
 
 
 def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
-    """The same motion of robots that have conditions, which change nothing."""
+    """The same motion of robots that have conditions, of which none but noise and lag of what nobody reads acts."""
     robot = sim.robot
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
     bank.set_heights(sim.bank.heights.numpy())
+    rows = bank.conditions.numpy()
+    rows[:, Condition.NOISE], rows[:, Condition.LAG] = 1.0, robot.control_dt
+    bank.conditions.assign(rows)
     with wp.ScopedDevice(sim.device):
         varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
         varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
