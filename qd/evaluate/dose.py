@@ -28,6 +28,7 @@ from sim.spaces.dose import Dose
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
 _COLUMNS = 4
+_RESAMPLES = 1000
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
@@ -77,7 +78,7 @@ def measure_dose(
             "controllers": about_controllers(controllers, robot),
             "titles": {name: dose.describe() for name, dose in doses.items()},
             "dose": [{**row, "resolved": resolved} for of_dose in rows.values() for row in of_dose],
-            "half": [half_of(doses[name], of_dose) for (name, _), of_dose in rows.items()],
+            "half": [half_of(doses[name], of_dose, results[name][by]) for (name, by), of_dose in rows.items()],
         }
 
     return publish(out, measure, show_dose, draw=lambda report: as_png(draw_dose(report)))
@@ -129,27 +130,40 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
     return rows
 
 
-def half_of(dose: Dose, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def half_of(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
     """Where under half of the robots begin to reach the goal, by straight lines between the values.
 
-    The ``interval`` ends where the limits of the goal rates pass a half. None stands for what lies beyond the values.
+    The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None stands
+    for what lies beyond the values: ``beyond`` the ``first`` or the ``last``.
     """
-    known = [row for row in rows if row["goal_rate"] is not None]
-    values = [row["value"] for row in known]
-    value = _passes_half(values, [row["goal_rate"] for row in known])
-    limits = [_passes_half(values, [row["interval"][end] for row in known]) for end in (0, 1)]
+    known = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
+    values = [rows[number]["value"] for number in known]
     about = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    return {**about, "value": value, "interval": limits if dose.harder_up else limits[::-1]}
+    if not known:
+        return {**about, "value": None, "beyond": None, "interval": [None, None]}
+    counted = counted_episodes(result.outcome == Outcome.INVALID)
+    hits, counts = (
+        of_episodes.sum(axis=1).reshape(-1, len(rows))[:, known]
+        for of_episodes in ((result.outcome == Outcome.GOAL) & counted, counted)
+    )
+    drawn = np.random.default_rng(0).integers(len(hits), size=(_RESAMPLES, len(hits)))
+    with np.errstate(invalid="ignore"):
+        places = [_half_at(rates) for rates in hits[drawn].sum(axis=1) / counts[drawn].sum(axis=1)]
+    place = _half_at(hits.sum(axis=0) / counts.sum(axis=0))
+    ends = np.quantile(places, [0.025, 0.975], method="inverted_cdf")
+    value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None
+                      for at in (place, *ends))  # fmt: skip
+    beyond = None if value is not None else "last" if place > 0 else "first"
+    return {**about, "value": value, "beyond": beyond, "interval": limits if dose.harder_up else limits[::-1]}
 
 
-def _passes_half(values: Sequence[float], rates: Sequence[float]) -> float | None:
-    """Value at which rates first fall below a half; None if they never do, or are below at once."""
-    below = [place for place, rate in enumerate(rates) if rate < FAILING_GOAL_RATE]
-    if not below or below[0] == 0:
-        return None
-    last, first = below[0] - 1, below[0]
-    share = (rates[last] - FAILING_GOAL_RATE) / (rates[last] - rates[first])
-    return values[last] + share * (values[first] - values[last])
+def _half_at(rates: NDArray[np.floating]) -> float:
+    """Where along the places of rates they fall below a half; infinite if nowhere, -infinite if the first is below."""
+    below = np.flatnonzero(rates < FAILING_GOAL_RATE)
+    if not len(below) or below[0] == 0:
+        return -np.inf if len(below) else np.inf
+    last, first = rates[below[0] - 1], rates[below[0]]
+    return float(below[0] - 1 + (last - FAILING_GOAL_RATE) / (last - first))
 
 
 def show_dose(report: dict[str, Any]) -> None:

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from qd.archive import Archive
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
+from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.measures import interval_of, mean_of, terrain_rates
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_pack, show_pack_test
-from qd.faults import EPISODES, fresh_counts, judgement, rate_of
+from qd.faults import EPISODES, SPECIALIST, fresh_counts, judgement, rate_of
 from qd.fitness import FAILING_GOAL_RATE
 from qd.groups import families_of, rank, verdict_of
 from qd.judge import certifiers_of, find_search
@@ -170,9 +171,15 @@ def make_pack(
             f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}: run `faultline judge` on it first"
         )
     candidates, not_passable = candidates_of(archive, run)
+    trained_on = set[str]().union(*(recorded_marks(other) for name, other in controllers.items() if name != SPECIALIST))
+    marks = marks_of(archive.genes)
+    candidates = [candidate for candidate in candidates if marks[candidate[0]["elite"]] not in trained_on]
     chosen = choose_terrains(candidates, size)
     if not chosen:
-        raise ValueError(f"{run} must have faults or near-faults, got none and {not_passable} that nobody crosses")
+        raise ValueError(
+            f"{run} must have faults or near-faults that no controller but a specialist was trained on, got none and "
+            f"{not_passable} that nobody crosses"
+        )
     print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
     genes = np.array([genes for _, genes in chosen], np.float32)
     heights = round_heights(heights_of(genes, search.space))

@@ -1,6 +1,7 @@
 #!/bin/bash
 # Makes all published numbers, in order: results/make/all.sh [ROBOT ...], anymal and cassie if none is named.
-# A step is skipped if its file was made by today's sources of kernels, sim, qd and train.
+# A step is skipped if the last of its files was made by today's sources of kernels, sim, qd and train. What is of a
+# new archive or of new controllers with the same sources is made anew once its file is gone.
 # Behind a step stands its device time on one H100 (by kind of robot, ANYmal / Cassie, where they differ).
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -21,16 +22,16 @@ for robot in "${robots[@]}"; do
   make_file "$folder/base.json" base "$robot"                         # 2 min
   make_file "$folder/penalty_ratios.json" penalty_ratios "$robot"     # 1 min
   make_file "$folder/recipes.json" recipes "$robot"                   # 25 min: nine trainings
-  make_file "$folder/archive/archive.json" archive "$robot"           # 60 min: four searches, judged
+  make_file "$folder/third/curve.json" archive "$robot"               # 60 min: four searches, two of them judged
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 40 min: 16 searches
   make_file "$folder/search_noise.json" search_noise "$robot"         # 60 min: 47 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
   make_file "$folder/rounds.json" rounds "$robot"                     # 60 min
-  make_file "$folder/tables.json" tables "$robot"                     # 40 min: twelve trainings
+  make_file "$folder/tables_paper_sizes.json" tables "$robot"         # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
-  make_file "$folder/dose.json" dose "$robot"                         # 5 min
+  make_file "$folder/dose-resolved.json" dose "$robot"                # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
   make_file "$folder/conditions.json" conditions "$robot"             # 8 min
   make_file "sim/robots/$robot/pack/pack.json" pack "$robot"          # 2 min

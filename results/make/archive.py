@@ -27,7 +27,8 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
 CURVE = (6, 12, 31, 62, 125)
 """Iterations after which elites cross fresh episodes, the last those of the preset; the third search has three."""
 PUBLISHED = (
-    "archive.npz", "archive.json", "config.json", "metrics.jsonl", "curve.json", "*.png", "certifiers/specialist.pt",
+    "archive.npz", "archive.json", "config.json", "metrics.jsonl", "curve.json", "*.png", "minimal.*",
+    "certifiers/specialist.*",
 )  # fmt: skip
 """Files of a run that are published."""
 COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")

@@ -158,10 +158,13 @@ def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
     with wp.ScopedDevice(sim.device):
         varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
         varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
+        episodes.outcome.fill_(int(Outcome.RUNNING))
+        nobody = wp.zeros(sim.num_envs, dtype=int)
         observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
 
     def beside() -> None:
         varied.push(episodes, robot.physics_dt)
+        varied.begin_conditions(nobody)
         varied.disturb(episodes, observation)
 
     return Motion(varied, segments, beside)

@@ -1,6 +1,7 @@
 """What the scripts share: their five flags, the file that each writes, and means over seeds with their intervals."""
 
 import argparse
+import filecmp
 import json
 import os
 import queue
@@ -93,7 +94,10 @@ class Script:
         return replace(cfg, iterations=iterations or cfg.iterations)
 
     def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
-        """Copies files of a run into a folder of what is published."""
+        """Copies files of a run into a folder of what is published, and takes those away that it has not."""
+        for old in (file for pattern in patterns for file in folder.glob(pattern)):
+            if not (run / old.relative_to(folder)).exists():
+                old.unlink()
         for file in (file for pattern in patterns for file in run.glob(pattern)):
             target = folder / file.relative_to(run)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -103,11 +107,21 @@ class Script:
         """A published archive of archive.py; in a trial too."""
         return read_archive_of(self.robot, self.results / name)
 
+    def read_dose(self) -> list[dict[str, Any]]:
+        """Rows of dose.json beside the file, made by today's sources; in a trial none if it is not there."""
+        rows = self.read_so_far(self.out.with_name("dose.json")).get("dose", [])
+        if not rows and not self.small:
+            raise ValueError(f"{self.out.parent}/dose.json must be of today's sources: run results.make.dose first")
+        return rows
+
     def run_of_archive(self) -> Path:
         """The run of the published archive to work in; a copy of what is published where the run itself is gone."""
-        run = self.runs / ("copy" if self.small else "archive")
-        if not (run / "archive.npz").exists():
-            shutil.copytree(self.results / "archive", run, dirs_exist_ok=True)
+        run, published = self.runs / "archive", self.results / "archive"
+        if self.small or not (run / "archive.npz").exists():
+            run = self.runs / "copy"
+            if not is_same_file(run / "archive.npz", published / "archive.npz"):
+                shutil.rmtree(run, ignore_errors=True)
+                shutil.copytree(published, run)
         return run
 
     def read_so_far(self, file: Path, *alike: str) -> dict[str, Any]:
@@ -132,6 +146,11 @@ class Script:
         write_atomically(self.out, to_json(content))
         print(f"Written to {self.out}.")
         return content
+
+
+def is_same_file(first: Path, second: Path) -> bool:
+    """Whether two files are there and alike."""
+    return first.exists() and second.exists() and filecmp.cmp(first, second, shallow=False)
 
 
 def file_name(words: str) -> str:
@@ -207,6 +226,12 @@ def parse(
         origin={**provenance(device, args.seed), **identity(robot, str(robot.policy_file)), **trial},
         parts=tuple(getattr(args, "parts", None) or ()),
     )
+
+
+def publish_controller(script: Script, policy: Path, name: str) -> None:
+    """Copies a trained controller and its training record to ``results/<robot>/<name>``."""
+    for suffix in (".pt", ".train.json"):
+        shutil.copyfile(policy.with_suffix(suffix), script.results / f"{name}{suffix}")
 
 
 def published_controllers(script: Script) -> dict[str, str]:

@@ -19,7 +19,7 @@ from qd.minimise import minimise
 from qd.run.directory import RunDirectory
 from qd.search import search
 from qd.workers.cross import Crossings
-from results.make.common import Script, parse, read_made
+from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
 from sim.conditions import KINDS
 from sim.spaces.dose import CONDITIONS_SPACE as SPACE
@@ -50,17 +50,18 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
     run = script.runs / "conditions"
     with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
 
-        def passes(rows: NDArray[np.int64], taken: Sequence[int], label: str) -> NDArray[np.bool_]:
-            """Whether half of the robots cross elites without some kinds of conditions."""
+        def rates(rows: NDArray[np.int64], taken: Sequence[int], label: str) -> NDArray[np.float64]:
+            """Goal rates on elites without some kinds of conditions; NaN of an invalid one."""
             genes = space.without(archive.genes[rows], [first + kind for kind in taken])
             result = crossings.cross(
                 script.policy, genes, seeds[rows], replicas=EPISODES, space=SPACE, label=label, invalid_ok=True
             )
-            return goal_rates(outcome_counts(result)) >= FAILING_GOAL_RATE
+            return goal_rates(outcome_counts(result))
 
-        again = rows[~passes(rows, (), "as they are")]
-        cured = again[passes(again, range(len(KINDS)), "nominal conditions")]
-        needed = {kind: passes(cured, [number], f"without {kind}") for number, kind in enumerate(KINDS)}
+        again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]
+        cured = again[rates(again, range(len(KINDS)), "nominal conditions") >= FAILING_GOAL_RATE]
+        needed = {kind: rates(cured, [number], f"without {kind}") >= FAILING_GOAL_RATE
+                  for number, kind in enumerate(KINDS)}  # fmt: skip
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
     examples = examples_of(archive, cured, needed)
     minima = None
@@ -104,8 +105,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
-    file = script.out.with_name("dose.json")
-    dose = [row for row in read_made(file).get("dose", []) if row["parameter"] in KINDS]
+    dose = [row for row in script.read_dose() if row["parameter"] in KINDS]
     return script.write(
         {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed, "dose": dose}
     )

@@ -99,7 +99,9 @@ def archives() -> str:
     columns = {
         "episodes": "episodes",
         "*elites*: terrains, each the hardest of its kind": "elites",
+        "... that are in their cell again, in fresh episodes": "elites_same_cell",
         "*corrected elites*: cells that fresh episodes alone would fill": "corrected_elites",
+        "*families* of like terrains": "families",
         "*failing*: under half of the robots cross it in fresh episodes": "failing",
         "*confirmed*: failing, also with finer physics": "confirmed",
         "*faults*: confirmed, and a controller of the panel crosses it": "faults_panel",
@@ -150,12 +152,10 @@ def beside_paper() -> str:
 
 def methods(robot: str) -> str:
     """Methods of search, means over seeds, the one with most failing elites first."""
-    rows = [(name.replace("mixed", "cma_mae+map_elites"), one) for file in ("search", "compare")
-            for name, one in read(f"results/{robot}/{file}.json").get("methods", {}).items()]  # fmt: skip
-    rows = sorted((row for row in rows if ":" not in row[0]), key=lambda row: (-row[1]["episodes"], -row[1]["failing"]))
+    rows = sorted(read(f"results/{robot}/search.json").get("methods", {}).items(), key=lambda row: -row[1]["failing"])
     names = ("seeds", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
-    named = {f"{name}, {one['episodes']:,.0f} episodes": one for name, one in rows}
-    return table(named, {name.replace("_", " "): name for name in names})
+    named = {name.replace("mixed", "cma_mae+map_elites"): one for name, one in rows if ":" not in name}
+    return table(named, {name.replace("_", " "): name for name in ("episodes", *names)})
 
 
 def noise() -> str:
@@ -192,11 +192,11 @@ def conditions() -> str:
     rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
             if "failing_again" in numbers["conditions"] else numbers["archive"]  # before, chance was among the needs
             for words, numbers in of_robots("results/{}/conditions.json").items()}  # fmt: skip
-    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
+    names = ("episodes", "elites", "corrected_elites", "confirmed", "faults_panel", "failing")
     columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
-    columns["... and faults"] = "faults_and_nominal_passes"
+    columns["... and faults by the panel"] = "faults_and_nominal_passes"
     columns |= {f"... crossed with a nominal {kind} alone": kind for kind in KINDS}
     return table(rows, columns, upright=True)
 
@@ -208,7 +208,7 @@ def condition_examples() -> str:
         examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
         minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
         for number, kind in enumerate(KINDS):
-            of_kind = [one for one in minima if examples[one["elite"]]["needs"] == kind]
+            of_kind = [one for one in minima if examples.get(one["elite"], {}).get("needs") == kind]
             least = min((one for one in of_kind if BUMPS + number in one["bumps"]),
                         key=lambda one: len(one["bumps"]), default=None)  # fmt: skip
             if least is not None:
@@ -263,35 +263,47 @@ def growth() -> str:
 
 def spaces() -> str:
     """Searches in different terrain spaces."""
-    rows = {f"{words}, {one['space']}": one for words, numbers in of_robots("results/{}/spaces.json").items()
-            for one in numbers["spaces"].values()}  # fmt: skip
-    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "certified", "faults")
+    rows = {f"{words}, {name}": one for words, numbers in of_robots("results/{}/spaces.json").items()
+            for name, one in numbers["spaces"].items()}  # fmt: skip
+    names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "certified", "faults", "faults_panel")
     return table(rows, {name.replace("_", " "): name for name in names})
 
 
 def sizes() -> str:
-    """The size of an obstacle that half of the robots get over; in brackets the last one tried, if more do.
+    """The size of an obstacle that half of the robots get over, with contact resolved; a range where it is not sharp.
 
-    Obstacles that at no size tried stop half of the robots are left out.
+    In brackets stands the last size tried, if over half get over that. Obstacles that stop nobody so are left out.
     """
     columns, rows = {}, {}
-    for words, numbers in of_robots("results/{}/dose.json").items():
-        last = {(row["element"], row["controller"]): row["value"] for row in numbers["dose"]}
+    for words, numbers in of_robots("results/{}/dose-resolved.json").items():
+        tried = dict[tuple[str, str], list[float]]()
+        for row in numbers["dose"]:
+            tried.setdefault((row["element"], row["controller"]), []).append(row["value"])
         for half in numbers["half"]:
-            name, tried = f"{words}: {half['controller']}", last[half["element"], half["controller"]]
+            name, values = f"{words}: {half['controller']}", tried[half["element"], half["controller"]]
             obstacle = half["element"].replace("_", " ")
             row = rows.setdefault(f"{obstacle}, {half['parameter']} {half['unit']}".strip(), {})
-            row[name] = f"({tried:g})" if half["value"] is None else f"{half['value']:.2f}"
+            row[name] = size_words(half, values)
             columns[name] = lambda row, name=name: row.get(name, NONE)
     stopping = {name: row for name, row in rows.items() if not all(size.startswith("(") for size in row.values())}
     return table(stopping, columns)
 
 
+def size_words(half: Mapping[str, Any], tried: Sequence[float]) -> str:
+    """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those tried."""
+    value, (low, high), form = half["value"], half["interval"], ".3f" if half["unit"] == "s" else ".2f"
+    if value is None:
+        return f"under {tried[0]:g}" if half.get("beyond") == "first" else f"({tried[-1]:g})"
+    if low is not None and high is not None and high - low <= 0.2 * value:
+        return f"{value:{form}}"
+    return " to ".join("..." if limit is None else f"{limit:{form}}" for limit in (low, high))
+
+
 def agreement() -> str:
     """How far rates at the search's settings lie above those of other crossings of the same terrains."""
-    ways = {"again": "the same settings again", "resolved": "finer physics", "mujoco_c": "MuJoCo C",
-            "mujoco_c_resolved": "MuJoCo C, finer", "both_resolved": "both finer"}  # fmt: skip
-    rows = {f"{words}, {name.replace('_', '-')}: {label}": numbers[name][way]
+    ways = {"again": "the same settings again", "resolved": "finer physics", "mujoco_c": "MuJoCo C, finer",
+            "both_resolved": "both finer"}  # fmt: skip
+    rows = {f"{words}, {name.replace('_', '-')}: {label}": numbers[name].get(f"{way}_resolved", numbers[name][way])
             for words, numbers in of_robots("results/{}/agreement.json").items()
             for name in ("hard_random", "elites") for way, label in ways.items() if way in numbers[name]}  # fmt: skip
     return table(rows, {"terrains": "terrains", "goal rate": shown("goal_bias", "+.3f")})
@@ -309,10 +321,14 @@ def minimal() -> str:
 def packs() -> str:
     """Controllers on the published packs: goal rate, and failed terrains."""
     files = of_robots("sim/robots/{}/pack/pack.json")
-    columns = {words: lambda name, rates=pack["rates"]: "{}; {} of {}".format(
-        value_words(rates[name]["goal_rate"], rates[name]["goal_interval"]), rates[name]["failing"],
-        rates[name]["terrains"]) for words, pack in files.items()}  # fmt: skip
-    return table({name: name for name in files["ANYmal C"]["rates"]}, columns)
+
+    def cell(rates: Mapping[str, Any]) -> Callable[[Any], str]:
+        return lambda name: NONE if name not in rates else "{}; {} of {}".format(
+            value_words(rates[name]["goal_rate"], rates[name]["goal_interval"]), rates[name]["failing"],
+            rates[name]["terrains"])  # fmt: skip
+
+    names = dict.fromkeys(name for pack in files.values() for name in pack["rates"])
+    return table({name: name for name in names}, {words: cell(pack["rates"]) for words, pack in files.items()})
 
 
 def public_controllers() -> str:
@@ -391,7 +407,7 @@ def speed() -> str:
         "... of 8,192 on each of two GPUs": trained("train_env_steps_per_s_2gpu"),
         "... of mjlab's 4,096 Unitree Go1": trained("train_env_steps_per_s_mjlab"),
         f"goal rate above that of finer physics, {sizes}": inside("agreement", "resolved", "goal_bias", form="+.3f"),
-        f"goal rate above that of MuJoCo C, {sizes}": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),
+        f"goal rate above that of MuJoCo C, finer, {sizes}": inside("agreement", "mujoco_c", "goal_bias", form="+.3f"),
         "largest kernels of a control step": lambda row: row["named"]["kernels"],
         "device": lambda row: row["named"]["device"],
         "commit": lambda row: row["named"]["commit"],

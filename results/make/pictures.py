@@ -51,12 +51,12 @@ def take_still(source: Source, name: str) -> None:
     Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
 
 
-def payload_source() -> Source:
-    """The first minimal terrain of the published search under conditions whose cause is a payload."""
+def payload_source() -> Source | None:
+    """The first minimal terrain of the published search under conditions whose cause is a payload; None without any."""
     run = Path("results/anymal/conditions")
-    minima = read(f"{run}/minimal.json")["elites"]
-    number = next(minimal["elite"] for minimal in minima if minimal["cause"]["kind"] == "payload")
-    return source_of_run(open_run("anymal", run), minimal=str(number))
+    minima = read(f"{run}/minimal.json").get("elites", ())
+    numbers = [str(minimal["elite"]) for minimal in minima if (minimal["cause"] or {}).get("kind") == "payload"]
+    return source_of_run(open_run("anymal", run), minimal=numbers[0]) if numbers else None
 
 
 def draw_noise() -> Figure:
@@ -102,8 +102,8 @@ def main() -> None:
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
-    if "stills" in wanted:
-        take_still(payload_source(), "payload")
+    if "stills" in wanted and (source := payload_source()) is not None:
+        take_still(source, "payload")
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         if read("results/anymal/archive/curve.json"):

@@ -5,7 +5,6 @@ published as results/<robot>/hardened.pt. Beside it one training on the publishe
 all rounds together, is searched as often.
 """
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from qd.search import search
 from results.make.archive import judge_with_specialist
-from results.make.common import Script, parse
+from results.make.common import Script, parse, publish_controller
 from train.cfg import HardenCfg, RunCfg
 from train.finetune import finetune
 from train.harden import harden
@@ -92,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     if script.parts:
         return searches
     if hardened is not None and not script.small:
-        shutil.copyfile(hardened, script.results / "hardened.pt")
+        publish_controller(script, hardened, "hardened")
     return script.write(
         {
             **hardening,

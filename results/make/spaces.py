@@ -1,6 +1,5 @@
 """What breaks the controller in each terrain space, and the dose beside them: spaces.json."""
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,9 +35,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
                         compute=script.compute)  # fmt: skip
         summary = RunDirectory(run).read_summary()
         numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
-    dose = script.out.with_name("dose.json")
-    rows = json.loads(dose.read_text())["dose"] if dose.exists() else None
-    return script.write({"spaces": numbers, "dose": rows})
+    return script.write({"spaces": numbers, "dose": script.read_dose()})
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ seed at the paper's sizes is tables_paper_sizes.json.
 """
 
 import itertools
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
-from results.make.common import SEEDS, Script, crossing_rates, parse, published_controllers
+from results.make.common import SEEDS, Script, crossing_rates, parse, publish_controller, published_controllers
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
 from train.cfg import LARGE, FinetuneCfg, RunCfg
@@ -52,7 +51,7 @@ def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str
         policy = train(script, cfg, name, seed, script.runs / file / f"{name}-{seed}")
         controllers[name if seed == SEEDS[0] else f"{name}@{seed}"] = policy
         if (file, seed) == ("tables", SEEDS[0]):
-            shutil.copyfile(policy, script.results / f"{name}.pt")
+            publish_controller(script, Path(policy), name)
     return controllers
 
 
@@ -130,7 +129,8 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         episodes=episodes,
         seed=script.seed,
     )
-    tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=script.out)
+    draft = script.runs / script.out.name  # what is published is written last, and whole
+    tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=draft)
     archive = script.read_archive()
     independent = None if cfg.independent is None else script.read_archive("independent")
     sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent)
@@ -142,14 +142,14 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         name: {controller: crossing_rates(result.outcome, "goal") for controller, result in row.items()}
         for name, row in crossed.items()
     }
-    script.add(
-        tables,
-        {"kind_differences": {name: kind_differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
-    )
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
     arrays |= {f"{name}_family": families_of(of_set) for name, of_set in sets.items()}
     arrays["controllers"] = np.array(list(controllers))
     write_atomically(script.out.with_suffix(".npz"), npz_bytes(arrays))
+    script.add(
+        tables,
+        {"kind_differences": {name: kind_differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
+    )
 
 
 if __name__ == "__main__":

@@ -34,14 +34,22 @@ _SHOWN = 12  # digits of a hash in a message
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
-    """Command, commit, hash of the sources, device, versions, seed and date of the running program."""
-    changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *(ROOT / name for name in ROOMS)])
-    commit = _output(["git", "rev-parse", "HEAD"])
+    """Command, commit, hash of the sources, device, versions, seed and date of the running program.
+
+    ``dirty`` says whether sources or scripts differ from the commit. Where there is no git, FAULTLINE_COMMIT names the
+    commit, with -dirty behind it if they do.
+    """
+    given = os.environ.get("FAULTLINE_COMMIT", "")
+    commit, dirty = given.removesuffix("-dirty") or None, given.endswith("-dirty")
+    if commit is None:
+        places = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack"]
+        changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *places])
+        commit, dirty = _output(["git", "rev-parse", "HEAD"]), None if changed is None else changed != ""
     return {
         "command": _command(),
-        "commit": os.environ.get("FAULTLINE_COMMIT") or commit or None,
+        "commit": commit,
         "sources_sha256": sources_sha256(),
-        "dirty": None if changed is None else changed != "",
+        "dirty": dirty,
         "device": device_name(device),
         "versions": versions(),
         "seed": seed,

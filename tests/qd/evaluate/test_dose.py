@@ -62,26 +62,25 @@ def test_rows_are_by_value():
     assert (first["success_rate"], first["fallen_rate"]) == (1.0, 0.0)
     # Half of the second's episodes are invalid, more than a quarter.
     assert (second["goal_rate"], second["interval"], second["episodes"]) == (None, None, 0)
-    assert half_of(dose, [first, second])["value"] is None
+    half = half_of(dose, [first, second], result)
+    assert (half["value"], half["beyond"], half["interval"]) == (None, "last", [None, None])
 
 
 @pytest.mark.parametrize(
-    ("name", "rates", "limits", "value", "interval"),
+    ("name", "hits", "value", "beyond", "interval"),
     [
-        # From .9 at 0.2 m to .1 at 0.4 m: half at 0.3 m. The limits pass it from .8 to 0 and from 1 to .3.
-        ("ditch", (0.9, 0.1), [(0.8, 1.0), (0.0, 0.3)], 0.3, [0.2 + 0.2 * 0.3 / 0.8, 0.2 + 0.2 * 0.5 / 0.7]),
-        # Friction gets harder as it falls: .9 at 0.4 and .1 at 0.2.
-        ("friction", (0.9, 0.1), [(0.8, 1.0), (0.0, 0.3)], 0.3, [0.4 - 0.2 * 0.5 / 0.7, 0.4 - 0.2 * 0.3 / 0.8]),
-        ("friction", (0.9, 0.7), [(0.8, 1.0), (0.6, 0.8)], None, [None, None]),
+        # Of four places all arrive at the first value and one at the second: 1 and .25, and a half between them.
+        ("ditch", [(2, 0), (2, 2), (2, 0), (2, 0)], 0.2 + 0.2 * 0.5 / 0.75, None, (0.3, None)),
+        # Friction gets harder as it falls, from .4 to .2.
+        ("friction", [(2, 0), (2, 2), (2, 0), (2, 0)], 0.4 - 0.2 * 0.5 / 0.75, None, (None, 0.3)),
+        ("friction", [(2, 2), (2, 2), (2, 2), (2, 2)], None, "last", (None, None)),
+        ("ditch", [(0, 0), (0, 2), (0, 0), (0, 0)], None, "first", (None, None)),
+        ("ditch", [(2, 0), (2, 0), (2, 0), (2, 0)], 0.3, None, (0.3, 0.3)),  # no place differs from another
     ],
 )
-def test_where_under_half_begin_to_reach_the_goal(name, rates, limits, value, interval):
+def test_where_under_half_begin_to_reach_the_goal(name, hits, value, beyond, interval):
     dose = parse_doses([f"{name}=0.2,0.4"], [])[name]
-    about = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "controller": "a"}
-    rows = [
-        {**about, "value": size, "goal_rate": rate, "interval": list(ends)}
-        for size, rate, ends in zip(dose.values, rates, limits, strict=True)
-    ]
-    half = half_of(dose, rows)
-    assert half["value"] == (None if value is None else pytest.approx(value))
+    result = result_of([[GOAL] * hit + [HIT] * (2 - hit) for place in hits for hit in place])
+    half = half_of(dose, rows_of(name, dose, "a", result), result)
+    assert half["value"] == (None if value is None else pytest.approx(value)) and half["beyond"] == beyond
     assert half["interval"] == [None if limit is None else pytest.approx(limit) for limit in interval]
