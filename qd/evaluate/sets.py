@@ -205,11 +205,12 @@ def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on
 
 
 def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
+    """Their families are those in the whole archive, where it was judged: kin of kin may not be in the set."""
     elites, space = archive.rows(rows), space_of(archive)
+    families = families_of(elites.genes, space) if elites.family is None else elites.family
     return TerrainSet(
-        terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families_of(elites.genes, space),
-        elites=elites,
-    )  # fmt: skip
+        terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families, elites=elites
+    )
 
 
 def space_of(archive: Archive) -> TerrainSpace:

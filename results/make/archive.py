@@ -11,21 +11,19 @@ from typing import Any
 
 from qd.judge import judge
 from qd.run.directory import RunDirectory
-from qd.search import search
-from results.make.common import ONCE, Script, parse
-from sim.files.atomic import to_json, write_atomically
+from results.make.common import ONCE, Script, follow_search, parse
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
 SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
     "archive": ({}, 0),
-    "archive_cma_mae": ({"method": "cma_mae", **ONCE}, 0),
+    "archive_cma_mae": ({"method": "cma_mae", **ONCE, "emitters": 10, "groups": 1}, 0),
     "independent": ({}, 1),
     "third": ({}, 2),
 }
-"""Changes of preset wide, and seed of each."""
-CURVE = (6, 12, 31, 62, 125)
-"""Iterations after which elites cross fresh episodes, the last those of the preset; the third search has three."""
+"""Changes of preset wide, and seed of each; the paper has ten emitters of 20 terrains."""
+CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
+"""Episodes after which elites cross fresh ones; the third search has three points."""
 PUBLISHED = (
     "archive.npz", "archive.json", "config.json", "metrics.jsonl", "curve.json", "*.png", "minimal.*",
     "certifiers/specialist.*",
@@ -37,15 +35,9 @@ COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing
 def make_archive(script: Script, name: str) -> Path:
     """Searches and judges; returns the run."""
     changes, seed = ({}, 0) if script.small else SEARCHES[name]
-    run, points = script.runs / name, CURVE[:3] if name == "third" else CURVE
-    so_far = {row["iterations"]: row for row in script.read_so_far(run / "curve.json").get("curve", [])}
-    for iterations in points[:1] if script.small else points:
-        if iterations not in so_far:
-            search(script.search_cfg(iterations, seed=script.seed + seed, **changes), run, script.compute)
-            judge(run, stages=("fresh",), compute=script.compute)
-            numbers = RunDirectory(run).read_summary()
-            so_far[iterations] = {"iterations": iterations, **{count: numbers[count] for count in COUNTS}}
-            write_atomically(run / "curve.json", to_json({**script.origin, "curve": [*so_far.values()]}))
+    run, cfg = script.runs / name, script.search_cfg(seed=script.seed + seed, **changes)
+    points = [round(episodes / cfg.episodes_per_iteration) for episodes in (CURVE[:3] if name == "third" else CURVE)]
+    follow_search(script, run, cfg, [1] if script.small else points, COUNTS)
     if not script.small and name.startswith("archive"):  # on a CPU a training takes hours
         judge_with_specialist(script, run)
     return run

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.archive import Archive
-from qd.run.directory import read_archive_of
+from qd.judge import Stage, judge
+from qd.run.directory import RunDirectory, read_archive_of
 from qd.run.settings import SearchCfg, preset
+from qd.search import search
 from qd.workers.evaluator import Compute
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
@@ -146,6 +148,30 @@ class Script:
         write_atomically(self.out, to_json(content))
         print(f"Written to {self.out}.")
         return content
+
+
+def follow_search(
+    script: Script,
+    run: Path,
+    cfg: SearchCfg,
+    points: Sequence[int],
+    counts: Sequence[str],
+    last_stages: Sequence[Stage] = ("fresh",),
+) -> list[dict[str, Any]]:
+    """Extends a search to so many iterations one by one, and lets its elites cross fresh episodes after each.
+
+    Returns ``counts`` of each point, which the run's curve.json keeps: what is in it is not searched again. At the last
+    point it is judged by ``last_stages``.
+    """
+    rows = {row["iterations"]: row for row in script.read_so_far(run / "curve.json").get("curve", [])}
+    for iterations in points:
+        if iterations not in rows:
+            search(replace(cfg, iterations=iterations), run, script.compute)
+            judge(run, stages=last_stages if iterations == points[-1] else ("fresh",), compute=script.compute)
+            numbers = RunDirectory(run).read_summary()
+            rows[iterations] = {"iterations": iterations, **{count: numbers.get(count) for count in counts}}
+            write_atomically(run / "curve.json", to_json({**script.origin, "curve": [*rows.values()]}))
+    return [rows[iterations] for iterations in points]
 
 
 def is_same_file(first: Path, second: Path) -> bool:

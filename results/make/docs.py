@@ -85,6 +85,9 @@ def rate(robot: str, measure: str, terrains: str, controller: str, *, short: boo
     tables = read(f"results/{robot}/tables.json")
     if controller == "hardened" and controller not in tables["goal"]["hand_crafted"]:
         tables = read(f"results/{robot}/hardened.json")
+    kind = tables.get("kinds", {}).get(terrains, {}).get(controller)  # over terrains and seeds
+    if measure == "goal" and kind:
+        return value_words(kind["goal"], None if short else kind["interval"], ".3f")
     seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
     value = seeds.get("mean", tables[measure].get(terrains, {}).get(controller))
     limits = seeds.get("interval", tables["intervals"][measure].get(terrains, {}).get(controller))
@@ -131,6 +134,18 @@ def goals(robot: str, measure: str = "goal") -> str:
     certified = tables["certified"][HELD_OUT[0]]["terrains"]
     rows[f"{SETS[HELD_OUT[0]]}, certified ({certified})"] = (f"certified_{measure}", HELD_OUT[0])
     return table(rows, {one: lambda row, one=one: rate(robot, row[0], row[1], one) for one in CONTROLLERS})
+
+
+def differences() -> str:
+    """How much more often one kind of controller reaches the goal than another, over terrains and seeds."""
+    rows = {f"{words}, {SETS[name]}": of_set for words, tables in of_robots("results/{}/tables.json").items()
+            for name, of_set in tables.get("differences", {}).items() if name in SETS}  # fmt: skip
+
+    def cell(pair: str) -> Callable[[Any], str]:
+        return lambda row: value_words(row[pair]["goal"], row[pair]["interval"], "+.3f") if row.get(pair) else NONE
+
+    pairs = ("C-G - C-HR", "C-G - C-HC", "C-G - base", "hardened - C-G")
+    return table(rows, {pair: cell(pair) for pair in pairs})
 
 
 def beside_paper() -> str:
@@ -449,7 +464,7 @@ def kernels() -> str:
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
     archives, growth, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement,
     minimal, packs, public_controllers, speed, kernels, noise, conditions,
-    condition_examples)}  # fmt: skip
+    condition_examples, differences)}  # fmt: skip
 
 
 def with_tables(text: str) -> str:

@@ -5,17 +5,17 @@ published as results/<robot>/hardened.pt. Beside it one training on the publishe
 all rounds together, is searched as often.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from qd.search import search
 from results.make.archive import judge_with_specialist
-from results.make.common import Script, parse, publish_controller
+from results.make.common import Script, parse, publish_controller, read_made
 from train.cfg import HardenCfg, RunCfg
 from train.finetune import finetune
-from train.harden import harden
+from train.harden import ROUNDS_FILE, harden
 
 COUNTS = (
     "episodes", "elites", "corrected_elites", "families", "failing", "confirmed", "certified", "faults", "faults_panel",
@@ -29,8 +29,14 @@ TRAINED = ("hardening", "at_once")
 SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
 
 
-def last_policy(rounds: Sequence[Mapping[str, Any]], run: Path) -> Path | None:
-    """File of the last training that was kept; None if there is none."""
+def last_policy(script: Script) -> Path | None:
+    """File of the last training of the hardening that was kept; None if there is none."""
+    run = script.runs / "hardening"
+    rounds = read_made(run / ROUNDS_FILE).get("rounds", ())
+    if not script.small and len(rounds) <= cfg_of(script).rounds:
+        raise ValueError(
+            f"{run} must hold a finished hardening, got {len(rounds)} searches: run the part hardening first"
+        )
     kept = [row["tuned"] for row in rounds if row["kept"]]
     return run / kept[-1] / "policy.pt" if kept else None
 
@@ -59,37 +65,38 @@ def train_at_once(script: Script) -> Path:
     return finetune(script.robot, tune, script.runs / "at_once", RunCfg(device=script.device))
 
 
-def hardening_of(script: Script) -> tuple[dict[str, Any], Path | None]:
-    """Three rounds, or in a trial a tiny one alone; and the last controller."""
-    cfg, run = cfg_of(script), script.runs / "hardening"
+def harden_here(script: Script) -> dict[str, Any]:
+    """Three rounds, or in a trial a tiny one alone."""
+    cfg = cfg_of(script)
     if script.small:
         cfg = replace(
             cfg, rounds=1, search=replace(cfg.search, episodes=16),
             tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
             evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
         )  # fmt: skip
-    hardening = harden(script.robot, cfg, run, script.compute, certifiers={} if script.small else None)
-    return hardening, last_policy(hardening["rounds"], run)
+    return harden(script.robot, cfg, script.runs / "hardening", script.compute, certifiers={} if script.small else None)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
 
-    Parts are the two trainings, and each search by what it is of and its seed; those of a training come after it.
+    Parts are the two trainings, and each search by what it is of and its seed; those of the hardening come after it.
+    Where no round is kept there is nothing to search again.
     """
     script = parse(__doc__, argv, "rounds.json", parts=(*TRAINED, *SEARCHES))
     parts = script.parts or (TRAINED[:1] if script.small else (*TRAINED, *SEARCHES))
-    trained = {name: make(script) for name, make in {"hardening": hardening_of, "at_once": train_at_once}.items()
-               if any(part.startswith(name) for part in parts)}  # fmt: skip
-    hardening, hardened = trained.get("hardening", ({}, None))
-    policies = {"base": None, "hardening": hardened, "at_once": trained.get("at_once")}
+    hardening = harden_here(script) if "hardening" in parts else {}
+    if "at_once" in parts:
+        train_at_once(script)
+    policies = {"base": lambda _: None, "hardening": last_policy, "at_once": train_at_once}
     searches: dict[str, list[dict[str, Any]]] = {name: [] for name in policies}
-    for part in parts:
-        if part in SEARCHES:
-            name, seed = SEARCHES[part]
-            searches[name].append(search_again(script, name, policies[name], seed))
+    for name, seed in (SEARCHES[part] for part in parts if part in SEARCHES):
+        policy = policies[name](script)
+        if name == "base" or policy is not None:
+            searches[name].append(search_again(script, name, policy, seed))
     if script.parts:
         return searches
+    hardened = last_policy(script)
     if hardened is not None and not script.small:
         publish_controller(script, hardened, "hardened")
     return script.write(

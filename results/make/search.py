@@ -2,7 +2,7 @@
 
 Each search of preset wide is extended step by step; after each step all elites cross fresh episodes. At the end, those
 that fail cross with contact resolved and are crossed by the robot's panel. The default is searched with three seeds,
-others with two.
+others with two. It crosses 14,400 episodes less: at first there is nothing to cross again.
 """
 
 from collections.abc import Sequence
@@ -10,10 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.judge import judge
-from qd.run.directory import RunDirectory
-from qd.search import search
-from results.make.common import ONCE, SEEDS, Script, file_name, mean_over_seeds, parse
+from results.make.common import ONCE, SEEDS, Script, file_name, follow_search, mean_over_seeds, parse
 
 DEFAULT = "surrogate"
 METHODS: dict[str, dict[str, Any]] = {
@@ -29,20 +26,16 @@ METHODS: dict[str, dict[str, Any]] = {
 SEEDS_OF = {DEFAULT: SEEDS, "surrogate, each terrain once": SEEDS}
 STEPS = (96_000, 192_000, 384_000)
 """Episodes after which elites cross fresh ones."""
-COUNTS = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
+COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
 JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 
-def follow_search(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
-    """The numbers of a run's archive.json after each step."""
-    changes = {} if script.small else METHODS[method]
-    run, rows = script.runs / "search" / file_name(f"{method}, seed {seed}"), []
-    for episodes in STEPS[:1] if script.small else STEPS:
-        search(script.search_cfg(episodes=episodes, seed=seed, **changes), run, script.compute)
-        is_last = episodes == STEPS[-1]
-        judge(run, stages=("fresh", "resolved", "others") if is_last else ("fresh",), compute=script.compute)
-        rows.append(RunDirectory(run).read_summary())
-    return rows
+def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
+    """Counts of a search after each step."""
+    cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
+    points = [1] if script.small else [round(episodes / cfg.episodes_per_iteration) for episodes in STEPS]
+    run = script.runs / "search" / file_name(f"{method}, seed {seed}")
+    return follow_search(script, run, cfg, points, (*COUNTS, *JUDGED), ("fresh", "resolved", "others"))
 
 
 def seeds_of(method: str) -> tuple[int, ...]:
@@ -53,7 +46,7 @@ def seeds_of(method: str) -> tuple[int, ...]:
 def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Means over seeds after each step."""
     return [
-        {name: float(np.mean([row[name] for row in rows])) for name in ("episodes", *COUNTS)}
+        {name: float(np.mean([row[name] for row in rows])) for name in COUNTS}
         for rows in zip(*rows_of_seeds, strict=True)
     ]
 
@@ -63,16 +56,16 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     runs = {f"{method}, seed {seed}": (method, seed) for method in METHODS for seed in seeds_of(method)}
     script = parse(__doc__, argv, "search.json", parts=tuple(runs))
     for part in script.parts:
-        follow_search(script, *runs[part])
+        follow(script, *runs[part])
     if script.parts:
         return {}
     methods = [(DEFAULT, SEEDS[:1])] if script.small else [(name, seeds_of(name)) for name in METHODS]
-    rows = {name: [follow_search(script, name, seed) for seed in seeds] for name, seeds in methods}
+    rows = {name: [follow(script, name, seed) for seed in seeds] for name, seeds in methods}
     numbers = {}
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
         numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
-        for count in (*COUNTS, *JUDGED):
+        for count in (*COUNTS[1:], *JUDGED):
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
         numbers[name]["curve"] = curve_of(rows_of_seeds)
     return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"]})

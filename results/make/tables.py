@@ -13,19 +13,29 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
-from results.make.common import SEEDS, Script, crossing_rates, parse, publish_controller, published_controllers
+from results.make.common import (
+    SEEDS,
+    Script,
+    crossing_rates,
+    parse,
+    publish_controller,
+    published_controllers,
+    read_made,
+)  # fmt: skip
 from sim.files.atomic import write_atomically
+from sim.files.intervals import bootstrap_interval
 from sim.files.npz import npz_bytes
+from sim.policy.spec import controller_hash
 from train.cfg import LARGE, FinetuneCfg, RunCfg
 from train.finetune import finetune
+from train.ppo.checkpoint import CHECKPOINT
 
 MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
-RESAMPLES = 10_000
-
 
 SIZES: dict[str, dict[str, int]] = {"tables": {**LARGE, "iterations": 1200}, "tables_paper_sizes": {}}
 """Robots, terrains at a time and iterations by the file that they are of; the paper's are the default."""
@@ -39,6 +49,10 @@ def train(script: Script, cfg: FinetuneCfg, kind: str, seed: int, run: Path) -> 
     cfg = replace(cfg, mix=MIXES[kind], seed=seed)
     if cfg.mix == "generated":
         cfg = replace(cfg, archive=(str(script.results / "archive"),))
+    policy = run / "policy.pt"
+    record = read_made(policy.with_suffix(".train.json"))
+    if not (run / CHECKPOINT).exists() and record.get("sources_sha256") == script.origin["sources_sha256"]:
+        return str(policy)  # brought here from where it was trained, without its checkpoint
     return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
 
 
@@ -55,42 +69,47 @@ def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str
     return controllers
 
 
-def kind_difference(
-    first: NDArray[np.float64], second: NDArray[np.float64], families: NDArray[np.int64], seed: int
-) -> dict[str, Any]:
-    """How much more often the first kind of controller reaches the goal than the second.
+def kind_mean(rates: Sequence[NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any] | None:
+    """How often one kind of controller reaches the goal, or how much more often the first of two.
 
     Args:
-        first: Goal rates of its seeds on the terrains, shape (num_seeds, num_terrains).
-        second: Likewise.
+        rates: Goal rates of the seeds of one kind or of two on the terrains, each of shape (num_seeds, num_terrains).
         families: Of terrains that are not independent, shape (num_terrains,).
         seed: Of the bootstrap.
 
     Returns:
-        ``goal``, and its 95 % ``interval`` over families and seeds, both resampled.
+        ``goal``, its 95 % ``interval`` and the number of ``seeds`` of each kind; None without a terrain that is valid
+        for all. The variance is that over families, by the bootstrap, and that over the seeds of each kind; the
+        interval is Student's with Satterthwaite's degrees of freedom (1946). One seed says nothing of the others.
     """
-    known = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
-    family = np.unique(families[known], return_inverse=True)[1]
-    sizes = np.bincount(family).astype(np.float64)
-    sums = [np.array([np.bincount(family, row[known]) for row in kind]) for kind in (first, second)]
-    rng, draws = np.random.default_rng(seed), []
-    for _ in range(RESAMPLES):
-        weights = np.bincount(rng.integers(len(sizes), size=len(sizes)), minlength=len(sizes))
-        rates = [kind[rng.integers(len(kind), size=len(kind))].mean(axis=0) @ weights for kind in sums]
-        draws.append((rates[0] - rates[1]) / (sizes @ weights))
-    mean = float((sums[0].mean(axis=0) - sums[1].mean(axis=0)).sum() / sizes.sum())
-    return {"goal": mean, "interval": np.quantile(draws, [0.025, 0.975]).tolist()}
+    known = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in rates])
+    if not known.any():
+        return None
+    of_seeds = [sign * kind[:, known] for sign, kind in zip((1.0, -1.0), rates, strict=False)]
+    mean = np.sum([kind.mean(axis=0) for kind in of_seeds], axis=0)
+    limits = bootstrap_interval(mean, seed, families=families[known])
+    parts = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in of_seeds if len(kind) > 1]
+    of_families = 0.0 if limits is None else ((limits[1] - limits[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2
+    variance = of_families + sum(part for part, _ in parts)
+    spread = sum(part**2 / freedom for part, freedom in parts)
+    freedom = variance**2 / spread if spread > 0.0 else np.inf
+    half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+    goal = float(mean.mean())
+    return {"goal": goal, "interval": [goal - half, goal + half], "seeds": [len(kind) for kind in of_seeds]}
 
 
-def kind_differences(
-    rates: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int
-) -> dict[str, dict[str, Any]]:
-    """:func:`kind_difference` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
+def by_kind(rates: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """Goal rates of controllers by their kind, whose further seeds are called ``C-G@1``: shape (num_seeds, T)."""
     kinds: dict[str, list[NDArray[np.float64]]] = {}
     for name, of_controller in rates.items():
         kinds.setdefault(name.partition("@")[0], []).append(of_controller)
+    return {kind: np.array(of_kind) for kind, of_kind in kinds.items()}
+
+
+def differences_of(kinds: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
+    """:func:`kind_mean` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
     return {
-        f"{second} - {first}": kind_difference(np.array(kinds[second]), np.array(kinds[first]), families, seed)
+        f"{second} - {first}": kind_mean([kinds[second], kinds[first]], families, seed)
         for first, second in itertools.combinations(kinds, 2)
     }
 
@@ -103,19 +122,25 @@ def families_of(terrains: TerrainSet) -> NDArray[np.int64]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Trains and evaluates; parts are trainings alone, a trial evaluates what is published on few terrains."""
     script = parse(__doc__, argv, "tables.json", parts=tuple(TRAININGS))
-    if script.parts:
+    published = published_controllers(script)
+    if script.parts and not script.small:
         train_controllers(script, script.parts)
         return
-    published = published_controllers(script)
     if script.small:
         write_tables(script, {name: published[name] for name in ("base", "C-G")})
         return
     for file in SIZES:
         trainings = [training for training, (of_file, *_) in TRAININGS.items() if of_file == file]
         controllers = {"base": script.policy, **train_controllers(script, trainings)}
-        if file == "tables" and "hardened" in published:
+        if file == "tables" and is_hardened_here(script, published.get("hardened")):
             controllers["hardened"] = published["hardened"]
         write_tables(replace(script, out=script.out.with_stem(file)), controllers)
+
+
+def is_hardened_here(script: Script, policy: str | None) -> bool:
+    """Whether a controller is of rounds.json, which today's sources made."""
+    rounds = script.read_so_far(script.results / "rounds.json").get("rounds", ())
+    return policy is not None and controller_hash(policy) in [row["policy_sha256"] for row in rounds]
 
 
 def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
@@ -143,12 +168,20 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         for name, row in crossed.items()
     }
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
-    arrays |= {f"{name}_family": families_of(of_set) for name, of_set in sets.items()}
+    kinds = {name: by_kind(of_set) for name, of_set in rates.items()}
+    family = {name: families_of(of_set) for name, of_set in sets.items()}
+    arrays |= {f"{name}_family": of_set for name, of_set in family.items()}
     arrays["controllers"] = np.array(list(controllers))
     write_atomically(script.out.with_suffix(".npz"), npz_bytes(arrays))
     script.add(
         tables,
-        {"kind_differences": {name: kind_differences(rates[name], families_of(sets[name]), cfg.seed) for name in sets}},
+        {
+            "kinds": {
+                name: {kind: kind_mean([of_kind], family[name], cfg.seed) for kind, of_kind in kinds[name].items()}
+                for name in sets
+            },
+            "differences": {name: differences_of(kinds[name], family[name], cfg.seed) for name in sets},
+        },
     )
 
 

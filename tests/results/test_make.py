@@ -17,6 +17,7 @@ import pytest
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
 from results.make import bare, common, docs, search_noise, speed, tables, train_speed
+from sim.files.intervals import t_interval
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -73,6 +74,21 @@ def test_a_trial_writes_its_file(name, tmp_path, monkeypatch):
     report = json.loads(out.read_text())
     assert {"command", "commit", "sources_sha256", "dirty", "device", "versions", "seed", "date"} <= report.keys()
     assert report["robot"] == "anymal" and report["sources_sha256"] == sources_sha256()
+
+
+def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
+    without_figures(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    words = ["--small", "--device", "cpu", "--out", str(tmp_path / "anymal/search.json")]
+    script = common.parse(None, words, "search.json")
+    run, cfg = tmp_path / "run", script.search_cfg()
+    first = common.follow_search(script, run, cfg, [1, 2], ("episodes", "elites"))
+    assert [row["episodes"] for row in first] == [cfg.episodes_per_iteration, 2 * cfg.episodes_per_iteration]
+    again = common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites"))
+    assert again[:2] == first and again[2]["iterations"] == 3
+    monkeypatch.setattr(common, "search", None)  # nothing is left to do
+    assert common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites")) == again
 
 
 def test_every_script_loads_and_is_listed():
@@ -304,18 +320,34 @@ def test_bias_and_distance_are_of_terrains_that_both_have():
     assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}
 
 
-def test_difference_of_two_kinds_of_controllers():
+def test_differences_of_kinds_hold_families_and_seeds():
     # Two families of two terrains: the first kind crosses all of one and half of the other, the second none.
     first, families = np.array([[1.0, 1.0, 0.5, 0.5]]), np.array([7, 7, 9, 9])
-    row = tables.kind_difference(first, np.zeros((2, 4)), families, 0)
-    assert row["goal"] == pytest.approx(0.75)
+    row = tables.kind_mean([first, np.zeros((2, 4))], families, 0)
+    assert row["goal"] == pytest.approx(0.75) and row["seeds"] == [1, 2]
     assert row["interval"] == pytest.approx([0.5, 1.0])  # a quarter of the resamples are of one family alone
     rates = {"C-HR": first[0], "C-G": np.ones(4), "C-G@1": np.full(4, 0.8)}
-    [(pair, row)] = tables.kind_differences(rates, families, 0).items()
+    kinds = tables.by_kind(rates)
+    [(pair, row)] = tables.differences_of(kinds, families, 0).items()
     assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.9 - 0.75)
+    # Families do not differ here: what is left is Student's interval over two seeds.
+    of_seeds = tables.kind_mean([kinds["C-G"]], families, 0)["interval"]
+    assert of_seeds == pytest.approx(t_interval(np.array([1.0, 0.8])))
     # A terrain that is invalid for one controller counts for none.
     first[0, 0] = np.nan
-    assert tables.kind_difference(first, np.zeros((2, 4)), families, 0)["goal"] == pytest.approx(2 / 3)
+    assert tables.kind_mean([first, np.zeros((2, 4))], families, 0)["goal"] == pytest.approx(2 / 3)
+    assert tables.kind_mean([np.full((1, 4), np.nan)], families, 0) is None
+
+
+def test_intervals_of_kinds_cover_the_truth():
+    """Of 19 in 20 repetitions, with seeds that differ as trainings do and families that differ more."""
+    rng, families, covered = np.random.default_rng(0), np.arange(60) // 2, 0
+    for _ in range(200):
+        terrains = rng.normal(0.0, 0.2, 30)[families]
+        kinds = [0.5 + terrains * weight + rng.normal(0.0, 0.03, (3, 1)) for weight in (1.0, 0.7)]
+        low, high = tables.kind_mean(kinds, families, 0)["interval"]
+        covered += low <= 0.0 <= high
+    assert 182 <= covered <= 199
 
 
 def test_pages_say_what_the_files_say():
