@@ -1,7 +1,7 @@
 """Which recipe fine-tunes best: recipes.json. C-HC, C-HR and C-G are trained by each, at the sizes of tables.json.
 
-As in the paper one recipe serves all three. It is chosen by their mean goal rate on validation terrains, of which no
-other number is made.
+As in the paper one recipe serves all three. It is chosen for both robots together, by the mean goal rate on validation
+terrains, by which a hardening chooses too, and of which no other number is made.
 """
 
 from collections.abc import Sequence
