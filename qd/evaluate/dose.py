@@ -29,6 +29,7 @@ _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
 _COLUMNS = 4
 _RESAMPLES = 1000
+_BEYOND = {"first": "below the first", "last": "over the last", None: "-"}
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
@@ -174,7 +175,7 @@ def show_dose(report: dict[str, Any]) -> None:
         for half in (half for half in report["half"] if half["element"] == element):
             rates = [row["goal_rate"] for row in rows if row["controller"] == half["controller"]]
             low, high = (value_words(limit, None, ".2f") for limit in half["interval"])
-            passed = "-" if half["value"] is None else f"{half['value']:.2f} ({low} to {high})"
+            passed = f"{half['value']:.2f} ({low} to {high})" if half["value"] is not None else _BEYOND[half["beyond"]]
             lines.append((half["controller"], *(value_words(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
         unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
