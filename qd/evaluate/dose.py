@@ -29,7 +29,7 @@ _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
 _COLUMNS = 4
 _RESAMPLES = 1000
-_BEYOND = {"first": "below the first", "last": "over the last", None: "-"}
+_BEYOND = {"first": "before the first", "last": "beyond the last", None: "-"}
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")

@@ -22,7 +22,9 @@ for robot in "${robots[@]}"; do
   make_file "$folder/base.json" base "$robot"                         # 2 min
   make_file "$folder/penalty_ratios.json" penalty_ratios "$robot"     # 1 min
   make_file "$folder/recipes.json" recipes "$robot"                   # 25 min: nine trainings
-  make_file "$folder/third/curve.json" archive "$robot"               # 60 min: four searches, two of them judged
+  for part in archive archive_cma_mae independent third; do
+    make_file "$folder/$part/curve.json" archive "$robot"             # 60 min: four searches, two of them judged
+  done
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 40 min: 16 searches

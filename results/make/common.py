@@ -96,8 +96,9 @@ class Script:
         return replace(cfg, iterations=iterations or cfg.iterations)
 
     def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
-        """Copies files of a run into a folder of what is published, and takes those away that it has not."""
-        for old in (file for pattern in patterns for file in folder.glob(pattern)):
+        """Copies files of a run into a folder of what is published; of another archive it takes away what it lacks."""
+        of_another = not is_same_file(run / "archive.npz", folder / "archive.npz")
+        for old in (file for pattern in patterns for file in folder.glob(pattern) if of_another):
             if not (run / old.relative_to(folder)).exists():
                 old.unlink()
         for file in (file for pattern in patterns for file in run.glob(pattern)):
@@ -111,17 +112,22 @@ class Script:
 
     def read_dose(self) -> list[dict[str, Any]]:
         """Rows of dose.json beside the file, made by today's sources; in a trial none if it is not there."""
-        rows = self.read_so_far(self.out.with_name("dose.json")).get("dose", [])
-        if not rows and not self.small:
-            raise ValueError(f"{self.out.parent}/dose.json must be of today's sources: run results.make.dose first")
-        return rows
+        file = self.out.with_name("dose.json")
+        content, names = read_made(file), ("sources_sha256", "seed", "robot_sha256", "penalty_definition")
+        if any(content.get(name) != self.origin[name] for name in names):
+            if self.small:
+                return []
+            raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
+        return content["dose"]
 
     def run_of_archive(self) -> Path:
         """The run of the published archive to work in; a copy of what is published where the run itself is gone."""
         run, published = self.runs / "archive", self.results / "archive"
-        if self.small or not (run / "archive.npz").exists():
+        if self.small or not is_same_file(run / "archive.npz", published / "archive.npz"):
             run = self.runs / "copy"
-            if not is_same_file(run / "archive.npz", published / "archive.npz"):
+            if not all(
+                is_same_file(run / name, published / name) for name in ("archive.npz", "archive.json", "config.json")
+            ):
                 shutil.rmtree(run, ignore_errors=True)
                 shutil.copytree(published, run)
         return run

@@ -308,7 +308,8 @@ def size_words(half: Mapping[str, Any], tried: Sequence[float]) -> str:
     """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those tried."""
     value, (low, high), form = half["value"], half["interval"], ".3f" if half["unit"] == "s" else ".2f"
     if value is None:
-        return f"under {tried[0]:g}" if half.get("beyond") == "first" else f"({tried[-1]:g})"
+        way = "over" if tried[0] > tried[-1] else "under"
+        return {"first": f"{way} {tried[0]:g}", "last": f"({tried[-1]:g})"}.get(half.get("beyond", "last"), NONE)
     if low is not None and high is not None and high - low <= 0.2 * value:
         return f"{value:{form}}"
     return " to ".join("..." if limit is None else f"{limit:{form}}" for limit in (low, high))

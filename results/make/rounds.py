@@ -97,8 +97,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     if script.parts:
         return searches
     hardened = last_policy(script)
-    if hardened is not None and not script.small:
-        publish_controller(script, hardened, "hardened")
+    if not script.small:
+        for old in (script.results / "hardened.pt", script.results / "hardened.train.json"):
+            old.unlink(missing_ok=True)
+        if hardened is not None:
+            publish_controller(script, hardened, "hardened")
     return script.write(
         {
             **hardening,

@@ -51,7 +51,8 @@ def train(script: Script, cfg: FinetuneCfg, kind: str, seed: int, run: Path) -> 
         cfg = replace(cfg, archive=(str(script.results / "archive"),))
     policy = run / "policy.pt"
     record = read_made(policy.with_suffix(".train.json"))
-    if not (run / CHECKPOINT).exists() and record.get("sources_sha256") == script.origin["sources_sha256"]:
+    made_here = record.get("sources_sha256") == script.origin["sources_sha256"] and policy.exists()
+    if made_here and not (run / CHECKPOINT).exists() and cfg.iterations in (0, record.get("iterations")):
         return str(policy)  # brought here from where it was trained, without its checkpoint
     return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
 
@@ -93,9 +94,9 @@ def kind_mean(rates: Sequence[NDArray[np.float64]], families: NDArray[np.int64],
     variance = of_families + sum(part for part, _ in parts)
     spread = sum(part**2 / freedom for part, freedom in parts)
     freedom = variance**2 / spread if spread > 0.0 else np.inf
-    half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
-    goal = float(mean.mean())
-    return {"goal": goal, "interval": [goal - half, goal + half], "seeds": [len(kind) for kind in of_seeds]}
+    goal, half = float(mean.mean()), float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+    interval = np.clip([goal - half, goal + half], 1.0 - len(of_seeds), 1.0).tolist() if limits or parts else None
+    return {"goal": goal, "interval": interval, "seeds": [len(kind) for kind in of_seeds]}
 
 
 def by_kind(rates: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
@@ -180,7 +181,9 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
                 name: {kind: kind_mean([of_kind], family[name], cfg.seed) for kind, of_kind in kinds[name].items()}
                 for name in sets
             },
-            "differences": {name: differences_of(kinds[name], family[name], cfg.seed) for name in sets},
+            "differences": {
+                name: tables["differences"][name] | differences_of(kinds[name], family[name], cfg.seed) for name in sets
+            },
         },
     )
 

@@ -42,7 +42,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
     given = os.environ.get("FAULTLINE_COMMIT", "")
     commit, dirty = given.removesuffix("-dirty") or None, given.endswith("-dirty")
     if commit is None:
-        places = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack"]
+        places = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack/*"]
         changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *places])
         commit, dirty = _output(["git", "rev-parse", "HEAD"]), None if changed is None else changed != ""
     return {

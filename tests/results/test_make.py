@@ -91,6 +91,32 @@ def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path,
     assert common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites")) == again
 
 
+def test_doses_are_those_of_todays_sources(tmp_path):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/spaces.json")], "spaces.json")
+    file = tmp_path / "anymal/dose.json"
+    dose = json.loads((MAKE.parent / "anymal/dose.json").read_text()) | {"sources_sha256": sources_sha256()}
+    file.write_text(json.dumps(dose))
+    assert script.read_dose() == dose["dose"]
+    file.write_text(json.dumps(dose | {"seed": 1}))
+    with pytest.raises(ValueError, match="must be of today's sources"):
+        script.read_dose()
+
+
+def test_what_is_published_goes_with_its_archive(tmp_path):
+    """What lies beside another archive is taken away; beside the same one it stays."""
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/base.json")], "base.json")
+    run, folder = tmp_path / "run", tmp_path / "published"
+    for place in (run, folder):
+        place.mkdir()
+        (place / "archive.npz").write_text("one")
+    (folder / "minimal.json").write_text("{}")
+    script.publish(run, folder, ("archive.npz", "minimal.*"))
+    assert (folder / "minimal.json").exists()
+    (run / "archive.npz").write_text("another")
+    script.publish(run, folder, ("archive.npz", "minimal.*"))
+    assert not (folder / "minimal.json").exists() and (folder / "archive.npz").read_text() == "another"
+
+
 def test_every_script_loads_and_is_listed():
     scripts = {file.stem for file in MAKE.glob("*.py")} - {"bare"}
     text = (MAKE / "all.sh").read_text()
@@ -326,13 +352,13 @@ def test_differences_of_kinds_hold_families_and_seeds():
     row = tables.kind_mean([first, np.zeros((2, 4))], families, 0)
     assert row["goal"] == pytest.approx(0.75) and row["seeds"] == [1, 2]
     assert row["interval"] == pytest.approx([0.5, 1.0])  # a quarter of the resamples are of one family alone
-    rates = {"C-HR": first[0], "C-G": np.ones(4), "C-G@1": np.full(4, 0.8)}
+    rates = {"C-HR": first[0], "C-G": np.full(4, 0.52), "C-G@1": np.full(4, 0.5)}
     kinds = tables.by_kind(rates)
     [(pair, row)] = tables.differences_of(kinds, families, 0).items()
-    assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.9 - 0.75)
+    assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.51 - 0.75)
     # Families do not differ here: what is left is Student's interval over two seeds.
     of_seeds = tables.kind_mean([kinds["C-G"]], families, 0)["interval"]
-    assert of_seeds == pytest.approx(t_interval(np.array([1.0, 0.8])))
+    assert of_seeds == pytest.approx(t_interval(np.array([0.52, 0.5])))
     # A terrain that is invalid for one controller counts for none.
     first[0, 0] = np.nan
     assert tables.kind_mean([first, np.zeros((2, 4))], families, 0)["goal"] == pytest.approx(2 / 3)

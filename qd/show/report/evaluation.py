@@ -84,7 +84,10 @@ def _certified_table(tables: Mapping[str, Any]) -> Table | None:
 def _changes_table(tables: Mapping[str, Any]) -> Table:
     """What became of the terrains, from the first controller to the others before all other pairs."""
     first = next(iter(tables["controllers"]))
-    pairs = [(pair, name, change) for name, pairs in tables["differences"].items() for pair, change in pairs.items()]
+    pairs = [
+        (pair, name, change) for name, pairs in tables["differences"].items()
+        for pair, change in pairs.items() if " -> " in pair  # others are of kinds of controllers
+    ]  # fmt: skip
     pairs.sort(key=lambda row: not row[0].startswith(f"{first} -> "))
     rows = [
         [f"{SETS.get(name, name)}: {pair}", *(f"{change[fate]['count']}" for fate in FATES),
