@@ -17,7 +17,7 @@ from qd.run.directory import RUNS
 from qd.workers.evaluator import Compute, check_policy
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
-from sim.files.intervals import value_words, wilson_interval
+from sim.files.intervals import resamples, value_words, wilson_interval
 from sim.files.records import robot_identity
 from sim.policy.spec import about_controllers
 from sim.rates import counted_episodes
@@ -147,9 +147,9 @@ def half_of(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -
         of_episodes.sum(axis=1).reshape(-1, len(rows))[:, known]
         for of_episodes in ((result.outcome == Outcome.GOAL) & counted, counted)
     )
-    drawn = np.random.default_rng(0).integers(len(hits), size=(_RESAMPLES, len(hits)))
+    drawn = resamples(len(hits), 0, _RESAMPLES)
     with np.errstate(invalid="ignore"):
-        places = [_half_at(rates) for rates in hits[drawn].sum(axis=1) / counts[drawn].sum(axis=1)]
+        places = [_half_at(rates) for rates in (drawn @ hits) / (drawn @ counts)]
     place = _half_at(hits.sum(axis=0) / counts.sum(axis=0))
     ends = np.quantile(places, [0.025, 0.975], method="inverted_cdf")
     value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None

@@ -36,8 +36,8 @@ def make_archive(script: Script, name: str) -> Path:
     """Searches and judges; returns the run."""
     changes, seed = ({}, 0) if script.small else SEARCHES[name]
     run, cfg = script.runs / name, script.search_cfg(seed=script.seed + seed, **changes)
-    points = [round(episodes / cfg.episodes_per_iteration) for episodes in (CURVE[:3] if name == "third" else CURVE)]
-    follow_search(script, run, cfg, [1] if script.small else points, COUNTS)
+    points = script.iterations_of(cfg, *(CURVE[:3] if name == "third" else CURVE))
+    follow_search(script, run, cfg, points, COUNTS)
     if not script.small and name.startswith("archive"):  # on a CPU a training takes hours
         judge_with_specialist(script, run)
     return run

@@ -91,9 +91,13 @@ class Script:
             iterations, of_scheduler = 1, {**of_scheduler, "emitters": 2, "batch_size": 2, "groups": 1}
             changes["replicas"] = 1
         cfg = replace(cfg, scheduler=replace(cfg.scheduler, **of_scheduler), **changes)
-        if episodes is not None and not self.small:
-            iterations = round(episodes / cfg.episodes_per_iteration)
+        if episodes is not None:
+            (iterations,) = self.iterations_of(cfg, episodes)
         return replace(cfg, iterations=iterations or cfg.iterations)
+
+    def iterations_of(self, cfg: SearchCfg, *episodes: int) -> list[int]:
+        """Whole iterations of a search that make so many episodes, each as near as can be; one in a trial."""
+        return [1] if self.small else [round(count / cfg.episodes_per_iteration) for count in episodes]
 
     def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
         """Copies files of a run into a folder of what is published; of another archive it takes away what it lacks."""

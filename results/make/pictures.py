@@ -27,6 +27,7 @@ from sim.robots.find import get_robot
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 STILL_SIZE = (640, 360)
+"""Width and height [pixels]."""
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
 """Robot, terrain, what it is in words, and the controller of the panel that is shown beside."""
 

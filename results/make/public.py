@@ -60,7 +60,6 @@ WITH_SPECIALIST = "go2-robot-lab"
 """Whose network is plain layers, and whose failures a specialist certifies."""
 PICTURES = ("go2-robot-lab", "go1-playground", "g1-unitree")
 """Of whose worst failure the pages show a still."""
-"""Of a still, width and height [pixels]."""
 
 
 def fill_in(file: Path, text: str) -> None:

@@ -26,16 +26,17 @@ METHODS: dict[str, dict[str, Any]] = {
 SEEDS_OF = {DEFAULT: SEEDS, "surrogate, each terrain once": SEEDS}
 STEPS = (96_000, 192_000, 384_000)
 """Episodes after which elites cross fresh ones."""
-COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
+COUNTS = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
 JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 
 def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """Counts of a search after each step."""
     cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
-    points = [1] if script.small else [round(episodes / cfg.episodes_per_iteration) for episodes in STEPS]
-    run = script.runs / "search" / file_name(f"{method}, seed {seed}")
-    return follow_search(script, run, cfg, points, (*COUNTS, *JUDGED), ("fresh", "resolved", "others"))
+    run, counts = script.runs / "search" / file_name(f"{method}, seed {seed}"), ("episodes", *COUNTS, *JUDGED)
+    return follow_search(
+        script, run, cfg, script.iterations_of(cfg, *STEPS), counts, ("fresh", "resolved", "others")
+    )  # fmt: skip
 
 
 def seeds_of(method: str) -> tuple[int, ...]:
@@ -46,7 +47,7 @@ def seeds_of(method: str) -> tuple[int, ...]:
 def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Means over seeds after each step."""
     return [
-        {name: float(np.mean([row[name] for row in rows])) for name in COUNTS}
+        {name: float(np.mean([row[name] for row in rows])) for name in ("episodes", *COUNTS)}
         for rows in zip(*rows_of_seeds, strict=True)
     ]
 
@@ -65,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
         numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
-        for count in (*COUNTS[1:], *JUDGED):
+        for count in (*COUNTS, *JUDGED):
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
         numbers[name]["curve"] = curve_of(rows_of_seeds)
     return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"]})

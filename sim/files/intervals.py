@@ -35,10 +35,10 @@ def t_interval(values: NDArray[np.floating]) -> list[float] | None:
 
 
 @lru_cache(maxsize=3)  # of a few sizes of sets, 80 kB a terrain
-def _resamples(count: int, seed: int) -> NDArray[np.float64]:
+def resamples(count: int, seed: int, draws: int = _BOOTSTRAP_DRAWS) -> NDArray[np.float64]:
     """How often each of ``count`` terrains is drawn in each resample, shape (draws, count)."""
-    drawn = np.random.default_rng(seed).integers(count, size=(_BOOTSTRAP_DRAWS, count))
-    drawn += count * np.arange(_BOOTSTRAP_DRAWS)[:, None]
+    drawn = np.random.default_rng(seed).integers(count, size=(draws, count))
+    drawn += count * np.arange(draws)[:, None]
     return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(np.float64)
 
 
@@ -54,7 +54,7 @@ def bootstrap_interval(
     count = int(family.max(initial=-1)) + 1
     if count < 2:
         return None
-    drawn = _resamples(count, seed)
+    drawn = resamples(count, seed)
     means = (drawn @ np.bincount(family, weights=values)) / (drawn @ np.bincount(family).astype(np.float64))
     return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
 
