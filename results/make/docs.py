@@ -353,19 +353,32 @@ def public_controllers() -> str:
              "g1-unitree": "G1, unitree_rl_gym"}  # fmt: skip
     numbers = read("results/public.json").get("controllers", {})
 
-    def beside(part: str, ways: Sequence[str], key: str | None, form: str) -> Callable[[Any], str]:
-        return lambda one: " / ".join(format(one[part][way][key] if key else one[part][way], form) for way in ways)
+    def both(key: str, form: str) -> Callable[[Any], str]:
+        return lambda one: " / ".join(format(one["check"][f"flat_{key}{way}"], form) for way in ("", "_mujoco_c"))
 
+    def half(name: str) -> Callable[[Any], str]:
+        """Up to which size half of the robots get over an obstacle."""
+
+        def words(one: Any) -> str:
+            row = next((row for row in one.get("dose", ()) if row["element"] == name), {})
+            return str(row.get("beyond")) if row.get("beyond") else shown("value", ".2f")(row)
+
+        return words
+
+    ways, found = ("searched", "resolved", "mujoco_c"), ("episodes", "elites", "corrected_elites", "failing",
+                                                         "confirmed", "faults")  # fmt: skip
     columns: dict[str, Column] = {
-        "level ground: speed [m/s], here / in MuJoCo C": beside("flat", ("searched", "mujoco_c"), "speed", ".3f"),
-        "level ground: share that reaches the goal": beside("flat", ("searched", "mujoco_c"), "goal", ".2f"),
-        "heights up to [m]": lambda one: one["space"].partition("@")[2] or "0.25",
+        "level ground: speed [m/s], here / in MuJoCo C": both("speed", ".3f"),
+        "level ground: share that reaches the goal": both("goal", ".2f"),
+        "heights up to [m]": shown("height", "g"),
+        "hand-crafted: reach the goal": inside("hand_crafted", "goal_rate", form=".2f"),
         "hard-random: reach the goal, here / finer / MuJoCo C, finer":
-            beside("agreement", ("searched", "resolved", "mujoco_c"), None, ".2f"),
+            lambda one: " / ".join(f"{one['agreement'][way]:.2f}" for way in ways),
+        "half get over a kerb of [m]": half("step_up"),
+        "... stairs of [m]": half("stairs_up"),
         "episodes/s of 32,768 robots": "episodes_per_s_32768",
         "... on": lambda one: one.get("timed", {}).get("device", NONE),
-        **{name.replace("_", " "): name for name in ("episodes", "elites", "corrected_elites", "failing", "confirmed",
-                                                     "faults")},
+        **{name.replace("_", " "): inside("archive", name) for name in found},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
     }  # fmt: skip
     return table({words: numbers[name] for name, words in named.items() if name in numbers}, columns, upright=True)

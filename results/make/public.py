@@ -15,6 +15,10 @@ from typing import Any, get_args
 import numpy as np
 
 from qd.check import made_ready, walk
+from qd.evaluate.dose import measure_dose
+from qd.evaluate.evaluate import cross_sets
+from qd.evaluate.measures import summarise
+from qd.evaluate.sets import plain_set
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.run.settings import preset
@@ -30,9 +34,12 @@ from results.make.speed import time_crossings
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.records import provenance, sources_sha256
+from sim.files.settings import read_toml
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg
+from sim.spaces.base import MOST_HEIGHT
+from sim.spaces.dose import parse_doses
 from sim.spaces.registry import SUPER_GAUSSIAN, load_space
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
@@ -58,6 +65,9 @@ ITERATIONS = 8
 """Of preset wide: 256,000 episodes."""
 WITH_SPECIALIST = "go2-robot-lab"
 """Whose network is plain layers, and whose failures a specialist certifies."""
+_RISES = "0.02,0.04,0.06,0.08,0.1,0.15,0.2,0.3"
+OBSTACLES = (f"step_up={_RISES}", f"stairs_up={_RISES}", "ramp_up", "ditch", "payload")
+"""Obstacles of which the size is measured that half of the robots cross."""
 PICTURES = ("go2-robot-lab", "go1-playground", "g1-unitree")
 """Of whose worst failure the pages show a still."""
 
@@ -90,26 +100,47 @@ def time_alone(name: str, folder: Path, runs: Path, compute: Compute, *, seed: i
 
 
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
-    """Imports a controller, lets it walk in both simulators, and searches what breaks it."""
-    run = runs / f"{name}-archive"
-    robot, space = ready(name, folder, runs, compute)
-    with Crossings(robot, compute, cache=runs / "crossings") as crossings:
-        walked = walk(crossings, str(robot.policy_file), seed)
-        agreed = agree(crossings, space, seed, 1 if small else 40)
-    cfg = preset("small" if small else "wide", robot, None, space=space)
+    """Imports a controller, lets it cross what is no search's, and searches what breaks it."""
+    run, cache = runs / f"{name}-archive", runs / "crossings"
+    robot, named = ready(name, folder, runs, compute)
+    policy, space = str(robot.policy_file), load_space(named)
+    with Crossings(robot, compute, cache=cache) as crossings:
+        checked = check_numbers(walk(crossings, policy, seed), robot.speed)
+        agreed = agree(crossings, named, seed, 1 if small else 40)
+    plain = plain_set("hand_crafted", 6 if small else 300, seed, space)
+    crossed = cross_sets(
+        {name: policy}, {"hand_crafted": plain}, robot=robot, compute=compute, episodes=2 if small else 20, cache=cache
+    )["hand_crafted"][name]
+    dose = measure_dose(
+        robot, {name: policy}, parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), compute=compute, seed=seed,
+        terrains=1 if small else None, episodes=1 if small else None, out=runs / f"{name}-dose.json",
+    )  # fmt: skip
+    cfg = preset("small" if small else "wide", robot, None, space=named)
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
     archive = judge(run, stages=("fresh",) if small else ("fresh", "resolved"), compute=compute, robot=robot.spec)
     if name == WITH_SPECIALIST and not small:
         train_specialist(robot, run, FinetuneCfg.specialist(robot), RunCfg(device=compute.device))
         archive = judge(run, stages=("others",), compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
-    counts = {count: summary.get(count) for count in (*COUNTS, "wall_s")}
     return {
-        "flat": walked,
+        "contract": {key: value for key, value in read_toml(Path(policy)).items() if key != "policy"},
+        "space": named,
+        "height": float(named.partition("@")[2] or MOST_HEIGHT),
+        "check": checked,
+        "hand_crafted": summarise(crossed, seed, types=plain.types, levels=plain.levels),
         "agreement": agreed,
-        "space": space,
-        **counts,
+        "archive": {count: summary.get(count) for count in (*COUNTS, "wall_s")},
         "causes": causes_of(archive),
+        "dose": dose["half"],
+    }
+
+
+def check_numbers(walked: dict[str, dict[str, float]], speed: float) -> dict[str, float]:
+    """Numbers of :func:`qd.check.walk`, those of MuJoCo C by names of their own; ``vx_error`` is off ``speed`` [m/s]."""
+    return {
+        f"flat_{key}{suffix}": value
+        for way, suffix in (("searched", ""), ("mujoco_c", "_mujoco_c"))
+        for key, value in {**walked[way], "vx_error": abs(walked[way]["speed"] - speed)}.items()
     }
 
 
