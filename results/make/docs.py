@@ -205,14 +205,13 @@ def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 def conditions() -> str:
     """Searches of terrains and conditions, and which of their failing elites need a condition."""
     rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
-            if "failing_again" in numbers["conditions"] else numbers["archive"]  # before, chance was among the needs
             for words, numbers in of_robots("results/{}/conditions.json").items()}  # fmt: skip
     names = ("episodes", "elites", "corrected_elites", "confirmed", "faults_panel", "failing")
     columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
-    columns |= {f"... crossed with a nominal {kind} alone": kind for kind in KINDS}
+    columns |= {f"... crossed with {kind} alone made nominal": kind for kind in KINDS}
     return table(rows, columns, upright=True)
 
 

@@ -136,7 +136,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
 
 
 def check_numbers(walked: dict[str, dict[str, float]], speed: float) -> dict[str, float]:
-    """Numbers of :func:`qd.check.walk`, those of MuJoCo C by names of their own; ``vx_error`` is off ``speed`` [m/s]."""
+    """Numbers of :func:`qd.check.walk`, of both simulators by names; ``vx_error`` is off ``speed`` [m/s]."""
     return {
         f"flat_{key}{suffix}": value
         for way, suffix in (("searched", ""), ("mujoco_c", "_mujoco_c"))
