@@ -44,7 +44,6 @@ for robot in "${robots[@]}"; do
   fi
   "$python" -m results.make.speed --robot "$robot"                    # 7 min; what is done is not done again
   "$python" -m results.make.speed --robot "$robot" --device cpu       # 4 min, and to be quoted where two cores are free
-  make_file "$folder/solver_options.json" solver_options "$robot"     # 3 min
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
   "$python" -m results.make.public "$PUBLIC"                            # 40 min
