@@ -16,7 +16,7 @@ import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import bare, common, docs, search_noise, speed, tables, train_speed
+from results.make import bare, common, conditions, docs, search_noise, speed, tables, train_speed
 from sim.files.intervals import t_interval
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
@@ -100,6 +100,16 @@ def test_doses_are_those_of_todays_sources(tmp_path):
     file.write_text(json.dumps(dose | {"seed": 1}))
     with pytest.raises(ValueError, match="must be of today's sources"):
         script.read_dose()
+
+
+def test_conditions_of_todays_sources_take_new_doses_alone(tmp_path):
+    words = ["--device", "cpu", "--out", str(tmp_path / "anymal/conditions.json")]
+    origin = common.parse(None, words, "conditions.json").origin
+    rows = [{"parameter": "push", "goal_rate": 0.5}, {"parameter": "height", "goal_rate": 0.1}]
+    (tmp_path / "anymal/dose.json").write_text(json.dumps(origin | {"dose": rows}))
+    before = origin | {"date": "then", "conditions": {"failing": 3}, "dose": []}
+    (tmp_path / "anymal/conditions.json").write_text(json.dumps(before))
+    assert conditions.main(words) == before | {"dose": rows[:1]}
 
 
 def test_what_is_published_goes_with_its_archive(tmp_path):
