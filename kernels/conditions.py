@@ -147,40 +147,25 @@ def begin_conditions(
 
 
 @wp.kernel
-def _push_kernel(
-    episodes: Episodes, disturbed: Disturbed, physics_dt: float, every: int, joint_qd_out: wp.array2d[float]
-):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    if episodes.outcome[env] != Outcome.RUNNING:
-        return
-    due = int(wp.round(disturbed.row[env, int(Condition.PUSH_TIME)] / physics_dt))
-    steps = episodes.steps[env]
-    if steps <= due and due < steps + every:
-        joint_qd_out[env, 0] += disturbed.row[env, int(Condition.PUSH_X)]
-        joint_qd_out[env, 1] += disturbed.row[env, int(Condition.PUSH_Y)]
-
-
-def push(episodes: Episodes, disturbed: Disturbed, physics_dt: float, every: int, joint_qd_out: Any) -> None:
-    """Push the robots whose time it is in a control step of ``every`` physics steps: a kick of the base's velocity."""
-    inputs = [episodes, disturbed, physics_dt, every]
-    wp.launch(_push_kernel, joint_qd_out.shape[0], inputs, outputs=[joint_qd_out], device=joint_qd_out.device)
-
-
-@wp.kernel
-def _disturb_observation_kernel(
-    episodes: Episodes, num_joints: int, control_dt: float, disturbed_out: Disturbed,
-    observation_out: wp.array2d[float],
+def _disturb_kernel(
+    episodes: Episodes, num_joints: int, dt: float, every: int, disturbed_out: Disturbed,
+    joint_qd_out: wp.array2d[float], observation_out: wp.array2d[float],
 ):  # fmt: skip
-    """Grid (num_envs, num_columns)."""
+    """Grid (num_envs, num_columns): the columns of an observation, and with the first one the push."""
     env, k = wp.tid()
+    if k == 0 and episodes.outcome[env] == Outcome.RUNNING:
+        due = int(wp.round(disturbed_out.row[env, int(Condition.PUSH_TIME)] / dt))
+        steps = episodes.steps[env]
+        if steps <= due and due < steps + every:
+            joint_qd_out[env, 0] += disturbed_out.row[env, int(Condition.PUSH_X)]
+            joint_qd_out[env, 1] += disturbed_out.row[env, int(Condition.PUSH_Y)]
     age = disturbed_out.age[env, k]
     factor = disturbed_out.row[env, int(Condition.NOISE)]
     if factor > 0.0:
         # Of the episode's own stream, so that neither robot nor slot changes an episode.
         state = wp.rand_init(int(episodes.rng[env]), age * observation_out.shape[1] + k)
         observation_out[env, k] += factor * noise_width(disturbed_out.noise, k, num_joints) * wp.randf(state, -1.0, 1.0)
-    lag = int(wp.round(disturbed_out.row[env, int(Condition.LAG)] / control_dt))
+    lag = int(wp.round(disturbed_out.row[env, int(Condition.LAG)] / (float(every) * dt)))
     if lag > 0:
         size = disturbed_out.former.shape[1]
         disturbed_out.former[env, age % size, k] = observation_out[env, k]
@@ -188,10 +173,16 @@ def _disturb_observation_kernel(
     disturbed_out.age[env, k] = age + 1
 
 
-def disturb_observation(
-    episodes: Episodes, num_joints: int, control_dt: float, disturbed_out: Disturbed, observation_out: Any
-) -> None:
-    """Add noise to observation rows, and show those of ``LAG`` ago: the first ones until there are some so old."""
-    inputs, outputs = [episodes, num_joints, control_dt], [disturbed_out, observation_out]
+def disturb(
+    episodes: Episodes, num_joints: int, dt: float, every: int, disturbed_out: Disturbed, joint_qd_out: Any,
+    observation_out: Any,
+) -> None:  # fmt: skip
+    """Push robots whose time comes in the next control step, and disturb what all observe.
+
+    A push is a kick of the base's velocity, joint_qd (num_envs, 6 + num_joints), which is observed a step later.
+    Observations, (num_envs, num_columns), get noise, and those of ``LAG`` ago are shown: the first ones until there are
+    some so old. Episodes count steps of ``dt`` [s], ``every`` of them in a control step.
+    """
+    inputs, outputs = [episodes, num_joints, dt, every], [disturbed_out, joint_qd_out, observation_out]
     shape, device = observation_out.shape, observation_out.device
-    wp.launch(_disturb_observation_kernel, shape, inputs, outputs=outputs, device=device)
+    wp.launch(_disturb_kernel, shape, inputs, outputs=outputs, device=device)

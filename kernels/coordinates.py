@@ -52,7 +52,9 @@ class Delay:
 
 @wp.func
 def _due_target(target: float, at_first: float, env: int, actuator: int, delay_out: Delay) -> float:
-    """Keep the target of a physics step, and find the one that counts in it."""
+    """Keep the target of a physics step, and find the one that counts in it: this one if none is late."""
+    if delay_out.steps[env] == 0:
+        return target
     age = delay_out.age[env, actuator]
     size, before = delay_out.former.shape[1], age - delay_out.steps[env]
     delay_out.former[env, age % size, actuator] = target

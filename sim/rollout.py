@@ -220,7 +220,6 @@ class Rollout:
         park_ended(
             self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
         )
-        sim.push(self._episode, robot.physics_dt)
         for _ in range(robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
@@ -255,7 +254,7 @@ class Rollout:
             sim.joint_q, sim.joint_qd, self.command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
             sim.sensors, Noise(), self._counter, self._observation,
         )  # fmt: skip
-        sim.disturb(self._episode, self._observation)
+        sim.disturb(self._episode, self.robot.physics_dt, self._observation)
 
     @property
     def num_free(self) -> int:

@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.conditions import Condition, Disturbed, begin_conditions, disturb_observation, push
+from kernels.conditions import Condition, Disturbed, begin_conditions, disturb
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, limit_torques, tell_solver
 from kernels.episode import Episodes
@@ -248,16 +248,14 @@ class Simulation:
                 self.robot.physics_dt, tree, robots, self._delay, self.disturbed,
             )  # fmt: skip
 
-    def push(self, episodes: Episodes, dt: float) -> None:
-        """Push the robots whose time it is in a control step; the episodes count steps of ``dt`` [s]."""
-        if self.disturbed is not None:
-            push(episodes, self.disturbed, dt, round(self.robot.control_dt / dt), self.joint_qd)
+    def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
+        """Push robots and disturb observations, (num_envs, observation_size), as the conditions of their terrains say.
 
-    def disturb(self, episodes: Episodes, observation: Any) -> None:
-        """Make observations, (num_envs, observation_size), as noisy and old as the conditions of their terrains say."""
+        The episodes count steps of ``dt`` [s].
+        """
         if self.disturbed is not None:
-            robot = self.robot
-            disturb_observation(episodes, robot.num_joints, robot.control_dt, self.disturbed, observation)
+            every, joints = round(self.robot.control_dt / dt), self.robot.num_joints
+            disturb(episodes, joints, dt, every, self.disturbed, self.joint_qd, observation)
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""

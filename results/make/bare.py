@@ -163,9 +163,8 @@ def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
         observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
 
     def beside() -> None:
-        varied.push(episodes, robot.physics_dt)
         varied.begin_conditions(nobody)
-        varied.disturb(episodes, observation)
+        varied.disturb(episodes, robot.physics_dt, observation)
 
     return Motion(varied, segments, beside)
 

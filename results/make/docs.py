@@ -69,6 +69,11 @@ def shown(key: str, form: str = ",.0f", factor: float = 1.0) -> Callable[[Any], 
     return cell
 
 
+def in_words(count: str) -> str:
+    """A count's name as the head of a column."""
+    return count.replace("_panel", " by the panel").replace("_", " ")
+
+
 def table(rows: Mapping[str, Any], columns: Mapping[str, Column], *, upright: bool = False) -> str:
     """A Markdown table, an object a row, or a column if it is upright; a column without any number is left out."""
     made = {name: shown(column) if isinstance(column, str) else column for name, column in columns.items()}
@@ -170,7 +175,7 @@ def methods(robot: str) -> str:
     rows = sorted(read(f"results/{robot}/search.json").get("methods", {}).items(), key=lambda row: -row[1]["failing"])
     names = ("seeds", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
     named = {name.replace("mixed", "cma_mae+map_elites"): one for name, one in rows if ":" not in name}
-    return table(named, {name.replace("_", " "): name for name in ("episodes", *names)})
+    return table(named, {in_words(name): name for name in ("episodes", *names)})
 
 
 def noise() -> str:
@@ -181,7 +186,7 @@ def noise() -> str:
         for name, rows in searches_of(robot).items()
     }
     names = ("episodes", "elites", "corrected_elites", "failing", "families")
-    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
+    columns: dict[str, Column] = {in_words(name): name for name in names}
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
     columns["at most"] = shown("same_cell_ceiling", ".2f")
     return table(rows, columns)
@@ -207,7 +212,7 @@ def conditions() -> str:
     rows = {words: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
             for words, numbers in of_robots("results/{}/conditions.json").items()}  # fmt: skip
     names = ("episodes", "elites", "corrected_elites", "confirmed", "faults_panel", "failing")
-    columns: dict[str, Column] = {name.replace("_", " "): name for name in names}
+    columns: dict[str, Column] = {in_words(name): name for name in names}
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
@@ -241,7 +246,7 @@ def hardening() -> str:
             goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
             rows[f"{words}: {one['controller']}"] = {**one, **goal}
     counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel")
-    columns: dict[str, Column] = {name.replace("_", " "): name for name in counts}
+    columns: dict[str, Column] = {in_words(name): name for name in counts}
     sets = {"hand_crafted": "hand-crafted", "hard_random": "hard-random", "search-0": "first archive"}
     columns |= {f"goal, {words}": shown(name, ".3f") for name, words in sets.items()}
     return table(rows, columns)
@@ -259,7 +264,7 @@ def searched_again() -> str:
         return lambda found: " to ".join(f"{end(row[count] for row in found):,}" for end in (min, max))
 
     counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel", "fault_families")
-    return table(rows, {count.replace("_", " "): spread(count) for count in counts})
+    return table(rows, {in_words(count): spread(count) for count in counts})
 
 
 def growth() -> str:
@@ -272,7 +277,7 @@ def growth() -> str:
         for row in read(f"results/{robot}/{name}/curve.json").get("curve", ())
     }  # fmt: skip
     counts = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
-    return table(rows, {count.replace("_", " "): count for count in counts})
+    return table(rows, {in_words(count): count for count in counts})
 
 
 def spaces() -> str:
@@ -280,7 +285,7 @@ def spaces() -> str:
     rows = {f"{words}, {name}": one for words, numbers in of_robots("results/{}/spaces.json").items()
             for name, one in numbers["spaces"].items()}  # fmt: skip
     names = ("episodes", "elites", "corrected_elites", "failing", "confirmed", "certified", "faults", "faults_panel")
-    return table(rows, {name.replace("_", " "): name for name in names})
+    return table(rows, {in_words(name): name for name in names})
 
 
 def sizes() -> str:
@@ -377,7 +382,7 @@ def public_controllers() -> str:
         "... stairs of [m]": half("stairs_up"),
         "episodes/s of 32,768 robots": "episodes_per_s_32768",
         "... on": lambda one: one.get("timed", {}).get("device", NONE),
-        **{name.replace("_", " "): inside("archive", name) for name in found},
+        **{in_words(name): inside("archive", name) for name in found},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
     }  # fmt: skip
     return table({words: numbers[name] for name, words in named.items() if name in numbers}, columns, upright=True)

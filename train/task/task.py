@@ -171,7 +171,6 @@ class CommandTask:
     def _control_step(self) -> None:
         sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
-        sim.push(episodes, self.robot.control_dt)
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
             # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
@@ -205,7 +204,7 @@ class CommandTask:
             sim.joint_q, sim.joint_qd, training.command, training.last_action, sim.terrain_of_env, terrain,
             sim.sensors, self._noise, training.counter, training.observation,
         )  # fmt: skip
-        sim.disturb(episodes, training.observation)
+        sim.disturb(episodes, self.robot.control_dt, training.observation)
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 
