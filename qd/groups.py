@@ -22,7 +22,8 @@ from sim.crossing import CrossingCfg
 from sim.robots.shipped import ROBOTS
 from sim.spaces.base import TerrainSpace
 
-VERDICTS = ("", "failing", "confirmed", "certified", "fault")
+VERDICTS = ("", "failing", "certified", "confirmed", "fault")
+"""From the least to the most: what is certified alone, the controller may cross with contact resolved."""
 KIN_M = 0.06
 """Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
 _EVERY = 2  # nodes; distances are compared at 0.1 m
@@ -43,7 +44,7 @@ ORDERS = {
 def verdicts_of(archive: Archive) -> NDArray[np.int64]:
     """The verdict on each elite as its place in :data:`VERDICTS`, shape (N,)."""
     failing, confirmed, certified = archive.failing, archive.confirmed, archive.certified
-    conditions = [confirmed & certified, certified, confirmed, failing]
+    conditions = [confirmed & certified, confirmed, certified, failing]
     return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
 
 

@@ -46,7 +46,7 @@ def minimise(
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
     Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
-    certified, confirmed and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
+    confirmed, certified and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
     terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.judge.judge` takes it.
     Returns what the run has now; None without a failing elite.
     """

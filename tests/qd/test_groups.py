@@ -33,8 +33,8 @@ def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid(
 
 def test_verdicts_come_before_rates_and_rates_before_fitness():
     elites = elites_of(judged_archive())
-    assert elites.verdict.tolist() == [4, 2, 3, 1, 0]  # fault, confirmed, certified, failing, not failing
-    assert elites.by_severity().tolist() == [0, 2, 1, 3, 4]
+    assert elites.verdict.tolist() == [4, 3, 2, 1, 0]  # fault, confirmed, certified, failing, not failing
+    assert elites.by_severity().tolist() == [0, 1, 2, 3, 4]
     archive = dataclasses.replace(
         small_archive(5),
         goal_rate=np.array([0.9, 0.1, 0.0, 0.0, 0.0]),
