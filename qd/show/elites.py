@@ -17,7 +17,6 @@ from qd.minimise import MinimalTerrains, read_minimal
 from qd.run.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
 from qd.run.settings import SearchCfg, find_policy
 from sim.files.command import chosen_elites, command_line
-from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
 from sim.robots.robot import RobotCfg
@@ -60,7 +59,8 @@ class OpenedRun:
 
     def command(self, word: str, **flags: object) -> str:
         """A command about this run as a user types it."""
-        return without_machine(command_line(word, robot=self.robot.spec, run=self.path, **flags))
+        space = self.space.name if self.space.sha256 else None  # code of a user's own runs only if named
+        return command_line(word, robot=self.robot.spec, run=self.path, space=space, **flags)
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config."""

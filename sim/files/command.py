@@ -245,11 +245,13 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 def command_line(name: str, **flags: object) -> str:
     """A command as it is typed: ``faultline replay --run runs/x --elite 0``.
 
-    Flags are named by fields; None, False and empty lists are left out, True is a bare flag.
+    Flags are named by fields; None, False and empty lists are left out, True is a bare flag. Of a path below the
+    present folder the rest is shown; any other stays whole, since the command must work.
     """
-    words = ["faultline", name]
+    words, here = ["faultline", name], f"{Path.cwd()}{os.sep}"
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"
+        value = str(value).removeprefix(here) if isinstance(value, str | Path) else value
         if value is True:
             words.append(flag)
         elif isinstance(value, list | tuple):

@@ -121,7 +121,7 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
         compared=compared_of(content["tables"]),
         choices=content.get("choices", {}),
         origin=origin_rows(content),
-        reports=[without_machine(command_line("report", run=run / row["search"])) for row in rounds],
+        reports=[command_line("report", robot=robot, run=run / row["search"]) for row in rounds],
     )
 
 

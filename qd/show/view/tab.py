@@ -22,7 +22,6 @@ from qd.show.view.recorder import Report
 from qd.show.view.scene import Points, Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
 from sim.bank import terrains_of
-from sim.files.command import command_line
 from sim.recording.recorder import Recording
 
 _BAR_S = 0.1  # real time from one update of the bar's time to the next, while playing
@@ -150,12 +149,10 @@ class Tab:
 
     def copy_command(self) -> None:
         """Have the browser copy the command that replays what the tab shows."""
-        show, name, space = self.common.show, self.controller, self.common.show.opened_run.space
-        text = command_line(
-            "replay", robot=show.robot.spec, run=show.opened_run.path, space=space.name if space.sha256 else None,
-            policy=None if name is None or name == SEARCHED else show.controllers[name],
-            **{"minimal" if self.minimal else "elite": self.selection.picked},
-        )  # fmt: skip
+        show, name = self.common.show, self.controller
+        policy = None if name is None or name == SEARCHED else show.controllers[name]
+        terrain = {"minimal" if self.minimal else "elite": self.selection.picked}
+        text = show.opened_run.command("replay", policy=policy, **terrain)
         self.bar.copy(text)
         self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,6 +54,15 @@ def recording(anymal):
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
     made = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
     return dataclasses.replace(made, origin=identity(anymal, "shipped") | {"space": "super_gaussian"})
+
+
+def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_path, monkeypatch):
+    dog = dataclasses.replace(opened_run.robot, settings_file=Path("/mine/dog/robot.toml"))
+    run = dataclasses.replace(opened_run, path=tmp_path / "runs" / "a", robot=dog)
+    assert run.command("film", elite=3) == "faultline film --robot /mine/dog/robot.toml --run runs/a --elite 3"
+    space = SimpleNamespace(name="/mine/hills.py:Hills", sha256="a" * 64)
+    monkeypatch.setattr("qd.show.elites.get_space", lambda name, sha256: space)
+    assert run.command("judge").endswith("--run runs/a --space /mine/hills.py:Hills")
 
 
 def lines_of(opened_run, recording, policy=None):

@@ -41,6 +41,9 @@ def test_the_page_has_the_numbers_of_the_rounds(tmp_path):
         "tune-1 kept better tune-2 not kept <i>worse", "faultline harden <b>",
     ):  # fmt: skip
         assert part in text
+    assert f"faultline report --run {tmp_path}/search-base " in text  # a command that works, wherever the run lies
+    assert f"Made from {tmp_path.name}:" in text
+    assert "report --robot anymal --run" in text_of(write_report(run, robot="anymal").read_bytes())
     written(run, rounds=[row("base", None)], tables={**content()["tables"], "differences": {}})  # one search alone
     assert "search-0: base" not in text_of(write_report(run).read_bytes())
 
