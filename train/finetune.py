@@ -12,7 +12,8 @@ from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from qd.evaluate.sets import elites_sha256, read_elites, space_of, split_elites
 from qd.faults import SPECIALIST as CERTIFIER
 from qd.judge import CERTIFIERS_FOLDER
-from qd.run.directory import RunDirectory, find_run
+from qd.run.directory import RunDirectory, directory_of, find_run
+from sim.files.command import command_line
 from sim.policy.loaders import load_checkpoint
 from sim.policy.onnx import export_onnx
 from sim.policy.spec import SHIPPED, controller_hash
@@ -134,7 +135,10 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
         rows = split.train
         if cfg.recipe.only == "failing":
             if archive.fresh is None:
-                raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: judge it first")
+                own = robot.spec if archive.robot == robot.name and robot.settings_file else None
+                space = archive.space if archive.space_sha256 else None
+                judge = command_line("judge", robot=own, run=directory_of(path), space=space)
+                raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: run `{judge}`")
             rows = rows[archive.failing[rows]]
         is_free = [mark not in held_out for mark in marks_of(archive.genes[rows])]
         chosen.append((archive, rows[np.array(is_free, bool)], split))

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
 from qd.groups import way_to_end
-from qd.judge import controllers_in
+from qd.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.run.progress import Bar
 from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
 from qd.show.replay import Source, save
@@ -282,8 +282,11 @@ def film_source(
         try:
             check_policy(policy, robot, device)
         except ValueError as error:
-            names = ", ".join([*others_known, SHIPPED])
-            raise ValueError(f"beside must be {names} or a controller as --policy takes it: {error}") from error
+            names, remedy = ", ".join([*others_known, SHIPPED]), ""
+            if run and beside in controllers_in(run.folder / CERTIFIERS_FOLDER) and beside not in others_known:
+                judge = run.command("judge")
+                remedy = f"; {beside} is in certifiers/ of the run, and judging again makes its name known: `{judge}`"
+            raise ValueError(f"beside must be {names} or a controller as --policy takes it: {error}{remedy}") from error
     recordings = source.record(device)
     if beside is not None:
         others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]

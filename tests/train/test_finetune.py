@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -227,6 +228,11 @@ def test_which_elites_are_trained_on(places, searched):
     assert elites.goal_rate is not None and set(elites.goal_rate) == {0.1}
     made = make_archive(10)
     write_archive(places / "crossed.npz", replace(made, fresh=replace(fresh_values(made), goal_rate=np.ones(10))))
+    unjudged = write_run(places / "unjudged", made)
+    own = replace(ROBOT, settings_file=Path("/mine/robot.toml"))
+    for robot, named in ((ROBOT, ""), (own, "--robot /mine/robot.toml ")):
+        with pytest.raises(ValueError, match=f"`faultline judge {named}--run {unjudged}`"):
+            elites_of(robot, cfg_of(places, archive=(str(unjudged),), only="failing"))
     with pytest.raises(ValueError, match="elites to train on"):
         elites_of(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
 

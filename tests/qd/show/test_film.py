@@ -210,6 +210,20 @@ def test_mistakes_are_refused_before_anything_is_crossed(run, capsys, flags, nam
     assert not list(run.glob("*.mp4"))
 
 
+def test_a_certifier_that_came_after_the_judging_is_known_once_the_run_is_judged_again(run, capsys):
+    try:
+        open_context(16, 16).free()
+    except ValueError as error:
+        pytest.skip(str(error))
+    certifier = run / "certifiers" / "specialist.pt"
+    certifier.parent.mkdir()
+    certifier.touch()
+    for name, is_there in (("specialist", True), ("nobody", False)):
+        assert film("--beside", name) == 2
+        error = capsys.readouterr().err
+        assert "no such file" in error and (f"`faultline judge --robot anymal --run {run}`" in error) == is_there
+
+
 def test_without_opengl_nothing_is_crossed(run, capsys, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "no_such_way")
     assert film() == 2
