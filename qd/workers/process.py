@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.resource_tracker import ensure_running
 from typing import Any, NoReturn
 
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ class WorkerProcess:
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
         # A blocked signal stays blocked in the child: Ctrl-C reaches the whole group, and the parent ends its workers.
+        ensure_running()  # else the first start begins the tracker, which unblocks the signal again on Python 3.11
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._process.start()

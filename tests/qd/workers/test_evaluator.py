@@ -1,5 +1,8 @@
 import dataclasses
 import multiprocessing
+import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -138,6 +141,20 @@ def test_large_height_maps_go_in_while_results_come_out():
             evaluate.put(lot, SEEDS[:2])
         for lot in maps:
             np.testing.assert_array_equal(evaluate.take().penalties, lot)
+
+
+def test_the_first_worker_too_leaves_ctrl_c_to_its_parent():
+    """In a new process, in which multiprocessing's resource tracker does not run yet."""
+    script = (
+        "import multiprocessing\n"
+        "from qd.workers.process import WorkerProcess\n"
+        "worker = WorkerProcess(1, dict, {})\n"
+        "print(open(f'/proc/{multiprocessing.active_children()[0].pid}/status').read())\n"
+        "worker.stop()\n"
+    )
+    status = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    blocked = int(status.partition("SigBlk:")[2].split()[0], 16)
+    assert blocked & 1 << (signal.SIGINT - 1)
 
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
