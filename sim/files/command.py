@@ -9,6 +9,7 @@ import inspect
 import io
 import os
 import re
+import select
 import shlex
 import signal
 import sys
@@ -118,7 +119,8 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
 
     Returns:
         Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
-        can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM.
+        can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM; 1
+        without a word, as of rich, where nobody reads what it prints any more, as in ``faultline ... | head -1``.
         FAULTLINE_DEBUG=1 shows the traceback instead of the line.
     """
     signal.signal(signal.SIGTERM, _interrupt)
@@ -127,8 +129,11 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
         command = _parse(cls, argv, name, defaults)
         check(command)
         status = command.execute()
+        sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _drop_unread():
+            return 1
         remedy = _cache_remedy(error)
         if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
             raise
@@ -138,6 +143,17 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
+
+
+def _drop_unread() -> bool:
+    """Whether nobody reads standard output or errors any more; what is left for them to print is dropped."""
+    poll = select.poll()
+    for stream in (1, 2):
+        poll.register(stream, 0)
+    unread = [stream for stream, _ in poll.poll(0)]
+    for stream in unread:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    return bool(unread)
 
 
 def _cache_remedy(error: Exception) -> str:
@@ -176,6 +192,7 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
             )  # fmt: skip
     except SystemExit as stop:
         if not stop.code:  # it was asked for help
+            sys.stdout.flush()
             raise
         lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in said.getvalue().splitlines()]
         _title, *words = [line for line in lines if line.strip("-")]

@@ -3,6 +3,8 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,6 +113,42 @@ def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatc
     monkeypatch.setenv("FAULTLINE_DEBUG", "1")
     with pytest.raises(ValueError, match="two"):
         run("--how", "value")
+
+
+TALKS = """
+import os, sys
+from dataclasses import dataclass
+from sim.files.command import run_command
+
+@dataclass(frozen=True, kw_only=True)
+class Talks:
+    'Say something.'
+    how: str = 'end'
+
+    def execute(self):
+        if self.how == 'other':
+            read, write = os.pipe()
+            os.close(read)
+            os.write(write, b'x')
+        print('a word', flush=self.how == 'now')
+
+sys.exit(run_command(Talks, sys.argv[1:], name='talks'))
+"""
+
+
+@pytest.mark.parametrize("flag", ["--how=end", "--how=now", "--help"])
+def test_where_nobody_reads_its_output_any_more_a_command_ends_without_a_word(flag):
+    """As in ``faultline ... | head -1``, whether it notices at once or when it ends."""
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-c", TALKS, flag], stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert done.returncode == 1 and not done.stderr
+
+
+def test_another_broken_pipe_is_an_error():
+    done = subprocess.run([sys.executable, "-c", TALKS, "--how=other"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("error: ")
 
 
 def test_a_command_line_can_be_typed():
