@@ -221,12 +221,12 @@ class Report(ControllerFlags, DeviceFlag, SpaceFlag):
 class View(RobotFlag, EliteFlags):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    It opens on the worst terrain of the commonest cause, one second before the robot fails, and plays; the controller
-    that crosses the terrain is shown beside it as a ghost. Under the scene are play, the time with marks where things
-    happen, episode, speed and follow. On the left are the elites, by what stops the robot, as a list and on a map
-    of where episodes end; a click shows one. On the right stand how often the robot arrives, who crosses beside it, its
-    penalties, and a button that films what is shown. Crossings that are not recorded yet run on the CPU, which takes
-    seconds, and are stored under --cache.
+    It opens on the worst terrain of the commonest cause, of causes that have a fault if any has, one second before the
+    robot fails, and plays; the controller that crosses the terrain is shown beside it as a ghost. Under the scene are
+    play, the time with marks where things happen, episode, speed and follow. On the left are the elites, by what stops
+    the robot, as a list and on a map of where episodes end; a click shows one. On the right stand how often the robot
+    arrives, who crosses beside it, its penalties, and a button that films what is shown. Crossings that are not
+    recorded yet run on the CPU, which takes seconds, and are stored under --cache.
 
     Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
     opens just that.
