@@ -23,8 +23,9 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
 Settings = TypeVar("Settings")
-_EXPECTED = re.compile(r"Expected (?P<what>.*?)(?P<got>, got .*?)?( - at `\$\.?(?P<field>.*)`)?")
+_EXPECTED = re.compile(r"Expected (?P<what>.*?)(, got .*?)?( - at `\$\.?(?P<field>.*)`)?")
 _PLAIN_WORDS = {
+    r"`str` matching regex '\^\((.*)\)\$'": r"one of \1", r"(?<=\w)\|(?=\w)": ", ",
     r"`(int|float)` >= (\S+?)(\.0)?$": r"at least \2",
     r"`(int|float)` > (\S+?)(\.0)?$": r"above \2",
     r"`(int|float)` <= (\S+?)(\.0)?$": r"at most \2",
@@ -62,27 +63,30 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
-        match = _EXPECTED.fullmatch(str(error))
-        words = (
-            f"{match['field'] or 'it'} must be {_in_words(match['what'])}{match['got'] or ''}"
-            if match
-            else (str(error).replace("Object missing required field", "missing").replace("`", "'"))
-        )
+        words = str(error).replace("Object missing required field", "missing").replace("`", "'")
+        if match := _EXPECTED.fullmatch(str(error)):
+            place, expected = match["field"] or "", match["what"]
+            for word, words in {" | null": "", "array": "a list", "object": "a table"}.items():  # as a file has them
+                expected = expected.replace(word, words)
+            for key in re.findall(r"[^.\[\]]+", place):
+                data = data[int(key) if key.isdigit() else key]
+            words = f"{place or 'it'} must be {_in_words(expected)}, got {_brief(data)}"
         raise ValueError(f"{name}: {words}") from None
-    unknown = list(_unknown(data, msgspec.to_builtins(settings, enc_hook=str)))
-    if unknown:
-        raise ValueError(f"{name} has no setting {', '.join(unknown)}")
+    if unknown := list(_unknown(data, settings)):
+        raise ValueError(f"{name} has no setting {'; and no '.join(unknown)}")
     if lines := problems(settings):
         raise ValueError(f"{name}: {'; '.join(lines)}")
     return settings
 
 
-def _unknown(given: Any, known: Any) -> Iterator[str]:
+def _unknown(given: dict[str, Any], settings: Any, table: str = "") -> Iterator[str]:
+    """The names of each table that nobody knows, with those that it has."""
+    known = [setting.name for setting in fields(settings)]
+    if unknown := [f"{table}{key}" for key in given if key not in known]:
+        yield f"{', '.join(unknown)}: there are {', '.join(known)}"
     for key, value in given.items():
-        if key not in known:
-            yield str(key)
-        elif isinstance(value, dict) and isinstance(known[key], dict):
-            yield from _unknown(value, known[key])
+        if isinstance(value, dict) and is_dataclass(part := getattr(settings, key, None)):
+            yield from _unknown(value, part, f"{table}{key}.")
 
 
 def _mismatch(annotation: Any, value: Any) -> str | None:

@@ -65,7 +65,10 @@ def test_settings_come_back_from_json():
     ("values", "field"),
     [
         (7, "outer"),
-        ({"inner": {"colour": 3}}, "colour"),
+        ({"inner": {"colour": 3}}, r"inner\.colour.* share, span"),
+        ({"inner": {"span": [1, "a"]}}, r"inner\.span\[1\] .*'a'"),
+        ({"count": 0}, "count .*at least 1.* 0"),
+        ({"maybe": "x"}, "maybe .*number, got 'x'"),  # None is no choice in a file
         ({"inner": {"span": [2, 1]}}, "span"),
         ({"length": math.nan}, "length"),
     ],
