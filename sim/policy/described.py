@@ -94,17 +94,21 @@ class ControllerCfg:
 def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
     """Reads a description, or its text, which is called ``path`` in errors; an error names the field too."""
     content = read_toml(path, text)
+    if "model_file" in content:
+        raise ValueError(f"{path} must be a controller, got the settings of a robot: name it by --robot")
     items = content.pop("observation", None)
     if not isinstance(items, list) or not items or not all(isinstance(item, dict) for item in items):
-        raise ValueError(f'{path}: observation must be a list of terms, for example [{{term = "gravity"}}]')
+        what = f'observation must be a list of terms, for example [{{term = "gravity"}}], got {items or "none"}'
+        raise ValueError(f"{path}: {what}: fill in the lines that an import marked `fill in`")
     terms = []
     for k, item in enumerate(items):
         name = item.get("term")
         if not isinstance(name, str) or name not in TERMS:
             raise ValueError(f"{path}: observation[{k}].term must be one of {', '.join(TERMS)}, got {name}")
         place = f"{path}: observation[{k}] ({name})"
-        if unknown := item.keys() - {"term", "clip", "scale", "history", *TERMS[name]}:
-            raise ValueError(f"{place} has no setting {', '.join(sorted(unknown))}")
+        known = ("term", "clip", "scale", "history", *TERMS[name])
+        if unknown := sorted(item.keys() - known):
+            raise ValueError(f"{place} has no setting {', '.join(unknown)}: there are {', '.join(known)}")
         if missing := {"period_s", "order"} & {*TERMS[name]} - item.keys():
             raise ValueError(f"{place}: missing '{missing.pop()}'")
         terms.append(from_builtins(Term, item, place))

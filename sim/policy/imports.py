@@ -4,18 +4,16 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-import torch
 
 from sim.files.command import command_line
 from sim.files.settings import to_toml
-from sim.policy.loaders import activation_in, load_network, read_yaml
+from sim.policy.loaders import activation_in, load_network, read_yaml, widths
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
 from sim.robots.own import NEW_NAME, is_new_name, per_joint
 from sim.robots.robot import RobotCfg
@@ -288,7 +286,7 @@ def _read_mjlab(source: Path, found: _Found) -> Path:
 def _read_weights(source: Path, found: _Found) -> Path:
     """Weights that say nothing but their widths."""
     network: Any = load_network(source, "cpu", None, of="it")
-    (width, count), place = _widths(network), found.imu()
+    (width, count), place = widths(network), found.imu()
     if activation := getattr(getattr(network, "head", network), "activation", None):
         found.put(activation=activation)
     asked = f"an angle of each joint [rad], its pose at action 0: {', '.join(found.joints)}"
@@ -303,16 +301,6 @@ def _read_weights(source: Path, found: _Found) -> Path:
     example = to_toml([_term("lin_vel", at=place), *map(_term, _BLIND)])
     found.put(observation=None, why=f"its {width or 'all'} columns in its order, with scale; of {example}")
     return source
-
-
-def _widths(network: Any) -> tuple[int | None, int | None]:
-    """Columns and actions of a network, as far as it says them."""
-    if hasattr(network, "sizes"):
-        return network.sizes
-    for weight in network.parameters():
-        with suppress(RuntimeError, torch.jit.Error, AttributeError, IndexError):  # of an inner layer
-            return weight.shape[1], network(torch.zeros(1, weight.shape[1])).shape[1]
-    return None, None
 
 
 def _read_isaac_lab(source: Path, found: _Found) -> Path:

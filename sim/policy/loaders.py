@@ -8,7 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,9 @@ from sim.policy.spec import ControllerSpec, agent_file, find_named, in_one_line,
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 
+_WEIGHTS = "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx)"
 _FORMATS = (
-    "a description (.toml), an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx), "
+    f"a description (.toml), {_WEIGHTS}, "
     "module:callable or file.py:callable (a function on device tensors, or a class or factory marked by "
     "`faultline_factory = True` that is called with (robot, device)), or module:adapter@file (a function that is "
     "called with (controller, robot))"
@@ -160,7 +161,11 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
     if path == robot.policy_file and not path.exists():
         remedy = f"train one with `{robot.train_command}`, or name another with --policy"
         raise ValueError(f"robot '{robot.name}' has no controller of its own, expected at {path}: {remedy}")
-    if path.suffix == ".toml" and path.is_file():
+    if not os.path.isfile(path):  # False too for a name that no file can have
+        raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+    if path.suffix == ".py":
+        raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
+    if path.suffix == ".toml":
         return load_described(read_controller(path), weights_file(path), robot, device, path)
     sizes = (robot.observation_size, robot.num_joints) if fits else None
     return load_network(path, device, sizes, of=f"robot '{robot.name}'")
@@ -170,8 +175,8 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
     """The controller of a description, which is called ``path`` in errors, with the network of a file."""
     policy = Described(cfg, robot, str(path))
     sizes = policy.observation_size, policy.num_actions
-    if weights is None:
-        raise ValueError(f"{path}: policy must be the name of a file, got {cfg.policy!r}")
+    if weights is None or not os.path.isfile(weights):
+        raise ValueError(f"{path}: policy must name a file of weights beside it, got {cfg.policy!r}: put it there")
     of = f"{path} ({policy.columns})"
     network = load_network(weights, device, sizes, of=of, activation=cfg.activation)
     if cfg.activation is not None and not isinstance(network, MlpPolicy | RnnPolicy):
@@ -190,10 +195,6 @@ def load_network(
     takes what the file has, a TorchScript module as it is. The ``activation`` is that between the layers of a
     checkpoint; None takes what its file or its training says.
     """
-    if not os.path.isfile(path):  # False too for a name that no file can have
-        raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
-    if path.suffix == ".py":
-        raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
     if path.suffix.lower() == ".onnx":
         from sim.policy.onnx import load_onnx  # onnxruntime takes long to load, and few controllers need it
 
@@ -339,7 +340,7 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
     except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
-            f"or holding code): {in_one_line(reason)}; expected {_FORMATS}"
+            f"or holding code): {in_one_line(reason)}; expected {_WEIGHTS}"
         ) from error
     return module if sizes is None else _by_robot(module, probe, path, sizes[0], device)
 
@@ -387,12 +388,26 @@ def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, of: s
             forget_all(policy, 4, device)
             action = policy(torch.zeros(shape, device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
+        width, _ = widths(policy) if isinstance(policy, torch.nn.Module) else (None, None)
+        if width not in (None, sizes[0]):
+            what = f"takes {width} columns, {of} gives {sizes[0]}"
+            raise ValueError(f"policy '{spec}' {what}: describe those that it takes (docs/controllers.md)") from error
         raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {of}: {in_one_line(error)}") from error
     problem = action_problem(action, (4, sizes[1]))
     if problem is not None:
         raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
+
+
+def widths(network: Any) -> tuple[int | None, int | None]:
+    """Columns and actions of a network, as far as it says them."""
+    if hasattr(network, "sizes"):
+        return network.sizes
+    for weight in network.parameters():
+        with suppress(Exception):  # of an inner layer
+            return weight.shape[1], network(torch.zeros(1, weight.shape[1], device=weight.device)).shape[1]
+    return None, None
 
 
 @torch.inference_mode()

@@ -125,12 +125,17 @@ _NOT_THE_USERS = (
 )
 
 
+_ADVICE = re.compile(
+    r"(?s)Weights only load failed.*(trusted source\.|WeightsUnpickler error: )|\. (Please use `torch|This is an int).*"
+)
+"""What torch says of any file that it refuses: to load it as code, or that it is damaged."""
+
+
 def in_one_line(error: BaseException) -> str:
     """Kind of an error, the first line of what it says, and the innermost line of the user's own code."""
-    advised = str(error).partition("WeightsUnpickler error: ")[2]  # by torch, to load the file as code
-    lines = (advised.partition(". Please")[0] or str(error)).strip().splitlines()
+    lines = _ADVICE.sub("", str(error)).strip().splitlines()
     first = -1 if lines and lines[0].startswith("The following operation failed") else 0  # TorchScript's trace
-    text = ": ".join([type(error).__name__, *lines[first:][:1]])
+    text = ": ".join([type(error).__name__, *lines[first:][:1]]).rstrip(".")
     frames = [
         frame
         for frame in traceback.extract_tb(error.__traceback__)

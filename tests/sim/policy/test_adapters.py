@@ -79,7 +79,7 @@ ADAPTER = "def adapt(actor, robot): "
         ("def act(o): return o[:, :12] * float('nan')", "act", "not finite"),
         (ADAPTER + "raise KeyError('gone')", "adapt@{}", r"gone.*mine\.py, line 1\)"),
         (ADAPTER + "return 3", "adapt@{}", "int"),
-        (ADAPTER + "return actor", "adapt@{}", r"\(4, 235\)"),
+        (ADAPTER + "return actor", "adapt@{}", "48 columns, robot 'anymal' gives 235"),
     ],
 )
 def test_code_that_fails_is_named(tmp_path, write, anymal, source, call, words):

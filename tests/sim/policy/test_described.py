@@ -185,6 +185,18 @@ def test_an_activation_is_of_a_checkpoint(tmp_path, anymal, describe):
         load_policy(describe('{term = "gravity"}', 'activation = "elu"'), anymal, "cpu")
 
 
+def test_a_script_of_other_columns_is_told_both_numbers(tmp_path, anymal, describe):
+    layers = torch.nn.Sequential(torch.nn.Linear(6, 16), torch.nn.ELU(), torch.nn.Linear(16, ACTIONS))
+    torch.jit.script(layers).save(str(tmp_path / "weights.pt"))
+    with pytest.raises(ValueError, match=r"weights\.pt' .*6 columns.*controller\.toml \(gravity 3\) .* 3"):
+        load_policy(describe('{term = "gravity"}'), anymal, "cpu")
+
+
+def test_weights_that_are_not_there_are_named(anymal, describe):
+    with pytest.raises(ValueError, match=r"controller\.toml: policy .*gone\.pt"):
+        load_policy(describe('{term = "gravity"}', policy="gone.pt"), anymal, "cpu")
+
+
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
     weights = tmp_path / "weights.pt"
     assert ControllerSpec.parse(remembering).files == (remembering, weights)
@@ -207,11 +219,13 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
     ("terms", "line", "named"),
     [
         ('{term = "height"}', "", r"observation\[0\]\.term .*scan.* height"),
-        ('{term = "gravity", scal = 1}', "", r"observation\[0\] \(gravity\).* scal"),
+        ('{term = "gravity", scal = 1}', "", r"observation\[0\] \(gravity\).* scal.* scale"),
         ('{term = "gravity"}, {term = "clock"}', "", r"observation\[1\] \(clock\).*period_s"),
         ('{term = "command", scale = [1, 2]}', "", r"observation\[0\]\.scale .*3.* 2"),
         ('{term = "gravity", scale = "a"}', "", r"observation\[0\] \(gravity\): scale"),
-        ('{term = "gravity"}', "crossing = {speed = 0.5}", "crossing"),
+        ('{term = "gravity"}', "crossing = {speed = 0.5}", "crossing.* action_clip"),
+        ('{term = "gravity"}', 'model_file = "dog.xml"', "robot"),
+        ('{term = "gravity"}', 'history = {length = 2, newest = "new"}', r"history\.newest .*first, last.*'new'"),
         ('{term = "gravity"}', 'joints = ["LF_HAA", "LF_TOE"]', "joints.*LF_TOE"),
         ('{term = "gravity"}', "action_scale = [1, 2]", "action_scale .*12.* 2"),
         ('{term = "gravity"}', "action_scale = nan", "action_scale"),
