@@ -124,7 +124,10 @@ def import_controller(source: Path, model_file: Path, out: Path) -> None:
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError, re.error) as error:
         if isinstance(error, ValueError) and str(found.file) in str(error):
             raise
-        raise ValueError(f"{source} must be {kind}, but: {type(error).__name__}: {error}") from None
+        problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        if not isinstance(error, KeyError | ValueError):
+            problem = f"it is laid out otherwise ({type(error).__name__}: {error})"
+        raise ValueError(f"{source} must be {kind}, but {problem}") from None
     copy = out / weights.name
     if copy.exists() and copy.read_bytes() != weights.read_bytes():
         raise ValueError(f"{copy} must be a copy of {weights}, got other weights: move them away first")
@@ -159,6 +162,9 @@ def _reader_of(source: Path) -> tuple[str, Callable[[Path, _Found], Path]]:
         return "a run of Isaac Lab", _read_isaac_lab
     if source.is_dir() or source.suffix in (".yaml", ".yml"):
         file = source / "config.yaml" if source.is_dir() else source
+        if source.is_dir() and not file.is_file():
+            kinds = "a folder of rl_sar, with config.yaml, or a run of Isaac Lab, with params/env.yaml"
+            raise ValueError(f"{source} must be {kinds}, got neither of these files: name the folder with one")
         content = read_yaml(file)
         if "kps" in content:
             return "a deployment of unitree_rl_gym", _read_deployment
@@ -221,7 +227,9 @@ def _read_rl_sar(source: Path, found: _Found) -> Path:
     steps = said.pop("observations_history", None) or [0]
     if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
         raise ValueError(f"{file}: observations_history must be all steps from 0 on, got {steps}")
-    by = {"time": "row", "term": "term"}[said.pop("observations_history_priority", "time")]
+    by = {"time": "row", "term": "term"}.get(priority := said.pop("observations_history_priority", "time"))
+    if by is None:
+        raise ValueError(f"{file}: observations_history_priority must be time or term, got {priority}")
     if len(steps) > 1:
         history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
         found.put(history=history, why="steps before the start are zeros, as in rl_sar's own loop")
@@ -322,7 +330,7 @@ def _read_isaac_lab(source: Path, found: _Found) -> Path:
     exported = [place for name in ("policy.pt", "policy.onnx") if (place := source / "exported" / name).is_file()]
     checkpoints = sorted(source.glob("model_*.pt"), key=lambda place: int(re.sub(r"\D", "", place.stem) or 0))
     if not exported and not checkpoints:
-        raise ValueError(f"{source} must have weights, exported/policy.pt or model_*.pt, got none")
+        raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
     if not exported and activation_in(agent) is not None:
         found.put(activation=activation_in(agent))
     return (*exported, *checkpoints[::-1])[0]

@@ -233,6 +233,7 @@ def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
         (rl_sar, {"wheel_indices": [3]}, "wheel_indices"),
         (rl_sar, {"observations": ["ang_vel", "ang_vel_world"]}, "ang_vel_world"),
         (rl_sar, {"observations_history": [0, 2]}, "observations_history"),
+        (rl_sar, {"observations_history_priority": "step"}, "observations_history_priority must be time or term"),
         (rl_sar, {"model_name": "other.pt"}, "other.pt"),
         (rl_sar, {"rl_kp": [1.0]}, "rl_kp"),
         (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
@@ -246,7 +247,7 @@ def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
         (isaac_lab, {"old": "joint_pos_rel", "new": "joint_pos"}, "joint_pos,"),
         (isaac_lab, {"old": "JointPositionAction", "new": "JointVelocityAction"}, "JointVelocityAction"),
         (isaac_lab, {"old": "{.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}", "new": "{.*_toe: 1}"}, ".*_toe matches"),
-        (isaac_lab, {"old": "decimation: 4", "new": ""}, "decimation"),
+        (isaac_lab, {"old": "decimation: 4", "new": ""}, "it has no 'decimation'"),
         (isaac_lab, {"old": "clip: null}", "new": "clip: [-1, 1]}"}, "clip"),
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
     ],
@@ -258,3 +259,8 @@ def test_what_is_not_understood_is_refused_by_its_name(tmp_path, write, change, 
     with pytest.raises(ValueError, match=re.escape(named)):
         imported(source, tmp_path)
     assert not (tmp_path / "mine").exists()
+
+
+def test_a_folder_of_no_known_kind_is_told_which_there_are(tmp_path):
+    with pytest.raises(ValueError, match=r"config\.yaml.*params/env\.yaml"):
+        imported(tmp_path, tmp_path)
