@@ -38,15 +38,16 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bo
     Returns whether it stands as it should and walks alike in both simulators. Without ``policy`` it walks by the
     robot's own controller.
     """
+    policy = policy or str(robot.policy_file)
+    if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
+        check_policy(policy, robot, compute.device)
     print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
     robot, standing = _with_room(robot, compute.device, 3.0)
     text, fine = describe_standing(robot, standing)
     print(text, flush=True)
-    policy = policy or str(robot.policy_file)
-    if not Path(policy).exists() and policy == str(robot.policy_file):
+    if not has_controller:
         print(f"Without a controller, expected at {policy} or named by --policy, this is all.")
         return fine
-    check_policy(policy, robot, compute.device)
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
         if not _walks(robot, walk(crossings, policy)):
             return False

@@ -24,6 +24,14 @@ def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mende
     assert "it needs nconmax = " in text and "Without a controller" in text
 
 
+def test_a_controller_is_tried_before_anything_is_simulated(tmp_path, capsys):
+    file = write_toml(tmp_path / "dog", "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n")
+    file.with_name("controller.toml").write_text('observation = [{term = "height"}]\n')
+    assert run_command(Check, ["--robot", str(file), "--device", "cpu"], name="check") == 2
+    text = capsys.readouterr()
+    assert "height" in text.err and "stands" not in text.out
+
+
 @pytest.mark.slow
 def test_the_shipped_controller_walks_alike_in_both_simulators_and_gets_over_kerbs(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
