@@ -96,7 +96,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     if absent:
         raise ValueError(
             f"penalties must occur in the episodes that scales are means over, got 0 of {', '.join(absent)}: leave "
-            f"them out of the robot's penalties, for which the scales in {out} fit, or calibrate on more terrains"
+            f"them out of the robot's penalties, for which the scales in {out} fit"
         )
     return report
 

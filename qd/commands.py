@@ -300,7 +300,7 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
                 raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
             folder = pack_folder(self.pack)
             pack = read_pack(folder)
-            robot = robot_of(pack.content, self.robot, folder / PACK_FILE, flag="pack")
+            robot = robot_of(pack.content, self.robot, folder / PACK_FILE, kind="pack")
             policy = self.policy or str(robot.policy_file)
             report = evaluate_pack(pack, robot, policy, compute=compute, out=self.out, **size)
             return int(self.fail_under is not None and not passes(report, self.fail_under))

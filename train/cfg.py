@@ -34,7 +34,8 @@ class RunCfg:
     """cpu, cuda or cuda:N; CUDA where there is one."""
     export: Path | None = None
     """Also write the controller to this file and its training record beside it: sim/robots/<robot>.pt ships it,
-    <name>.pt beside the settings file of another robot makes it that robot's own."""
+    <name>.pt beside the settings file of another robot makes it that robot's own, unless a controller.toml stands
+    beside its robot.toml."""
 
 
 RUN = RunCfg()

@@ -80,7 +80,7 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
     """Terrains of a pack."""
     folder = pack_folder(named)
     pack = read_pack(folder)
-    of_robot = robot_of(pack.content, robot, folder / PACK_FILE, flag="pack")
+    of_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
     rows = chosen_elites(places, range(len(pack.terrains)), f"{folder} has no place")
     names = {pack.terrains[row]["name"]: row for row in rows}
     return Source(

@@ -32,16 +32,16 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     raise ValueError(f"unknown robot '{spec}': expected {known}, a robot.toml or a Python file (docs/robots.md)")
 
 
-def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, flag: str = "run") -> RobotCfg:
+def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, kind: str = "run") -> RobotCfg:
     """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
     file names. The record is a file's :func:`sim.files.records.identity`; ``given`` is what the command line names, if
-    anything; errors name the file and its flag.
+    anything; errors name the file and its ``kind``.
     """
     name, robot = record["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:
-        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another --{flag}")
+        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another {kind}")
     if robot is None and name not in ROBOTS:
         raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
     robot = robot or ROBOTS[name]
