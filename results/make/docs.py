@@ -295,21 +295,19 @@ def sizes() -> str:
     """
     columns, rows = {}, {}
     for words, numbers in of_robots("results/{}/dose-resolved.json").items():
-        tried = dict[tuple[str, str], list[float]]()
-        for row in numbers["dose"]:
-            tried.setdefault((row["element"], row["controller"]), []).append(row["value"])
         for half in numbers["half"]:
-            name, values = f"{words}: {half['controller']}", tried[half["element"], half["controller"]]
-            obstacle = half["element"].replace("_", " ")
+            name, obstacle = f"{words}: {half['controller']}", half["element"].replace("_", " ")
             row = rows.setdefault(f"{obstacle}, {half['parameter']} {half['unit']}".strip(), {})
-            row[name] = size_words(half, values)
+            row[name] = size_words(half, numbers["dose"])
             columns[name] = lambda row, name=name: row.get(name, NONE)
     stopping = {name: row for name, row in rows.items() if not all(size.startswith("(") for size in row.values())}
     return table(stopping, columns)
 
 
-def size_words(half: Mapping[str, Any], tried: Sequence[float]) -> str:
-    """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those tried."""
+def size_words(half: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those in rows."""
+    obstacle = ("element", "controller")
+    tried = [row["value"] for row in rows if all(row[key] == half[key] for key in obstacle)]
     value, (low, high), form = half["value"], half["interval"], ".3f" if half["unit"] == "s" else ".2f"
     if value is None:
         way = "over" if tried[0] > tried[-1] else "under"
@@ -364,8 +362,8 @@ def public_controllers() -> str:
         """Up to which size half of the robots get over an obstacle."""
 
         def words(one: Any) -> str:
-            row = next((row for row in one.get("dose", ()) if row["element"] == name), {})
-            return str(row.get("beyond")) if row.get("beyond") else shown("value", ".2f")(row)
+            sizes = [size_words(row, one["dose"]) for row in one.get("half", ()) if row["element"] == name]
+            return sizes[0] if sizes else NONE
 
         return words
 

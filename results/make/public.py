@@ -16,9 +16,7 @@ import numpy as np
 
 from qd.check import made_ready, walk
 from qd.evaluate.dose import measure_dose
-from qd.evaluate.evaluate import cross_sets
-from qd.evaluate.measures import summarise
-from qd.evaluate.sets import plain_set
+from qd.evaluate.evaluate import evaluate_rates
 from qd.judge import judge
 from qd.run.directory import RunDirectory
 from qd.run.settings import preset
@@ -101,16 +99,16 @@ def time_alone(name: str, folder: Path, runs: Path, compute: Compute, *, seed: i
 
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
     """Imports a controller, lets it cross what is no search's, and searches what breaks it."""
-    run, cache = runs / f"{name}-archive", runs / "crossings"
+    run = runs / f"{name}-archive"
     robot, named = ready(name, folder, runs, compute)
-    policy, space = str(robot.policy_file), load_space(named)
-    with Crossings(robot, compute, cache=cache) as crossings:
+    policy = str(robot.policy_file)
+    with Crossings(robot, compute, cache=runs / "crossings") as crossings:
         checked = check_numbers(walk(crossings, policy, seed), robot.speed)
         agreed = agree(crossings, named, seed, 1 if small else 40)
-    plain = plain_set("hand_crafted", 6 if small else 300, seed, space)
-    crossed = cross_sets(
-        {name: policy}, {"hand_crafted": plain}, robot=robot, compute=compute, episodes=2 if small else 20, cache=cache
-    )["hand_crafted"][name]
+    rates = evaluate_rates(
+        robot, policy, compute=compute, terrains=6 if small else 300, episodes=2 if small else 20, space=named,
+        seed=seed, out=runs / f"{name}-rates.json",
+    )  # fmt: skip
     dose = measure_dose(
         robot, {name: policy}, parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), compute=compute, seed=seed,
         terrains=1 if small else None, episodes=1 if small else None, out=runs / f"{name}-dose.json",
@@ -127,11 +125,12 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "space": named,
         "height": float(named.partition("@")[2] or MOST_HEIGHT),
         "check": checked,
-        "hand_crafted": summarise(crossed, seed, types=plain.types, levels=plain.levels),
+        "hand_crafted": rates["hand_crafted"],
         "agreement": agreed,
         "archive": {count: summary.get(count) for count in (*COUNTS, "wall_s")},
         "causes": causes_of(archive),
-        "dose": dose["half"],
+        "dose": dose["dose"],
+        "half": dose["half"],
     }
 
 
