@@ -51,8 +51,8 @@ def search_again(script: Script, name: str, policy: Path | None, seed: int) -> d
 
 
 def cfg_of(script: Script) -> HardenCfg:
-    """Settings of the hardening."""
-    return replace(HardenCfg.of(script.robot), seed=script.seed, specialists=not script.small)
+    """Settings of the hardening; specialists judge the further searches alone, since no training needs them."""
+    return replace(HardenCfg.of(script.robot), seed=script.seed, specialists=False)
 
 
 def train_at_once(script: Script) -> Path:
