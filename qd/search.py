@@ -74,6 +74,9 @@ def search(
         space=space.name,  # where its code is now
     )
     with claimed(path):
+        if (finished := run.read_finished(cfg)) is not None:
+            say(describe_search(cfg, path, cfg.iterations, compute.device, evaluator.num_workers))
+            return finished
         saved = run.load(cfg)
         if saved is None:
             scheduler = Scheduler(cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed)

@@ -1,5 +1,6 @@
 """Parallel robots on height grids, one world each: Newton's MuJoCo model, terrain contact and steps of our own."""
 
+import gc
 import math
 from collections.abc import Callable
 from dataclasses import asdict
@@ -305,12 +306,19 @@ class Simulation:
     def capture(self, launch_all: Callable[[], None]) -> Any:
         """Record the launches of ``launch_all`` once as a graph for :meth:`launch`, on CUDA and CPU alike.
 
-        It is run eagerly first, so that no kernel is loaded while recording.
+        It is run eagerly first, so that no kernel is loaded while recording. Nor is garbage collected meanwhile: what
+        is freed on the GPU then can spoil the recording.
         """
+        collects = gc.isenabled()
         with wp.ScopedDevice(self.device):
             launch_all()
-            with wp.ScopedCapture() as capture:
-                launch_all()
+            gc.disable()
+            try:
+                with wp.ScopedCapture() as capture:
+                    launch_all()
+            finally:
+                if collects:
+                    gc.enable()
         return capture.graph
 
     def launch(self, graph: Any) -> None:

@@ -234,6 +234,14 @@ class RunDirectory:
             )
         return scheduler, metrics
 
+    def read_finished(self, cfg: SearchCfg) -> Archive | None:
+        """What a search found that has done its iterations, and whose checkpoint was taken away; None of any other."""
+        if not (self.path / ARCHIVE_FILE).exists() or (self.path / CHECKPOINT_FILE).exists() or not self.exists():
+            return None
+        self._check_settings(self.path, as_settings(self.read_cfg()), cfg)
+        archive = read_archive(self.path)
+        return archive if archive.iterations == self.read_summary().get("iterations") == cfg.iterations else None
+
     @staticmethod
     def _check_settings(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
         if different := differences(settings, as_settings(cfg)):

@@ -107,6 +107,14 @@ def test_a_finished_search_crosses_nothing_writes_what_is_lost_and_keeps_what_wa
     judged = (path / "archive.npz").read_bytes()
     assert run(path, opener=never).fresh is not None
     assert (path / "archive.npz").read_bytes() == judged
+    saved = (path / "checkpoint.bin").read_bytes()
+    (path / "checkpoint.bin").unlink()  # the largest file by far, which only more iterations need
+    assert run(path, opener=never).fresh is not None
+    with pytest.raises(ValueError, match=r"checkpoint\.bin is lost"):
+        run(path, iterations=3)
+    with pytest.raises(ValueError, match="other settings: seed"):
+        run(path, seed=4)
+    (path / "checkpoint.bin").write_bytes(saved)
     assert run(path, iterations=3).fresh is None  # there are other elites now
 
 
