@@ -1,5 +1,8 @@
 """The simulation as a machine: torques, steps, randomisation and errors."""
 
+import gc
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -85,3 +88,20 @@ def test_devices():
     for name in ("tpu", missing):
         with pytest.raises(ValueError, match=f"device .{name}"):
             resolve_device(name)
+
+
+def test_no_garbage_is_collected_while_a_graph_is_recorded(device):
+    # Python collects garbage at any time, and freeing what holds memory of the GPU can spoil a recording.
+    collects = []
+
+    def launch():
+        collects.append(gc.isenabled())
+        if len(collects) == 4:
+            raise ValueError("no such kernel")
+
+    sim = SimpleNamespace(device=device)
+    Simulation.capture(sim, launch)
+    assert collects == [True, False] and gc.isenabled()
+    with pytest.raises(ValueError, match="no such kernel"):
+        Simulation.capture(sim, launch)
+    assert collects == [True, False] * 2 and gc.isenabled()

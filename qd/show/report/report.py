@@ -75,6 +75,8 @@ def write_report(
             opened_run, ranking, crosser, heads, others, recordings, episodes=episodes, pictured=not no_pictures
         )
         missing += [no_pictures] if no_pictures else []
+        for number, case in cases.items():
+            case["film"] = opened_run.command("film", elite=number, policy=policy)
         missing += [f"All crossings of elite {n} were invalid this time." for n in (*heads, *others) if n not in cases]
     return publish_page(
         out, "search.html", **content, missing=missing, compared=compared,
@@ -110,8 +112,7 @@ def cross_cases(
     ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short. What the
     template takes of each: its number, name and verdict, the ``source`` of the picture at the moment of failure
     ``time_s`` [s], empty without pictures, the ``conditions`` in words, who crosses ``beside`` it, if anybody, the
-    source of the ``figure`` with paths and profile, empty in short, the table of its ``rates``, and the command that
-    films it.
+    source of the ``figure`` with paths and profile, empty in short, and the table of its ``rates``.
     """
     files, cases = opened_run.certifiers(), dict[int, dict[str, Any]]()
     names = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
@@ -160,7 +161,6 @@ def _case(
         "beside": beside,
         "figure": figure_source(draw_crossing(recording, title)) if whole else "",
         "rates": _rates(ranking, archive, row, arrived),
-        "film": opened_run.command("film", elite=number),
     }
 
 
