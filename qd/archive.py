@@ -182,12 +182,12 @@ class Archive(Evaluation):
     def robust(self) -> NDArray[np.bool_]:
         """Whether a fault is one under varied conditions too, shape (N,).
 
-        The controller fails in at least half of them, and one with a certificate crosses in at least half.
+        The controller crosses in under half of them, and one with a certificate in at least half.
         """
         faults = self.counts
         if faults.varied_outcomes is None or faults.certifier_varied_outcomes is None:
             return np.zeros(len(self), bool)
-        fails = goal_rates(faults.varied_outcomes) <= 1.0 - FAILING_GOAL_RATE
+        fails = goal_rates(faults.varied_outcomes) < FAILING_GOAL_RATE
         crosses = faults.certificates() & (goal_rates(faults.certifier_varied_outcomes) >= FAILING_GOAL_RATE)
         return self.is_fault & fails & crosses.any(axis=1)
 

@@ -169,8 +169,8 @@ class Judge(_OnRun):
     controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
     of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. varied: faults
     are crossed again under 20 draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault
-    is robust if the controller still fails in half of them, and another still crosses. Crossings are kept, so the same
-    command goes on after Ctrl-C.
+    is robust if the controller still crosses under half of them, and another at least half. Crossings are kept, so the
+    same command goes on after Ctrl-C.
     """
 
     stages: tuple[Literal["fresh", "resolved", "others", "varied"], ...] = ("fresh", "resolved", "others")

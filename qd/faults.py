@@ -32,12 +32,13 @@ OF_VARIED = ("crossed_varied", "robust")
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
     """What fresh episodes say of an archive, as reports have it."""
     std, corrected = fresh.penalty_std[fresh.valid].sum(axis=1), fresh.corrected_elites()
+    families = None if archive.family is None else archive.family[fresh.valid]
     return {
         "reevaluated": len(fresh.reproduced),
         "elites_reproduced": int(fresh.reproduced.sum()),
         "elites_same_cell": int((fresh.valid & (fresh.cell == archive.cell)).sum()),
         "mean_std": float(std.mean()) if len(std) else None,
-        "mean_std_interval": bootstrap_interval(std, 0),
+        "mean_std_interval": bootstrap_interval(std, 0, families=families),
         "mean_fitness_corrected": float(fresh.fitness[fresh.valid].mean()) if len(std) else None,
         "corrected_elites": len(corrected),
         "corrected_coverage": len(corrected) / archive.cells.num_cells,

@@ -241,7 +241,9 @@ def say_what_stops_the_robot(
     """
     if not len(archive):
         return
-    ranking = rank(archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive))
+    ranking = rank(archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive), judged=True)
+    if not len(ranking.elites):
+        return
     say((summary_of(ranking, archive), "bold"), "." if archive.fresh else ", as found, not crossed again.")
     number = ranking.worst(1)[0]
     if ranking.elites.failing.any():

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from kernels.episode import Outcome
-from sim.files.intervals import bootstrap_interval
+from qd.evaluate.labels import RATES as RATE_MEASURES
+from sim.files.intervals import DIFFERENCES, RATES, bootstrap_interval
 from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
 from sim.terrain import CROSSING_TYPES
@@ -49,10 +51,55 @@ def mean_of(values: NDArray[np.float64]) -> float | None:
     return float(known.mean()) if len(known) else None
 
 
-def interval_of(values: NDArray[np.float64], seed: int, families: Families) -> list[float] | None:
+def interval_of(
+    values: NDArray[np.float64], seed: int, families: Families, bounds: tuple[float, float] | None
+) -> list[float] | None:
     """95 % interval of :func:`mean_of`: bootstrap over terrains, or over their families."""
     known = ~np.isnan(values)
-    return bootstrap_interval(values[known], seed, families=of_terrains(families, known))
+    return bootstrap_interval(values[known], seed, families=of_terrains(families, known), bounds=bounds)
+
+
+def bounds_of(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
+    """Where a measure lies, or differences of it; None of one without bounds."""
+    return (DIFFERENCES if differences else RATES) if measure in RATE_MEASURES else None
+
+
+def kind_mean(
+    values: Sequence[NDArray[np.float64]], families: Families, seed: int, measure: str = "goal"
+) -> dict[str, Any] | None:
+    """What a measure is in the mean for one kind of controller, or how much more it is for the first of two kinds.
+
+    Args:
+        values: Of the trainings of one kind or of two on the terrains, each of shape (num_trainings, num_terrains).
+        families: Of terrains that are not independent.
+        seed: Of the bootstrap.
+        measure: Which one of :data:`qd.evaluate.labels.MEASURES` or of the certified terrains.
+
+    Returns:
+        ``mean``, its 95 % ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain
+        that is valid for all. The variance is that over families, by the bootstrap, and that over the trainings of each
+        kind; the interval is Student's with Satterthwaite's degrees of freedom (1946), and no narrower than the
+        bootstrap's. One training says nothing of others.
+    """
+    known = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
+    if not known.any():
+        return None
+    of_seeds = [sign * kind[:, known] for sign, kind in zip((1.0, -1.0), values, strict=False)]
+    on_terrains = np.sum([kind.mean(axis=0) for kind in of_seeds], axis=0)
+    bounds = bounds_of(measure, differences=len(of_seeds) > 1)
+    limits = interval_of(on_terrains, seed, of_terrains(families, known), bounds)
+    parts = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in of_seeds if len(kind) > 1]
+    of_families = 0.0 if limits is None else ((limits[1] - limits[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2
+    variance = of_families + sum(part for part, _ in parts)
+    spread = sum(part**2 / freedom for part, freedom in parts)
+    freedom = variance**2 / spread if spread > 0.0 else np.inf
+    mean, half = float(on_terrains.mean()), float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+    ends = [[mean - half, mean + half]] if parts else []
+    ends += [] if limits is None else [limits]
+    interval = [min(low for low, _ in ends), max(high for _, high in ends)] if ends else None
+    if interval and bounds:
+        interval = np.clip(interval, *bounds).tolist()
+    return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in of_seeds]}
 
 
 def of_terrains(families: Families, chosen: NDArray[np.bool_]) -> Families:
@@ -95,7 +142,7 @@ def summarise(
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
     everywhere = np.ones(len(result.outcome), bool)
     summary = _group(rates, everywhere)
-    summary |= {f"{name}_interval": interval_of(values, seed, None) for name, values in rates.items()}
+    summary |= {f"{name}_interval": interval_of(values, seed, None, RATES) for name, values in rates.items()}
     summary["episodes"] = int(result.outcome.size)
     ends = [outcome for outcome in Outcome if outcome != Outcome.TILT]
     summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in ends}

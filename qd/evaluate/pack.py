@@ -32,7 +32,7 @@ from qd.workers.evaluator import Compute, check_policy
 from sim.bank import heights_of
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
-from sim.files.intervals import wilson_interval
+from sim.files.intervals import RATES, wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
 from sim.policy.spec import about_controllers, crosser_name, is_same
@@ -318,7 +318,7 @@ def rates_over_all(abouts: Sequence[About], controller: str, seed: int) -> dict[
     summary: dict[str, Any] = {}
     for name in _RATES:
         values = _rates(abouts, controller, name)
-        summary |= {f"{name}_rate": mean_of(values), f"{name}_interval": interval_of(values, seed, families)}
+        summary |= {f"{name}_rate": mean_of(values), f"{name}_interval": interval_of(values, seed, families, RATES)}
     goal = _rates(abouts, controller, "goal")
     failing, valid = goal < FAILING_GOAL_RATE, ~np.isnan(goal)
     return summary | {

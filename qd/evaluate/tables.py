@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, RATES
-from qd.evaluate.measures import Families, Measured, interval_of, mean_of, of_terrains
+from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES
+from qd.evaluate.measures import Measured, bounds_of, interval_of, kind_mean, mean_of, of_terrains
 from qd.evaluate.sets import TerrainSet
 from qd.fitness import FAILING_GOAL_RATE
 from sim.files.atomic import read_json
-from sim.files.intervals import t_interval, wilson_interval
+from sim.files.intervals import wilson_interval
 from sim.files.records import check_robot
 from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
@@ -32,8 +32,8 @@ Tables = dict[str, Any]
 - ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean over the set's terrains; ``certified_goal``
   and ``certified_success`` over its certified terrains alone; ``penalties`` by penalty, scaled.
 - ``intervals``: measure -> set -> controller -> 95 % interval, None where nothing is known of the spread.
-- ``over_seeds``: measure -> set -> kind of which there are several controllers -> ``mean``, ``interval`` (t) and
-  ``values``.
+- ``over_seeds``: measure -> set -> kind of which there are several controllers -> ``mean``, ``interval`` over
+  terrains and controllers, and ``values`` of these.
 - ``certified``: set -> how many ``terrains``; ``certifiers``, how many each of them certifies; and ``chosen_by``,
   controller -> ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
 - ``differences``: set -> ``first -> second`` -> ``compared`` terrains, which are valid for both; ``mended``,
@@ -84,15 +84,15 @@ def make_tables(
     seed: int,
 ) -> Tables:
     """Everything that the tables say of crossings."""
-    means = _statistics(crossed, sets, lambda values, _: mean_of(values))
+    means = _statistics(crossed, sets, lambda values, *_: mean_of(values))
     return {
         "robot": robot.name,
         "episodes": episodes,
         "controllers": controllers,
         **means,
         "certified": _about_certified(sets, controllers),
-        "over_seeds": over_seeds(means, _MEASURES),
-        "intervals": _statistics(crossed, sets, lambda values, families: interval_of(values, seed, families)),
+        "over_seeds": over_seeds(crossed, sets, seed),
+        "intervals": _statistics(crossed, sets, lambda values, *about: interval_of(values, seed, *about)),
         "terrains": {name: len(terrains) for name, terrains in sets.items()},
         "differences": {
             name: {
@@ -104,25 +104,30 @@ def make_tables(
     }
 
 
-def _statistics(
-    crossed: Crossed, sets: Mapping[str, TerrainSet], statistic: Callable[[NDArray[np.float64], Families], Any]
-) -> dict[str, Any]:
-    """Each measure and ``penalties``: set -> controller -> a statistic of the terrains' values and families."""
+def _statistics(crossed: Crossed, sets: Mapping[str, TerrainSet], statistic: Callable[..., Any]) -> dict[str, Any]:
+    """Each measure and ``penalties``: set -> controller -> a statistic of the terrains' values, families and bounds."""
     tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
     for name, row in crossed.items():
-        families, certified = sets[name].families, sets[name].certified
-        everywhere = np.ones(len(sets[name]), bool)
-        groups = [(key, key, everywhere) for key in MEASURES]
-        if certified is not None:
-            groups += [(key, measure, certified) for key, measure in CERTIFIED.items()]
-        for key, measure, member in groups:
-            kin = of_terrains(families, member)
-            tables[key][name] = {who: statistic(measured.values[measure][member], kin) for who, measured in row.items()}
+        families = sets[name].families
+        for key, measure, member in _groups(sets[name]):
+            about = of_terrains(families, member), bounds_of(measure)
+            tables[key][name] = {
+                who: statistic(measured.values[measure][member], *about) for who, measured in row.items()
+            }
         tables["penalties"][name] = {
-            who: {key: statistic(values, families) for key, values in measured.penalties.items()}
+            who: {key: statistic(values, families, None) for key, values in measured.penalties.items()}
             for who, measured in row.items()
         }
     return tables
+
+
+def _groups(terrains: TerrainSet) -> list[tuple[str, str, NDArray[np.bool_]]]:
+    """Key of each number of a set, the measure that it is of, and on which of its terrains, shape (T,)."""
+    everywhere = np.ones(len(terrains), bool)
+    groups = [(key, key, everywhere) for key in MEASURES]
+    if terrains.certified is not None:
+        groups += [(key, measure, terrains.certified) for key, measure in CERTIFIED.items()]
+    return groups
 
 
 def _about_certified(
@@ -167,7 +172,8 @@ def difference(before: Measured, after: Measured, terrains: TerrainSet, seed: in
         "newly_broken": {**changed(broken), "clear": int((broken & apart).sum())},
         "fine": {"count": int((both & ~fails & ~then_fails).sum())},
         "gain": {
-            name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, kin)} for name, gain in gains.items()
+            name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, kin, bounds_of(name, differences=True))}
+            for name, gain in gains.items()
         },
     }
 
@@ -210,20 +216,16 @@ def _firsts(names: Iterable[str]) -> list[str]:
     return [first[kind] for kind in dict.fromkeys(map(_kind_of, names))]
 
 
-def over_seeds(tables: Mapping[str, Any], measures: Iterable[str]) -> dict[str, dict[str, dict[str, Any]]]:
+def over_seeds(crossed: Crossed, sets: Mapping[str, TerrainSet], seed: int) -> dict[str, Any]:
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
-    for measure in measures:
-        for name, row in tables[measure].items():
-            for kind in dict.fromkeys(map(_kind_of, row)):
-                values = [value for controller, value in row.items() if _kind_of(controller) == kind]
-                if len(values) < 2:
-                    continue
-                mean = interval = None
-                if None not in values:
-                    mean, interval = sum(values) / len(values), t_interval(np.array(values))
-                    if interval is not None and measure in RATES:
-                        interval = [max(interval[0], 0.0), min(interval[1], 1.0)]
-                summary = {"mean": mean, "interval": interval, "values": values}
-                summaries.setdefault(measure, {}).setdefault(name, {})[kind] = summary
+    for name, row in crossed.items():
+        for kind in _firsts(row):
+            of_kind = [measured for controller, measured in row.items() if _kind_of(controller) == _kind_of(kind)]
+            for key, measure, member in _groups(sets[name]) if len(of_kind) > 1 else ():
+                values = np.array([measured.values[measure][member] for measured in of_kind])
+                mean = kind_mean([values], of_terrains(sets[name].families, member), seed, measure)
+                summary = {part: mean and mean[part] for part in ("mean", "interval")}
+                summary["values"] = [mean_of(of_one) for of_one in values]
+                summaries.setdefault(key, {}).setdefault(name, {})[_kind_of(kind)] = summary
     return summaries

@@ -238,7 +238,8 @@ class Crossings:
             return None
         space = identity(cfg.space, load_space(cfg.space).sha256)
         way = [robot_identity(self.robot), self.robot.penalties, controller, space]
-        way += [cfg.num_replicas, cfg.device.startswith("cuda"), how, cfg.reward, cfg.penalties_from_s]
+        way += [cfg.num_replicas, cfg.device.startswith("cuda"), how, cfg.penalties_from_s]
+        way += [repr(self.robot.training) if cfg.reward else None]  # whose terms the reward is of
         key = hashlib.sha256(json.dumps([*way, code_fingerprint(("kernels", "sim"))]).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = _Stored(self._cache, key, self.robot.penalties)

@@ -12,12 +12,14 @@ import numpy as np
 
 from qd.archive import Archive
 from qd.faults import FRESH_EPISODES, fresh_numbers
+from qd.groups import families_of
 from qd.judge import FRESH_STREAM, elite_seeds, fresh_values
 from qd.run.settings import SearchCfg
 from qd.search import search
 from qd.workers.cross import Crossings
 from qd.workers.shards import arrays_of
 from results.make.common import ONCE, parse
+from sim.spaces.registry import get_space
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
 MOST_ELITES, STREAM = 200, 3  # of the random numbers that choose them
@@ -27,6 +29,7 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossin
     """What fresh episodes say of some of the elites that a search has found so far."""
     rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(STREAM,)))
     some = archive.rows(np.sort(rng.choice(len(archive), min(len(archive), MOST_ELITES), replace=False)))
+    some = replace(some, family=families_of(some.genes, get_space(cfg.space)))
     times = -(-FRESH_EPISODES // cfg.replicas)
     genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=FRESH_STREAM)
     label = "fresh episodes"
@@ -37,7 +40,7 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossin
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Runs both searches and writes their mean STD with 95 % bootstrap intervals over elites."""
+    """Runs both searches and writes their mean STD with 95 % bootstrap intervals over families."""
     script = parse(__doc__, argv, "ablation.json")
     every = 1 if script.small else 6
     cfg = script.search_cfg(18, seed=script.seed, **ONCE)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.fitness import FAILING_GOAL_RATE
+from qd.groups import families_of
 from qd.workers.cross import Crossings, How
 from results.make.common import Script, agreement, crossing_rates, parse
-from sim.spaces.registry import SUPER_GAUSSIAN
+from sim.spaces.registry import SUPER_GAUSSIAN, get_space
 
 KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else
 HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it
@@ -46,12 +47,12 @@ def cross_in_all_ways(
     }
 
 
-def compare(outcome: dict[str, NDArray[np.uint8]], seed: int) -> dict[str, Any]:
+def compare(outcome: dict[str, NDArray[np.uint8]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
     """Rates at the search's settings minus those of the other ways; ``both_resolved``: ours resolved minus MuJoCo C."""
     pairs = {name: ("search", name) for name in ("again", "resolved", "mujoco_c")}
     pairs["both_resolved"] = ("resolved", "mujoco_c")
     return {
-        name: agreement(outcome[ours][: len(outcome[theirs])], outcome[theirs], seed)
+        name: agreement(outcome[ours][: len(outcome[theirs])], outcome[theirs], seed, families[: len(outcome[theirs])])
         for name, (ours, theirs) in pairs.items()
     }
 
@@ -75,7 +76,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     }
     return script.write(
         {
-            **{name: compare(of_set, script.seed) for name, of_set in outcome.items()},
+            **{
+                name: compare(of_set, families_of(genes, get_space(space)), script.seed)
+                for (name, of_set), (genes, space) in zip(outcome.items(), sets.values(), strict=True)
+            },
             "failing": int(fails["search"].sum()),
             "failing_again": int((fails["search"] & fails["again"]).sum()),
             "failing_resolved": int((fails["search"] & fails["resolved"]).sum()),

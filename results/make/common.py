@@ -28,7 +28,7 @@ from qd.search import search
 from qd.workers.evaluator import Compute
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
-from sim.files.intervals import bootstrap_interval, t_interval
+from sim.files.intervals import DIFFERENCES, bootstrap_interval, t_interval
 from sim.files.records import identity, provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
@@ -124,11 +124,11 @@ class Script:
             raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
         return content["dose"]
 
-    def run_of_archive(self) -> Path:
-        """The run of the published archive to work in; a copy of what is published where the run itself is gone."""
-        run, published = self.runs / "archive", self.results / "archive"
+    def run_of_archive(self, name: str = "archive") -> Path:
+        """The run of a published archive to work in; a copy of what is published where the run itself is gone."""
+        run, published = self.runs / name, self.results / name
         if self.small or not is_same_file(run / "archive.npz", published / "archive.npz"):
-            run = self.runs / "copy"
+            run = self.runs / "copy" / name
             if not all(
                 is_same_file(run / name, published / name) for name in ("archive.npz", "archive.json", "config.json")
             ):
@@ -311,27 +311,31 @@ def crossing_rates(outcome: NDArray[np.uint8], kind: str) -> NDArray[np.float64]
     return terrain_means(hit, counted_episodes((outcome == Outcome.INVALID) | (outcome == Outcome.RUNNING)))
 
 
-def agreement(ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int) -> dict[str, Any]:
+def agreement(
+    ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int, families: NDArray[np.int64] | None = None
+) -> dict[str, Any]:
     """How far rates of terrains lie from those of other crossings of the same terrains.
 
     Args:
         ours: Outcomes, shape (num_terrains, num_episodes).
         theirs: Outcomes of the other crossings, shape (num_terrains, any number of episodes).
         seed: Draws the resamples.
+        families: Of terrains that are not independent, shape (num_terrains,).
 
     Returns:
         ``terrains``, those that are valid in both; of each kind the mean of our rate minus theirs
-        (``success_bias``) with its 95 % bootstrap interval over terrains (``success_bias_interval``), and the mean of
+        (``success_bias``) with its 95 % bootstrap interval over families (``success_bias_interval``), and the mean of
         its size (``success_difference``), None without terrains.
     """
     numbers: dict[str, Any] = {}
     for kind in ("success", "goal"):
         apart = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
-        apart = apart[np.isfinite(apart)]
+        known = np.isfinite(apart)
+        apart, kin = apart[known], None if families is None else families[known]
         numbers |= {
             "terrains": len(apart),
             f"{kind}_bias": float(apart.mean()) if len(apart) else None,
-            f"{kind}_bias_interval": bootstrap_interval(apart, seed),
+            f"{kind}_bias_interval": bootstrap_interval(apart, seed, families=kin, bounds=DIFFERENCES),
             f"{kind}_difference": float(np.abs(apart).mean()) if len(apart) else None,
         }
     return numbers

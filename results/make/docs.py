@@ -90,9 +90,6 @@ def rate(robot: str, measure: str, terrains: str, controller: str, *, short: boo
     tables = read(f"results/{robot}/tables.json")
     if controller == "hardened" and controller not in tables["goal"]["hand_crafted"]:
         tables = read(f"results/{robot}/hardened.json")
-    kind = tables.get("kinds", {}).get(terrains, {}).get(controller)  # over terrains and seeds
-    if measure == "goal" and kind:
-        return value_words(kind["goal"], None if short else kind["interval"], ".3f")
     seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
     value = seeds.get("mean", tables[measure].get(terrains, {}).get(controller))
     limits = seeds.get("interval", tables["intervals"][measure].get(terrains, {}).get(controller))
@@ -188,7 +185,7 @@ def noise() -> str:
     names = ("episodes", "elites", "corrected_elites", "failing", "families")
     columns: dict[str, Column] = {in_words(name): name for name in names}
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
-    columns["at most"] = shown("same_cell_ceiling", ".2f")
+    columns["two fresh lots"] = shown("two_lots_agree", ".2f")
     return table(rows, columns)
 
 
@@ -305,14 +302,23 @@ def sizes() -> str:
 
 
 def size_words(half: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
-    """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those in rows."""
+    """A size that half get over: sharp to a tenth of it, or its 95 % interval, or that it lies beyond those in rows.
+
+    Where half get over a harder one again, the interval reaches to that.
+    """
     obstacle = ("element", "controller")
-    tried = [row["value"] for row in rows if all(row[key] == half[key] for key in obstacle)]
+    of_half = [row for row in rows if all(row[key] == half[key] for key in obstacle)]
+    tried = [row["value"] for row in of_half]
     value, (low, high), form = half["value"], half["interval"], ".3f" if half["unit"] == "s" else ".2f"
     if value is None:
         way = "over" if tried[0] > tried[-1] else "under"
         return {"first": f"{way} {tried[0]:g}", "last": f"({tried[-1]:g})"}.get(half.get("beyond", "last"), NONE)
-    if low is not None and high is not None and high - low <= 0.2 * value:
+    side = 1 if tried[0] < tried[-1] else -1
+    again = [row["value"] for row in of_half if side * (row["value"] - value) > 0 and (row["goal_rate"] or 0.0) >= 0.5]
+    if again:
+        low = low if low is None else min(low, again[-1])
+        high = high if high is None else max(high, again[-1])
+    elif low is not None and high is not None and high - low <= 0.2 * value:
         return f"{value:{form}}"
     return " to ".join("..." if limit is None else f"{limit:{form}}" for limit in (low, high))
 

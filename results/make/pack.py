@@ -1,8 +1,12 @@
-"""The published pack, sim/robots/<robot>/pack: 100 certified terrains, and how often controllers cross them."""
+"""The published pack, sim/robots/<robot>/pack: 100 certified terrains, and how often controllers cross them.
+
+They are of the independent search, which no published controller has trained on, nor on kin of it.
+"""
 
 from collections.abc import Sequence
 
 from qd.evaluate.pack import make_pack
+from qd.judge import judge
 from results.make.common import parse, published_controllers
 
 
@@ -10,8 +14,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Chooses the terrains and lets the published controllers cross them."""
     script = parse(__doc__, argv, "pack/pack.json", published="sim/robots")
     size, episodes = (2, 2) if script.small else (100, 20)
+    run = script.run_of_archive("archive" if script.small else "independent")
+    if not script.small:
+        judge(run, stages=("resolved", "others"), compute=script.compute)
     make_pack(
-        script.run_of_archive(), published_controllers(script), compute=script.compute, size=size, episodes=episodes,
+        run, published_controllers(script), compute=script.compute, size=size, episodes=episodes,
         seed=script.seed, out=script.out.parent,
     )  # fmt: skip
 

@@ -1,8 +1,8 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
 Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds, and some in a million.
-Then all elites cross
-two lots of 40 fresh episodes. The share that both put into one cell is what no search could exceed with these elites.
+Then all elites cross two lots of 40 fresh episodes. The share that both put into one cell (``two_lots_agree``) is about
+what an archive has whose elites are as well known as by 40 episodes.
 """
 
 from collections.abc import Sequence
@@ -110,7 +110,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
         "settings": {**asdict(cfg.scheduler), "replicas": cfg.replicas, "iterations": cfg.iterations},
         **{count: numbers[count] for count in counts},
         "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
-        "same_cell_ceiling": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
+        "two_lots_agree": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
         "failing_corrected": int(archive.failing[corrected].sum()),
         "families_corrected": len(
             np.unique(families_of(archive.genes[corrected], get_space(archive.space, archive.space_sha256)))

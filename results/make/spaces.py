@@ -20,7 +20,7 @@ COUNTS = (
 
 def causes_of(archive: Archive) -> dict[str, int]:
     """How many elites fail by which cause, the commonest first."""
-    ranking = rank(archive, get_space(archive.space, archive.space_sha256))
+    ranking = rank(archive, get_space(archive.space, archive.space_sha256), judged=True)
     return {cause: len(rows) for cause, rows in ranking.by_cause().items()}
 
 

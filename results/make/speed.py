@@ -195,7 +195,7 @@ def measure_agreement(script: Script) -> dict[str, Any]:
     genes = SUPER_GAUSSIAN.hard_random(terrains, script.seed)
     with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
         outcome = cross_in_all_ways(script, crossings, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=episodes)
-    return {"agreement": {"episodes": episodes, **compare(outcome, script.seed)}}
+    return {"agreement": {"episodes": episodes, **compare(outcome, np.arange(terrains), script.seed)}}
 
 
 def time_cpu(script: Script) -> dict[str, Any]:

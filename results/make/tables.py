@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
+from qd.archive import read_archive
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
-from qd.evaluate.sets import TerrainSet, make_sets, paper_terrains
+from qd.evaluate.measures import kind_mean
+from qd.evaluate.sets import TerrainSet, elites_sha256, make_sets, paper_terrains
 from results.make.common import (
     SEEDS,
     Script,
@@ -28,7 +29,6 @@ from results.make.common import (
     read_made,
 )  # fmt: skip
 from sim.files.atomic import write_atomically
-from sim.files.intervals import bootstrap_interval
 from sim.files.npz import npz_bytes
 from sim.policy.spec import controller_hash
 from train.cfg import LARGE, FinetuneCfg, RunCfg
@@ -52,7 +52,9 @@ def train(script: Script, cfg: FinetuneCfg, kind: str, seed: int, run: Path) -> 
     policy = run / "policy.pt"
     record = read_made(policy.with_suffix(".train.json"))
     made_here = record.get("sources_sha256") == script.origin["sources_sha256"] and policy.exists()
-    if made_here and not (run / CHECKPOINT).exists() and cfg.iterations in (0, record.get("iterations")):
+    elites = [elites_sha256(read_archive(Path(one))) for one in cfg.archive]
+    is_alike = [one["sha256"] for one in record.get("settings", {}).get("elites", ())] == elites
+    if made_here and is_alike and not (run / CHECKPOINT).exists() and cfg.iterations in (0, record.get("iterations")):
         return str(policy)  # brought here from where it was trained, without its checkpoint
     return str(finetune(script.robot, cfg, run, RunCfg(device=script.device)))
 
@@ -70,35 +72,6 @@ def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str
     return controllers
 
 
-def kind_mean(rates: Sequence[NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any] | None:
-    """How often one kind of controller reaches the goal, or how much more often the first of two.
-
-    Args:
-        rates: Goal rates of the seeds of one kind or of two on the terrains, each of shape (num_seeds, num_terrains).
-        families: Of terrains that are not independent, shape (num_terrains,).
-        seed: Of the bootstrap.
-
-    Returns:
-        ``goal``, its 95 % ``interval`` and the number of ``seeds`` of each kind; None without a terrain that is valid
-        for all. The variance is that over families, by the bootstrap, and that over the seeds of each kind; the
-        interval is Student's with Satterthwaite's degrees of freedom (1946). One seed says nothing of the others.
-    """
-    known = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in rates])
-    if not known.any():
-        return None
-    of_seeds = [sign * kind[:, known] for sign, kind in zip((1.0, -1.0), rates, strict=False)]
-    mean = np.sum([kind.mean(axis=0) for kind in of_seeds], axis=0)
-    limits = bootstrap_interval(mean, seed, families=families[known])
-    parts = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in of_seeds if len(kind) > 1]
-    of_families = 0.0 if limits is None else ((limits[1] - limits[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2
-    variance = of_families + sum(part for part, _ in parts)
-    spread = sum(part**2 / freedom for part, freedom in parts)
-    freedom = variance**2 / spread if spread > 0.0 else np.inf
-    goal, half = float(mean.mean()), float(stdtrit(freedom, 0.975) * np.sqrt(variance))
-    interval = np.clip([goal - half, goal + half], 1.0 - len(of_seeds), 1.0).tolist() if limits or parts else None
-    return {"goal": goal, "interval": interval, "seeds": [len(kind) for kind in of_seeds]}
-
-
 def by_kind(rates: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """Goal rates of controllers by their kind, whose further seeds are called ``C-G@1``: shape (num_seeds, T)."""
     kinds: dict[str, list[NDArray[np.float64]]] = {}
@@ -108,11 +81,12 @@ def by_kind(rates: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.fl
 
 
 def differences_of(kinds: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
-    """:func:`kind_mean` of every two kinds on one set, the later one first: ``C-G - C-HR``."""
-    return {
-        f"{second} - {first}": kind_mean([kinds[second], kinds[first]], families, seed)
-        for first, second in itertools.combinations(kinds, 2)
-    }
+    """How much more often each kind reaches the goal on one set than one before it: ``C-G - C-HR``."""
+    differences = {}
+    for first, second in itertools.combinations(kinds, 2):
+        mean = kind_mean([kinds[second], kinds[first]], families, seed)
+        differences[f"{second} - {first}"] = mean and {"goal": mean.pop("mean"), **mean}
+    return differences
 
 
 def families_of(terrains: TerrainSet) -> NDArray[np.int64]:
@@ -169,7 +143,6 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         for name, row in crossed.items()
     }
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
-    kinds = {name: by_kind(of_set) for name, of_set in rates.items()}
     family = {name: families_of(of_set) for name, of_set in sets.items()}
     arrays |= {f"{name}_family": of_set for name, of_set in family.items()}
     arrays["controllers"] = np.array(list(controllers))
@@ -177,13 +150,10 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
     script.add(
         tables,
         {
-            "kinds": {
-                name: {kind: kind_mean([of_kind], family[name], cfg.seed) for kind, of_kind in kinds[name].items()}
-                for name in sets
-            },
             "differences": {
-                name: tables["differences"][name] | differences_of(kinds[name], family[name], cfg.seed) for name in sets
-            },
+                name: tables["differences"][name] | differences_of(by_kind(rates[name]), family[name], cfg.seed)
+                for name in sets
+            }
         },
     )
 

@@ -6,14 +6,20 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtr, stdtrit
 
+RATES, DIFFERENCES = (0.0, 1.0), (-1.0, 1.0)
+"""Bounds of rates, and of differences of rates."""
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
 _BOOTSTRAP_DRAWS = 10_000
+_FEW = 10  # families that differ from the others: from so many on, resampling says how far they may
 
 
-def wilson_interval(hits: int, count: int) -> tuple[float, float]:
-    """Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any."""
+def wilson_interval(hits: float, count: int) -> tuple[float, float]:
+    """Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any.
+
+    Trials that are rates themselves may make a fraction of a hit; they differ less than hits and misses.
+    """
     if not 0 <= hits <= count:
         raise ValueError(f"a rate needs 0 <= hits <= count, got {hits} of {count}")
     if count == 0:
@@ -43,12 +49,21 @@ def resamples(count: int, seed: int, draws: int = _BOOTSTRAP_DRAWS) -> NDArray[n
 
 
 def bootstrap_interval(
-    values: NDArray[np.floating], seed: int, *, families: NDArray[np.int64] | None = None
+    values: NDArray[np.floating],
+    seed: int,
+    *,
+    families: NDArray[np.int64] | None = None,
+    bounds: tuple[float, float] | None = None,
 ) -> list[float] | None:
     """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
-    Terrains of one family, by their numbers (num_terrains,), are not independent: they are drawn together.
+    Terrains of one family, by their numbers (num_terrains,), are not independent: they are drawn together. The fewer
+    families, the farther out are the quantiles (the expanded percentile interval of Hesterberg 2015).
+
+    Where nearly all values are alike, as rates of 1 are, resamples are too: what is rare may not be among the terrains.
+    With ``bounds``, :data:`RATES` or :data:`DIFFERENCES`, the interval then reaches as far as Wilson's of so many
+    families; of a difference the ends are put together as by Newcombe (1998, method 10).
     """
     family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
     count = int(family.max(initial=-1)) + 1
@@ -56,7 +71,29 @@ def bootstrap_interval(
         return None
     drawn = resamples(count, seed)
     means = (drawn @ np.bincount(family, weights=values)) / (drawn @ np.bincount(family).astype(np.float64))
-    return [float(limit) for limit in np.quantile(means, [0.025, 0.975])]
+    tail = ndtr(-stdtrit(count - 1, 0.975) * math.sqrt(count / (count - 1)))
+    low, high = np.quantile(means, [tail, 1.0 - tail])
+    if bounds is not None:
+        least, most = _where_few_differ(values, family, count, bounds)
+        low, high = min(low, least), max(high, most)
+    return [float(low), float(high)]
+
+
+def _where_few_differ(
+    values: NDArray[np.floating], family: NDArray[np.int64], count: int, bounds: tuple[float, float]
+) -> tuple[float, float]:
+    """How far the mean may lie where few of ``count`` families differ from 0 or 1; the mean itself where many do."""
+    mean = float(values.mean())
+    apart = values - (1.0 if bounds == RATES and mean > 0.5 else 0.0)
+    if len(np.unique(family[apart != 0.0])) >= _FEW:
+        return mean, mean
+    more, less = (float(np.maximum(side, 0.0).mean()) for side in (apart, -apart))
+    (more_low, more_high), (less_low, less_high) = (wilson_interval(share * count, count) for share in (more, less))
+    low, high = (
+        mean - math.hypot(more - more_low, less_high - less),
+        mean + math.hypot(more_high - more, less - less_low),
+    )
+    return max(low, bounds[0]), min(high, bounds[1])
 
 
 def value_words(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:

@@ -169,6 +169,11 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
     assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
     assert numbers_in(path)["robust"] == numbers_in(path)["crossed_varied"] - 1 == len(rows) - 1 > 0
     assert np.array_equal(read_archive(path).robust, archive.robust)
+    half = archive.faults.varied_outcomes.copy()
+    half[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
+    assert not dataclasses.replace(archive, faults=dataclasses.replace(archive.faults, varied_outcomes=half)).robust[
+        rows[-1]
+    ]
     # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
     assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
     assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)

@@ -17,7 +17,6 @@ import pytest
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
 from results.make import bare, common, conditions, docs, search_noise, speed, tables, train_speed
-from sim.files.intervals import t_interval
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -349,41 +348,21 @@ def test_bias_and_distance_are_of_terrains_that_both_have():
     numbers = common.agreement(OURS, THEIRS, seed=0)
     assert numbers["terrains"] == 2
     assert numbers["success_bias"] == -0.25 and numbers["success_difference"] == 0.25
-    assert numbers["success_bias_interval"] == pytest.approx([-0.25, -0.25])
+    low, high = numbers["success_bias_interval"]  # two terrains say little, though they agree
+    assert -1.0 < low < -0.5 and 0.2 < high < 0.5
     assert numbers["goal_bias"] == 0.0 and numbers["goal_difference"] == 0.25
-    assert numbers["goal_bias_interval"] == pytest.approx([-0.25, 0.25])
+    low, high = numbers["goal_bias_interval"]
+    assert -0.8 < low < -0.25 and high == pytest.approx(-low)
+    assert common.agreement(OURS, THEIRS, seed=0, families=np.zeros(4, np.int64))["goal_bias_interval"] is None
     numbers = common.agreement(OURS[2:], THEIRS[2:], seed=0)
     assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}
 
 
-def test_differences_of_kinds_hold_families_and_seeds():
-    # Two families of two terrains: the first kind crosses all of one and half of the other, the second none.
-    first, families = np.array([[1.0, 1.0, 0.5, 0.5]]), np.array([7, 7, 9, 9])
-    row = tables.kind_mean([first, np.zeros((2, 4))], families, 0)
-    assert row["goal"] == pytest.approx(0.75) and row["seeds"] == [1, 2]
-    assert row["interval"] == pytest.approx([0.5, 1.0])  # a quarter of the resamples are of one family alone
-    rates = {"C-HR": first[0], "C-G": np.full(4, 0.52), "C-G@1": np.full(4, 0.5)}
+def test_differences_are_of_the_later_kind_minus_the_earlier():
+    rates = {"C-HR": np.full(24, 0.75), "C-G": np.full(24, 0.52), "C-G@1": np.full(24, 0.5)}
     kinds = tables.by_kind(rates)
-    [(pair, row)] = tables.differences_of(kinds, families, 0).items()
-    assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.51 - 0.75)
-    # Families do not differ here: what is left is Student's interval over two seeds.
-    of_seeds = tables.kind_mean([kinds["C-G"]], families, 0)["interval"]
-    assert of_seeds == pytest.approx(t_interval(np.array([0.52, 0.5])))
-    # A terrain that is invalid for one controller counts for none.
-    first[0, 0] = np.nan
-    assert tables.kind_mean([first, np.zeros((2, 4))], families, 0)["goal"] == pytest.approx(2 / 3)
-    assert tables.kind_mean([np.full((1, 4), np.nan)], families, 0) is None
-
-
-def test_intervals_of_kinds_cover_the_truth():
-    """Of 19 in 20 repetitions, with seeds that differ as trainings do and families that differ more."""
-    rng, families, covered = np.random.default_rng(0), np.arange(60) // 2, 0
-    for _ in range(200):
-        terrains = rng.normal(0.0, 0.2, 30)[families]
-        kinds = [0.5 + terrains * weight + rng.normal(0.0, 0.03, (3, 1)) for weight in (1.0, 0.7)]
-        low, high = tables.kind_mean(kinds, families, 0)["interval"]
-        covered += low <= 0.0 <= high
-    assert 182 <= covered <= 199
+    [(pair, row)] = tables.differences_of(kinds, np.arange(24), 0).items()
+    assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.51 - 0.75) and row["seeds"] == [2, 1]
 
 
 def test_pages_say_what_the_files_say():

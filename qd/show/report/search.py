@@ -16,7 +16,7 @@ from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
-from sim.files.intervals import bootstrap_interval
+from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.records import without_machine
 from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
@@ -77,7 +77,7 @@ def _metrics_of(run: RunDirectory, archive: Archive) -> Metrics:
 
 def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
     """Mean over terrains, with its interval over families where they are not few."""
-    limits = bootstrap_interval(rates, 0, families=families) if len(rates) >= _MIN_TERRAINS else None
+    limits = bootstrap_interval(rates, 0, families=families, bounds=RATES) if len(rates) >= _MIN_TERRAINS else None
     return percent(float(rates.mean())) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")
 
 

@@ -7,12 +7,14 @@ import pytest
 
 from qd.evaluate.measures import (
     interval_of,
+    kind_mean,
     mean_of,
     measure,
     summarise,
     terrain_rates,
     velocity_error,
 )
+from sim.files.intervals import t_interval
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, OUT, result_of
 
 
@@ -45,11 +47,38 @@ def test_everything_is_a_mean_over_valid_episodes():
 def test_means_and_intervals_leave_invalid_terrains_out():
     values = np.array([1.0, 0.0, np.nan, 1.0, 1.0])
     assert mean_of(values) == 0.75 and mean_of(np.array([np.nan])) is None
-    low, high = interval_of(values, 0, None)
-    assert 0.25 <= low < 0.75 < high == 1.0
+    low, high = interval_of(values, 0, None, None)
+    assert 0.0 <= low < 0.75 < high == 1.0
     # Two families: all ones, and the single zero. A quarter of the resamples has the second alone.
-    assert interval_of(values, 0, np.array([0, 1, 2, 0, 0])) == [0.0, 1.0]
-    assert interval_of(values, 0, np.zeros(5, np.int64)) is None  # one family says nothing of its spread
+    assert interval_of(values, 0, np.array([0, 1, 2, 0, 0]), None) == [0.0, 1.0]
+    assert interval_of(values, 0, np.zeros(5, np.int64), None) is None  # one family says nothing of its spread
+
+
+def test_means_of_kinds_hold_families_and_trainings():
+    # Two families of two terrains: the first kind crosses all of one and half of the other, the second none.
+    first, families = np.array([[1.0, 1.0, 0.5, 0.5]]), np.array([7, 7, 9, 9])
+    row = kind_mean([first, np.zeros((2, 4))], families, 0)
+    assert row["mean"] == pytest.approx(0.75) and row["seeds"] == [1, 2]
+    # So few families could have been others: Wilson's interval of 1.5 of 2 is (.20, .97), of 0 of 2 (0, .66).
+    assert row["interval"] == pytest.approx([0.75 - np.hypot(0.75 - 0.198, 0.658), 1.0], abs=2e-3)
+    # A terrain that is invalid for one controller counts for none.
+    first[0, 0] = np.nan
+    assert kind_mean([first, np.zeros((2, 4))], families, 0)["mean"] == pytest.approx(2 / 3)
+    assert kind_mean([np.full((1, 4), np.nan)], families, 0) is None
+    # Families do not differ here: what is left is Student's interval over two trainings.
+    alike = np.array([[0.52], [0.5]]).repeat(24, axis=1)
+    assert kind_mean([alike], np.arange(24) // 2, 0)["interval"] == pytest.approx(t_interval(alike[:, 0]))
+
+
+def test_intervals_of_kinds_cover_the_truth():
+    """Of 19 in 20 repetitions, with trainings that differ as they do and families that differ more."""
+    rng, families, covered = np.random.default_rng(0), np.arange(60) // 2, 0
+    for _ in range(200):
+        terrains = rng.normal(0.0, 0.2, 30)[families]
+        kinds = [0.5 + terrains * weight + rng.normal(0.0, 0.03, (3, 1)) for weight in (1.0, 0.7)]
+        low, high = kind_mean(kinds, families, 0)["interval"]
+        covered += low <= 0.0 <= high
+    assert 182 <= covered <= 199
 
 
 def test_groups():

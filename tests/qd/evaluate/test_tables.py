@@ -61,10 +61,10 @@ def test_values_are_means_over_terrains(report):
 
 
 def test_intervals_over_elites_are_over_families_of_kin(anymal):
-    measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 8 + [0] * 2, of=4))}
-    kin = replace(make_set(10), families=np.array([0] * 4 + [1] * 4 + [2, 3]))
+    measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 32 + [0] * 8, of=4))}
+    kin = replace(make_set(40), families=np.array([0] * 16 + [1] * 16 + [2] * 4 + [3] * 4))
     of_terrains, of_kin = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
-    # Of four families 1 of 16 resamples has nothing but the two that fail; of ten terrains hardly any has 6 that do.
+    # Of four families 1 of 16 resamples has nothing but the two that fail; of 40 terrains hardly any has 20 that do.
     assert of_kin["intervals"]["goal"]["generated"]["base"][0] == 0.0
     assert of_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
 
@@ -72,7 +72,7 @@ def test_intervals_over_elites_are_over_families_of_kin(anymal):
 def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
     assert certified["certified_goal"] == {"generated": {"base": 0.625, "C-G": 0.75, "S": 1.0}}
     assert certified["certified_success"]["generated"] == {"base": 0.625, "C-G": 1.0, "S": 1.0}
-    assert certified["intervals"]["certified_goal"]["generated"]["C-G"] == [0.5, 1.0]
+    assert certified["intervals"]["certified_goal"]["generated"]["C-G"] == [pytest.approx(0.198, abs=1e-3), 1.0]
     # S certifies none of these terrains: its rate is not biased by that.
     chosen_by = {"base": "searched", "C-G": "certifier"}
     about = {"terrains": 2, "certifiers": {"C-G": 2, "S": 0}, "chosen_by": chosen_by}
@@ -96,8 +96,8 @@ def test_a_terrain_is_failed_below_half():
 
 def test_gains_are_means_of_differences_terrain_by_terrain():
     # Goal rates differ by +.5 on every terrain: no spread, however hard the terrains are.
-    before, after = make_measured([0, 5, 10], reward=8.0), make_measured([10, 15, 20], reward=9.5)
-    gain = difference(before, after, SET.rows(np.arange(3)), 0)["gain"]
+    before, after = make_measured([0, 5, 10] * 4, reward=8.0), make_measured([10, 15, 20] * 4, reward=9.5)
+    gain = difference(before, after, make_set(12), 0)["gain"]
     for name, value in (("goal", 0.5), ("reward", 1.5)):
         assert gain[name] == {"mean": pytest.approx(value), "interval": pytest.approx([value, value])}
 
@@ -111,19 +111,29 @@ def test_a_terrain_invalid_to_one_is_not_compared():
 
 
 def test_mean_and_interval_of_a_kind_with_several():
-    tables = {
-        "success": {"near": {"base": 0.5, "C-G": 0.8, "C-G@1": 0.9, "C-G@2": 1.0, "C-HC@7": 0.4}},
-        "goal": {"near": {"base": 0.5, "C-G": 0.7, "C-G@1": None, "C-G@2": 0.9, "C-HC@7": 0.4}},
-        "reward": {"near": {"C-G": 8.0, "C-G@1": 9.0, "C-G@2": 10.0}},
-    }
-    summaries = over_seeds(tables, tables)
-    assert summaries["success"]["near"].keys() == {"C-G"}
-    kind = summaries["success"]["near"]["C-G"]
-    assert kind["mean"] == pytest.approx(0.9) and kind["values"] == [0.8, 0.9, 1.0]
-    # Standard deviation .1, so .1 / sqrt(3) * 4.303 either way; a rate is at most 1, a reward is not.
+    goals = {"base": 10, "C-G": 16, "C-G@1": 18, "C-G@2": 20, "C-HC@7": 8}
+    row = {who: make_measured([count] * 12, reward=count / 2) for who, count in goals.items()}
+    bad = {**row, "C-G@1": make_measured([0] * 12, bad=range(12))}
+    summaries = over_seeds({"near": row, "far": bad}, {"near": make_set(12), "far": make_set(12)}, 0)
+    assert summaries["goal"]["near"].keys() == {"C-G"}
+    kind = summaries["goal"]["near"]["C-G"]
+    assert kind["mean"] == pytest.approx(0.9) and kind["values"] == pytest.approx([0.8, 0.9, 1.0])
+    # Terrains do not differ. Standard deviation .1, so .1 / sqrt(3) * 4.303 either way; a rate is at most 1.
     assert kind["interval"] == pytest.approx([0.9 - 0.2484, 1.0], abs=1e-4)
     assert summaries["reward"]["near"]["C-G"]["interval"] == pytest.approx([9.0 - 2.484, 9.0 + 2.484], abs=1e-3)
-    assert summaries["goal"]["near"]["C-G"]["mean"] is None
+    assert summaries["goal"]["far"]["C-G"] == {
+        "mean": None, "interval": None, "values": [pytest.approx(0.8), None, 1.0],
+    }  # fmt: skip
+
+
+def test_certified_terrains_have_intervals_over_families_and_trainings(anymal):
+    archive = replace(judged_archive(), policy_sha256="f" * 64).rows(np.array([2, 2, 3, 3] * 6))
+    row = {who: make_measured(counts * 6, of=4) for who, counts in {"C-G": [4, 0, 0, 4], "C-G@1": [4, 1, 0, 4]}.items()}
+    elites = replace(make_set(24, 10), elites=archive, families=np.arange(24))
+    summaries = over_seeds({"generated": row}, {"generated": elites}, 0)
+    low, high = summaries["certified_goal"]["generated"]["C-G"]["interval"]
+    assert archive.certified.sum() == 12 and low < 0.35 and high > 0.78  # twelve terrains, half of them crossed
+    assert np.ptp(summaries["certified_goal"]["generated"]["C-G"]["values"]) == pytest.approx(0.125)
 
 
 def test_one_training_is_not_several(tmp_path):
@@ -162,4 +172,4 @@ def test_the_terminal_shows_the_numbers(report, capsys):
     assert "0.833 (" in next(line for line in lines if line.startswith("C-G"))
     # C-G fails terrain 102, as base does; terrain 101 is not compared.
     (row,) = (line.split() for line in lines if line.startswith("generated, base -> C-G"))
-    assert row[4:] == ["0", "(0)", "0", "(0)", "1", "2", "+0.000", "(+0.000", "to", "+0.000)"]
+    assert row[4:] == ["0", "(0)", "0", "(0)", "1", "2", "+0.000", "(-0.658", "to", "+0.658)"]

@@ -1,5 +1,7 @@
 """The crossing service: results of every terrain in order, and what its cache finds, keeps apart and gives up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,19 @@ def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path,
     changed = Robots()
     cross_all(changed, tmp_path)
     assert len(changed.crossed) == len(GENES)
+
+
+def test_a_reward_of_other_weights_is_not_found_and_what_has_no_reward_is(tmp_path):
+    training = replace(ROBOT.training, rewards=replace(ROBOT.training.rewards, tracking_lin_vel=7.0))
+    heavier = replace(ROBOT, training=training)  # as a user edits them in the robot's own file
+    for reward, times in ((True, 2), (False, 1)):
+        crossed = []
+        for robot in (ROBOT, heavier, heavier):
+            opened = Robots()
+            cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute_by(opened, TWO_WORKERS), replicas=20,
+                  cache=tmp_path / str(reward), reward=reward)  # fmt: skip
+            crossed.append(len(opened.crossed))
+        assert crossed == [len(GENES) if time < times else 0 for time in range(3)]
 
 
 @pytest.mark.parametrize("damage", ["flip", "rename"])

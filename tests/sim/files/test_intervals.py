@@ -5,9 +5,18 @@ import io
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.special import ndtr, stdtrit
 
 from sim.files.figures import as_png, new_figure
-from sim.files.intervals import bootstrap_interval, rate_words, t_interval, value_words, wilson_interval
+from sim.files.intervals import (
+    DIFFERENCES,
+    RATES,
+    bootstrap_interval,
+    rate_words,
+    t_interval,
+    value_words,
+    wilson_interval,
+)
 
 
 def test_t_interval_by_hand():
@@ -39,7 +48,8 @@ def test_rates_and_values_in_words():
 def test_the_bootstrap_resamples_terrains_or_families():
     values, rng = np.random.default_rng(1).random(80), np.random.default_rng(3)
     means = [values[rng.integers(80, size=80)].mean() for _ in range(10_000)]
-    assert bootstrap_interval(values, 3) == pytest.approx(np.quantile(means, [0.025, 0.975]).tolist(), abs=1e-12)
+    tail = ndtr(-stdtrit(79, 0.975) * np.sqrt(80 / 79))  # .0222: 80 families are a sample, too
+    assert bootstrap_interval(values, 3) == pytest.approx(np.quantile(means, [tail, 1 - tail]).tolist(), abs=1e-12)
     assert bootstrap_interval(values, 4) != pytest.approx(bootstrap_interval(values, 3), abs=1e-6)
     # Two families of three and one terrain, drawn together: a mean of all is 0, 3/4 or 1.
     assert bootstrap_interval(np.array([1.0, 1.0, 1.0, 0.0]), 0, families=np.array([5, 5, 5, 7])) == [0.0, 1.0]
@@ -56,3 +66,27 @@ def test_lines_have_few_colours_and_maps_all(colours):
     image = Image.open(io.BytesIO(as_png(figure))).convert("RGB")
     assert image.size == (450, 300) and image.getpixel((1, 1)) == (255, 255, 255)
     assert (len(image.getcolors(10**6)) <= 256) == (colours is None)
+
+
+@pytest.mark.parametrize(("share", "families"), [(0.003, 300), (0.01, 300), (0.1, 300), (0.5, 6), (0.5, 24)])
+def test_intervals_of_rates_cover_what_is_rare_and_what_few_families_say(share, families):
+    # A share of the terrains stops half of the episodes, the others stop none.
+    rng, covered, repetitions = np.random.default_rng(5), 0, 200
+    for _ in range(repetitions):
+        rates = rng.binomial(20, np.where(rng.random(families) < share, 0.5, 1.0)) / 20
+        low, high = bootstrap_interval(rates, 0, bounds=RATES)
+        covered += low <= 1.0 - share / 2 <= high
+    assert covered >= 0.92 * repetitions
+
+
+def test_where_all_rates_are_alike_the_interval_is_wilsons():
+    assert bootstrap_interval(np.ones(300), 0, bounds=RATES) == pytest.approx(wilson_interval(300, 300))
+    assert bootstrap_interval(np.zeros(300), 0, bounds=RATES) == pytest.approx(wilson_interval(0, 300))
+    low, high = bootstrap_interval(np.zeros(300), 0, bounds=DIFFERENCES)
+    assert -low == high == pytest.approx(wilson_interval(0, 300)[1])
+    few = np.zeros(300)
+    few[:9] = 0.5  # of nine families, each a gain
+    least, most = bootstrap_interval(few, 0, bounds=DIFFERENCES)
+    assert least < bootstrap_interval(few, 0)[0] and most > few.mean() + 0.01
+    few[9] = 0.5
+    assert bootstrap_interval(few, 0, bounds=DIFFERENCES) == bootstrap_interval(few, 0)
