@@ -6,7 +6,7 @@ certificate is not known to be passable. A fault is robust if it is one under va
 (:data:`sim.spaces.conditions.VARIED`).
 """
 
-from collections.abc import Container
+from collections.abc import Container, Mapping, Sequence
 from itertools import compress
 from typing import Any
 
@@ -27,6 +27,25 @@ SPECIALIST = "specialist"
 _INVALID = OUTCOMES.index("invalid")
 OF_VARIED = ("crossed_varied", "robust")
 """Numbers of :func:`fault_numbers` that only those have who were judged under varied conditions."""
+
+
+def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What a search found and how much it took, as reports have it; ``metrics`` has a row an iteration."""
+    with_collision = int((archive.collision_rate > 0.0).sum())  # in any episode; the bit is of 20
+    return {
+        "iterations": archive.iterations,
+        "terrains_evaluated": sum(row["terrains"] for row in metrics),
+        "episodes": sum(row["episodes"] for row in metrics),
+        "elites": len(archive),
+        "reachable_cells": archive.cells.num_cells,
+        "reachable_coverage": archive.reachable_coverage,
+        "qd_score": archive.qd_score,
+        "mean_fitness": archive.mean_fitness,
+        "with_collision": with_collision,
+        "without_collision": len(archive) - with_collision,
+        "wall_s": sum(row["wall_s"] for row in metrics),
+        "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
+    }
 
 
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from qd.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
-from qd.faults import EPISODES, FRESH_EPISODES, OF_VARIED, fault_numbers, fresh_numbers
+from qd.faults import EPISODES, FRESH_EPISODES, OF_VARIED, fault_numbers, found_numbers, fresh_numbers
 from qd.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluation_of
 from qd.groups import causes_of, elites_of, families_of
 from qd.run.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, check_config, check_space, claimed
@@ -323,9 +323,12 @@ def _write(archive: Archive, search: Search, certifiers: Mapping[str, str], by: 
     seen = None if archive.faults is None else seen_by(archive, archive.family, certifiers)
     numbers = read_json(file) if file.exists() else {}
     numbers = {name: value for name, value in numbers.items() if name not in OF_VARIED}
+    metrics = RunDirectory(search.run).read_metrics() if (search.run / METRICS_FILE).exists() else []
+    if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
+        numbers |= found_numbers(archive, metrics[: archive.iterations])
     numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, archive.family, seen)
     numbers["judged_by"] = numbers.get("judged_by", {}) | by
     write_archive(search.run / ARCHIVE_FILE, archive)
     write_atomically(file, to_json(numbers))
-    if (search.run / METRICS_FILE).exists():
-        figures.write_figures(search.run, archive, RunDirectory(search.run).read_metrics())
+    if metrics:
+        figures.write_figures(search.run, archive, metrics)

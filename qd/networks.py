@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sim.corridor import SHAPE
+from sim.device import recording
 
 MEMBERS = 4
 """Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
@@ -178,7 +179,8 @@ class Training:
             self._optimiser.zero_grad(set_to_none=True)  # so that the graph has gradients of its own
             graph = torch.cuda.CUDAGraph()
             # Other threads may use the device meanwhile.
-            with torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+            stream = torch.cuda.current_stream()
+            with recording(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._learn_batch()  # is recorded, not done
             self._graph = graph
         self._graph.replay()

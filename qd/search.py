@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.archive import Archive, read_archive
-from qd.faults import fault_numbers
+from qd.faults import fault_numbers, found_numbers
 from qd.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.groups import rank, summary_of
 from qd.minima import read_minimal
@@ -276,27 +276,15 @@ def _write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> Non
     origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)
     figures = write_figures(run.path, archive, metrics)
-    with_collision = int((archive.collision_rate > 0.0).sum())  # in any episode; the bit is of 20
     numbers = {
         **origin,
         **archive.named(),
         "space": archive.space,
         "space_sha256": archive.space_sha256,
-        "iterations": archive.iterations,
-        "terrains_evaluated": sum(row["terrains"] for row in metrics),
-        "episodes": sum(row["episodes"] for row in metrics),
-        "elites": len(archive),
-        "reachable_cells": archive.cells.num_cells,
-        "reachable_coverage": archive.reachable_coverage,
-        "qd_score": archive.qd_score,
-        "mean_fitness": archive.mean_fitness,
+        **found_numbers(archive, metrics),
         **dict.fromkeys(_BY_FRESH_EPISODES),
         **fault_numbers(archive),
-        "with_collision": with_collision,
-        "without_collision": len(archive) - with_collision,
-        "wall_s": sum(row["wall_s"] for row in metrics),
         "gpus": 0 if origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
-        "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
     }
     write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
     say(

@@ -1,6 +1,9 @@
-"""Which device works: what a user asks for, and what small work for the host takes."""
+"""Which device works: what a user asks for, what small work for the host takes, and how its work is recorded."""
 
+import gc
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 import warp as wp
@@ -29,3 +32,15 @@ def _cpu_instead() -> str:
 def host_device() -> str:
     """Warp device of small work for the host: the CPU, or the default device where Warp has no compiler for the CPU."""
     return "cpu" if wp.is_cpu_available() else str(wp.get_device())
+
+
+@contextmanager
+def recording() -> Iterator[None]:
+    """Has Python collect no garbage while a graph is recorded: memory of the GPU that is freed then can spoil it."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()

@@ -68,7 +68,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         check_settings(run_dir, saved, settings)
         if is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done. A larger --iterations goes on.")
-            return run_dir / (POLICY if controller is None else DESCRIBED)
+            return _with_onnx(run_dir / (POLICY if controller is None else DESCRIBED), robot)
     beside = None if run.export is None else run.export.with_suffix(".toml")
     if controller is not None and beside is not None and beside.exists() and saved is None:
         raise ValueError(
@@ -82,8 +82,14 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
         policy = training.run(run.export)
-    if controller is None:
-        export_onnx(load_checkpoint(policy, robot), policy.with_suffix(".onnx"))
+    return _with_onnx(policy, robot, anew=True)
+
+
+def _with_onnx(policy: Path, robot: RobotCfg, *, anew: bool = False) -> Path:
+    """A controller as it is, once its ONNX file lies beside it; one with a description has none."""
+    onnx = policy.with_suffix(".onnx")
+    if policy.name == POLICY and (anew or not onnx.exists()):
+        export_onnx(load_checkpoint(policy, robot), onnx)
     return policy
 
 

@@ -21,7 +21,7 @@ from qd.run.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import arrays_of, join_results
-from sim.files.atomic import write_atomically
+from sim.files.atomic import locked, write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
@@ -85,8 +85,9 @@ class Cache:
     def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Stores the arrays of a key in one step."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
-        self.remove_least_used(but=key)
+        with locked(self.folder):  # commands that run at once may share it
+            write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
+            self.remove_least_used(but=key)
 
     def remove_least_used(self, *, but: str) -> None:
         """Removes the files that were not used for longest, but one, until the folder has its size."""
@@ -267,10 +268,9 @@ class Crossings:
     def _open(self, cfg: EvaluatorCfg) -> Pipeline:
         """A simulation with room for so many terrains; the one that is open if it serves."""
         if self._opened is not None:
-            opened, pipeline = self._opened
-            room = opened.num_terrains
-            if replace(opened, num_terrains=cfg.num_terrains) == cfg and room >= cfg.num_terrains:
-                return pipeline
+            opened = self._opened[0]
+            if replace(opened, num_terrains=cfg.num_terrains) == cfg and opened.num_terrains >= cfg.num_terrains:
+                return self._opened[1]
         self.close()
         pipeline = self._stack.enter_context(self.compute.open(cfg))
         self._opened = (cfg, pipeline)

@@ -179,6 +179,8 @@ def check_policy(policy: str, robot: RobotCfg, device: str) -> None:
 
 def build_rollout(cfg: EvaluatorCfg, num_terrains: int) -> Rollout:
     """The simulation of an evaluator, for a share of its terrains."""
+    import sim.simulation  # noqa: F401  Newton keeps the frames that first import it, and a simulation in them
+
     robot = get_robot(cfg.robot)
     robot, solver = resolved(robot) if cfg.resolved else (robot, SolverCfg())
     return Rollout(

@@ -106,14 +106,15 @@ def check_zip(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, busy: str) -> Iterator[None]:
-    """Keeps other processes out of a folder while this one lives, or raises a ValueError that says ``busy``."""
+def locked(folder: Path, busy: str = "") -> Iterator[None]:
+    """Keeps other processes out of a folder; where one is in, raises a ValueError that says ``busy``, or waits."""
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        fcntl.flock(handle, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))
+    except OSError as error:
         os.close(handle)
-        raise ValueError(busy) from None
+        cannot = f"{folder} cannot be locked: {error.strerror}: give a folder on another disk"
+        raise ValueError(busy if isinstance(error, BlockingIOError) else cannot) from None
     try:
         yield
     finally:

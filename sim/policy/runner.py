@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 import warp as wp
 
+from sim.device import recording
 from sim.policy.spec import in_one_line
 
 _LEAST_ROWS = 32
@@ -165,7 +166,11 @@ class PolicyRunner:
             self._call()
         torch.cuda.synchronize()
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=torch.cuda.current_stream()):
+        # Other threads may use the device meanwhile.
+        with (
+            recording(),
+            torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"),
+        ):
             self._call()
         return graph
 

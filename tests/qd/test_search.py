@@ -10,6 +10,7 @@ import pytest
 
 from qd.archive import read_archive, write_archive
 from qd.fitness import FitnessCfg, evaluation_of
+from qd.judge import judge
 from qd.run.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
@@ -17,6 +18,7 @@ from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.robots import Robots
 from tests.qd.searches import CFG, rows_of, run
+from tests.qd.stand_in import compute_by, open_stand_in
 
 FILES = ["archive.json", "archive.npz", "checkpoint.bin", "config.json", "metrics.jsonl"]
 FIGURES = ["archive.png", "curves.png"]
@@ -116,6 +118,17 @@ def test_a_finished_search_crosses_nothing_writes_what_is_lost_and_keeps_what_wa
         run(path, seed=4)
     (path / "checkpoint.bin").write_bytes(saved)
     assert run(path, iterations=3).fresh is None  # there are other elites now
+
+
+def test_a_search_that_was_stopped_is_judged_as_far_as_it_is(tmp_path):
+    run(tmp_path / "run")
+    with pytest.raises(Interrupted):
+        run(tmp_path / "run", iterations=5, opener=Robots(stop_after=18))
+    rows = rows_of(tmp_path / "run")
+    archive = judge(tmp_path / "run", compute=compute_by(open_stand_in), stages=("fresh",))
+    numbers = json.loads((tmp_path / "run/archive.json").read_text())
+    assert 2 < numbers["iterations"] == len(rows) < 5 and numbers["episodes"] == sum(row["episodes"] for row in rows)
+    assert numbers["elites"] == numbers["reevaluated"] == len(archive)
 
 
 def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):

@@ -1,6 +1,7 @@
 """The simulation as a machine: torques, steps, randomisation and errors."""
 
 import gc
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -90,18 +91,20 @@ def test_devices():
             resolve_device(name)
 
 
-def test_no_garbage_is_collected_while_a_graph_is_recorded(device):
+def test_no_garbage_is_collected_while_a_graph_is_recorded_and_a_spoilt_one_is_recorded_again(device):
     # Python collects garbage at any time, and freeing what holds memory of the GPU can spoil a recording.
     collects = []
 
-    def launch():
+    def launch(spoilt=(), error=RuntimeError):
         collects.append(gc.isenabled())
-        if len(collects) == 4:
-            raise ValueError("no such kernel")
+        if len(collects) in spoilt:
+            raise error("CUDA graph capture failed.")
 
     sim = SimpleNamespace(device=device)
-    Simulation.capture(sim, launch)
-    assert collects == [True, False] and gc.isenabled()
-    with pytest.raises(ValueError, match="no such kernel"):
-        Simulation.capture(sim, launch)
-    assert collects == [True, False] * 2 and gc.isenabled()
+    Simulation.capture(sim, partial(launch, [2]))
+    assert collects == [False] * 3 and gc.isenabled()
+    for spoilt, error in (([5, 6], RuntimeError), ([8], ValueError)):
+        with pytest.raises(error, match="capture failed"):
+            Simulation.capture(sim, partial(launch, spoilt, error))
+        assert gc.isenabled()
+    assert len(collects) == 8

@@ -99,7 +99,9 @@ def test_it_goes_on_with_the_same_terrains_by_equal_settings_alone(places, finis
     before = read_checkpoint(finished / "checkpoint.pt")
     with pytest.raises(ValueError, match="swap_every"):
         finetune(ROBOT, cfg_of(places, iterations=9, swap_every=3), finished, ON_CPU)
+    (finished / "policy.onnx").unlink()  # as where a kill came before it
     finetune(ROBOT, cfg_of(places), finished, ON_CPU)  # it is over
+    assert (finished / "policy.onnx").exists()
     assert read_checkpoint(finished / "checkpoint.pt")["progress"] == before["progress"]
     assert run_command(Finetune, ["--resume", str(finished), "--device", "cpu", "--iterations", "4"], name="x") == 0
     later = read_checkpoint(finished / "checkpoint.pt")

@@ -6,6 +6,7 @@ import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
 
+from sim.device import recording
 from sim.policy.described import ControllerCfg
 from train.ppo.cfg import PpoCfg
 
@@ -140,7 +141,7 @@ class CapturedPPO(PPO):
             self.optimizer.zero_grad(set_to_none=True)
             self._graph = torch.cuda.CUDAGraph()
             # NCCL's watchdog asks for its events from a thread of its own, which a capture of all threads forbids.
-            with torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
+            with recording(), torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
                 self._learn_minibatch()
         self._graph.replay()
 

@@ -122,6 +122,9 @@ def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
     """Whether a training has done its iterations and written its controller wherever it is asked for."""
     record = (run_dir / POLICY).with_suffix(".train.json")
     is_exported = export is None or is_same(str(export), str(run_dir / POLICY))
+    if export is not None:  # what is written last
+        last = ".toml" if (run_dir / DESCRIBED).exists() else ".train.json"
+        is_exported = is_exported and export.with_suffix(last).exists()
     return is_exported and record.exists() and read_json(record).get("iterations") == iterations
 
 

@@ -1,5 +1,6 @@
 """The crossing service: results of every terrain in order, and what its cache finds, keeps apart and gives up."""
 
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -114,7 +115,7 @@ def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, dam
 
 
 def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
-    block = {"values": np.random.default_rng(0).random(1000)}  # 8 kB that cannot be packed
+    block = block_of(0)
     cache = Cache(tmp_path, most_bytes=25_000)
     for key in ("a", "b", "c"):
         cache.write(key, block)
@@ -125,6 +126,26 @@ def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
     assert cache.keys() == ["a", "c", "d"]
     Cache(tmp_path, most_bytes=10).write("e", block)
     assert cache.keys() == ["e"]
+
+
+def block_of(number):
+    return {"values": np.random.default_rng(number).random(1000)}  # 8 kB that cannot be packed
+
+
+def write_often(folder, number):
+    block = block_of(number)
+    for count in range(40):
+        Cache(folder, most_bytes=20_000).write(f"key-{count % 4}", block)
+
+
+def test_processes_share_a_cache(tmp_path):
+    with ProcessPoolExecutor(2) as pool:
+        for done in [pool.submit(write_often, tmp_path, number) for number in range(2)]:
+            done.result()
+    cache = Cache(tmp_path)
+    stored = [cache.read(key)["values"].tolist() for key in cache.keys("key")]
+    assert len(stored) == 2  # of four, for which there is no room
+    assert all(block in [block_of(number)["values"].tolist() for number in range(2)] for block in stored)
 
 
 def test_a_simulation_stays_open_for_calls_that_agree():
