@@ -46,7 +46,8 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bo
     text, fine = describe_standing(robot, standing)
     print(text, flush=True)
     if not has_controller:
-        print(f"Without a controller, expected at {policy} or named by --policy, this is all.")
+        beside = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
+        print(f"Without a controller, expected at {beside} or named by --policy, this is all.")
         return fine
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
         if not _walks(robot, walk(crossings, policy)):
@@ -54,7 +55,7 @@ def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bo
         most, share = fitting_height(crossings, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
     crosser = crosser_name(robot, policy)
-    out = RUNS / f"{crosser}-dose" / "dose.json"
+    out = RUNS / f"{crosser}-check" / "dose.json"
     dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
     up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
     print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")

@@ -143,7 +143,7 @@ class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
     run: Path | None = None
     """Run directory; the newest of the robot under runs/."""
     certifiers: tuple[str, ...] = ()
-    """The other controllers, each NAME=FILE; if left out, the robot's panel and RUN/certifiers/*.pt."""
+    """The other controllers, each NAME=FILE; if left out, the robot's panel and those of RUN/certifiers."""
 
     def named(self) -> tuple[Path, dict[str, Any]]:
         """The run, and what the command line names beside it."""

@@ -20,7 +20,7 @@ class _OfTraining(RunCfg):
     """The flags of every training."""
 
     robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
+    """Which robot: anymal, cassie, or the file of another (mine/go2/robot.toml); its settings are the defaults."""
     run_dir: Path | None = None
     """Where to write; a new directory under runs/."""
     resume: Path | None = None
@@ -99,7 +99,7 @@ class Harden(HardenCfg, WorkerFlags):
     """
 
     robot: str = "anymal"
-    """Which robot: anymal, cassie, or the settings file of another (my_robot.py); its settings are the defaults."""
+    """Which robot: anymal, cassie, or the file of another (mine/go2/robot.toml); its settings are the defaults."""
     run_dir: Path | None = None
     """Where to work, and to go on; runs/<robot>-harden-<seed>."""
 

@@ -67,7 +67,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     if saved is not None:
         check_settings(run_dir, saved, settings)
         if is_finished(run_dir, cfg.iterations, run.export):
-            print(f"{run_dir} is finished: all {cfg.iterations} iterations are done. A larger --iterations goes on.")
+            print(f"{run_dir} is finished: all {cfg.iterations} iterations are done; with more it goes on.")
             return _with_onnx(run_dir / (POLICY if controller is None else DESCRIBED), robot)
     beside = None if run.export is None else run.export.with_suffix(".toml")
     if controller is not None and beside is not None and beside.exists() and saved is None:

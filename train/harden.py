@@ -163,7 +163,7 @@ class _Hardening:
         sets = self._sets(searches, "validation")
         results = cross_sets(
             controllers, sets, robot=self.robot, compute=self.compute, episodes=self.cfg.evaluation.episodes,
-            reward=True, cache=self.path / "crossings",
+            reward=True, cache=self.path / "crossings", note=", validation",
         )  # fmt: skip
         goal: dict[str, dict[str, float]] = {}
         for when in controllers:

@@ -66,14 +66,18 @@ def cross_sets(
     reward: bool = False,
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
+    note: str = "",
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them; prints its rates."""
+    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them; prints its rates.
+
+    ``note`` stands behind the names of the sets there.
+    """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     at_most = max(map(len, sets.values()))
     with Crossings(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crossings:
         for controller, policy in controllers.items():
             for name, terrains in sets.items():
-                label = f"{controller} on {name}" + (f" ({how})" if how != "searched" else "")
+                label = f"{controller} on {name}{note}" + (f" ({how})" if how != "searched" else "")
                 result = crossings.cross(
                     policy, terrains.terrains, terrains.seeds, replicas=episodes, space=terrains.space, how=how,
                     reward=reward, penalties_from_s=penalties_from_s, label=label, at_most=at_most,

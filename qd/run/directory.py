@@ -45,6 +45,10 @@ def find_run(
     ``published`` says when the robot's published archive is taken: where there is no such run, before it, or never.
     """
     if named is not None:
+        if published == "never" and RESULTS.resolve() in named.resolve().parents:
+            raise ValueError(
+                f"{named} is published and stays as it is: copy its directory below {RUNS}/, and name that"
+            )
         return named
     folder = RESULTS / robot.name / "archive"
     runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []

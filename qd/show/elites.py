@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ class Terrain(NamedTuple):
     """Name of files about it: ``elite-3`` or ``minimal-3``."""
     label: str
     """In words."""
-    minimal: dict[str, object] | None
+    minimal: dict[str, Any] | None
     """What is known of a minimal terrain."""
 
 

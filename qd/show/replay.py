@@ -239,8 +239,11 @@ def _spread(mean: float, std: float) -> str:
 def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> list[str]:
     """What the run knows of an elite, and whether what was crossed now agrees."""
     archive, n = run.archive, terrain.number
+    parts, about = run.space.describe(terrain.genes).splitlines(), elite_words(archive, n)
     if terrain.minimal:
-        known = f"Of the minimal terrain: {run.minima().words(n)}."
+        parts = terrain.minimal["words"]
+        known = f"Of the minimal terrain: {run.minima().words(n)}; {terrain.minimal.get('verdict', 'not judged')}."
+        about[:0] = ["Of the whole terrain of the elite:"] if about else []
     elif by:
         known = f"Now it was crossed with {by}; all else is of the controller that was searched."
     else:
@@ -249,6 +252,6 @@ def _about_elite(run: OpenedRun, terrain: Terrain, by: str, now: Evaluation) -> 
     return [
         f"Of {run.path}: one of {len(archive):,} elites, found in iteration {archive.iteration[n]}, with ratios in "
         f"{archive.cells.describe(int(archive.cell[n]))}. Its terrain:",
-        *(f"- {line}" for line in run.space.describe(terrain.genes).splitlines()),
-        *[known, *elite_words(archive, n)],
+        *(f"- {line}" for line in parts),
+        *[known, *about],
     ]

@@ -82,12 +82,14 @@ def bootstrap_interval(
 def _where_few_differ(
     values: NDArray[np.floating], family: NDArray[np.int64], count: int, bounds: tuple[float, float]
 ) -> tuple[float, float]:
-    """How far the mean may lie where few of ``count`` families differ from 0 or 1; the mean itself where many do."""
+    """How far the mean may lie where few of ``count`` families differ from 0, or 1; the mean itself where many do."""
     mean = float(values.mean())
     apart = values - (1.0 if bounds == RATES and mean > 0.5 else 0.0)
     if len(np.unique(family[apart != 0.0])) >= _FEW:
         return mean, mean
-    more, less = (float(np.maximum(side, 0.0).mean()) for side in (apart, -apart))
+    if bounds == RATES:
+        return wilson_interval(mean * count, count)
+    more, less = (float(np.maximum(side, 0.0).mean()) for side in (values, -values))
     (more_low, more_high), (less_low, less_high) = (wilson_interval(share * count, count) for share in (more, less))
     low, high = (
         mean - math.hypot(more - more_low, less_high - less),

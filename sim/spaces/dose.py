@@ -255,9 +255,10 @@ def parse_doses(words: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     doses = {name: dose for name, dose in DOSES.items() if name in elements}
     known = {name for dose in doses.values() for name in dose.others}
     if wrong := others.keys() - known:
+        beside = ", ".join(sorted(known)) or f"of which {', '.join(doses)} has none"
         raise ValueError(
-            f"at must name parameters that the elements have beside the one that grows, {', '.join(sorted(known))}, "
-            f"got {', '.join(sorted(wrong))}"
+            f"at must name parameters that the elements have beside the one that grows, {beside}, got "
+            f"{', '.join(sorted(wrong))}: leave that out"
         )
     return {name: dose.changed(elements[name], others) for name, dose in doses.items()}
 

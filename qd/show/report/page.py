@@ -55,7 +55,8 @@ def counted(number: int, noun: str) -> str:
 def check_page(out: Path) -> None:
     """Makes sure that a page can be written."""
     if out.suffix != ".html":
-        raise ValueError(f"out must be a file named *.html, got {out}: name for example {out / 'report.html'}")
+        example = out / "report.html" if out.is_dir() or not out.suffix else out.with_suffix(".html")
+        raise ValueError(f"out must be a file named *.html, got {out}: name for example {example}")
     prepare_output(out)
 
 

@@ -86,6 +86,9 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     assert folder_for(course, "anymal") == Path("runs/anymal-published-course")
     with pytest.raises(FileNotFoundError):
         find_run(robot, published="never")
+    with pytest.raises(ValueError, match="is published and stays as it is: copy"):
+        find_run(robot, published, published="never")
+    assert find_run(robot, published) == published
     for number in (1, 3, 2):
         make_run(Path(f"runs/{number}"), number)
     make_run(Path("runs/cassie"), 9, robot="cassie")

@@ -212,7 +212,9 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     assert json.loads((run / f"minimal-{number}.json").read_text()) == report and report["elite"] == number
     with pytest.raises(ValueError, match="out"):
         replay(source, out=Path("a.jpg"))
-    assert opened_run.minima().words(number) in " ".join(capsys.readouterr().out.split())
+    words = " ".join(capsys.readouterr().out.split())
+    assert f"Of the minimal terrain: {opened_run.minima().words(number)}; failing." in words
+    assert words.count("- bump of") == 1 and "- bump of <0.24> m" in words  # those that are left alone
     Export(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}
     with np.load(tmp_path / "out" / f"minimal-{number}.npz") as content:
