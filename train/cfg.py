@@ -81,7 +81,8 @@ class RecipeCfg:
     draw: Draw = "learnable"
     """How elites are drawn at each exchange. uniform: all alike. failing: the likelier, the less often they were
     crossed the last time. learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford
-    et al. 2024), so that harder ones come later."""
+    et al. 2024). In a training robots start all along the way, and it is the rate of all. Where there are places for
+    all elites, each has one, and the draw is of the places that are left."""
     critic_iterations: NonNegativeInt | None = None
     """Iterations in which the critic learns alone at first, if the controller comes without one; 50, or half of all if
     there are fewer than 100."""
@@ -108,7 +109,7 @@ class FinetuneCfg(TrainCfg):
     terrains: NonNegativeInt = 0
     """Terrains at a time; 0: on CUDA 500 (Cassie: 100), on the CPU 12."""
     archive: tuple[str, ...] = ()
-    """Runs of searches, or their archive.npz, for mix generated; each is drawn from equally often. Left out,
+    """Runs of searches, or their archive.npz, for mix generated, which share the places that not all elites fill. Left out,
     results/<robot>/archive, or of a robot without one its newest run under runs/."""
     space: str | None = None
     """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a

@@ -64,7 +64,7 @@ class Quantity(NamedTuple):
 _HEIGHT = {"height": Quantity("size", 0.01, 1.0)}
 _DEPTH = {"depth": Quantity("size", 0.05, 2.0)}
 _SLOPE = {"slope": Quantity("size", 0.01, 2.0, "m/m")}
-_STONES = {"side": Quantity("detail", 0.10, 1.0, cells=1), "gap": Quantity("turn", 0.05, 1.0, cells=1)}
+_STONES = {"side": Quantity("detail", 0.10, 1.0, cells=1), "gap": Quantity("turn", 0.10, 1.0, cells=1)}
 _LENGTH = {"length": Quantity("length", 0.20, 4.0, cells=1)}
 
 QUANTITIES: dict[Kind, dict[str, Quantity]] = {
@@ -207,7 +207,7 @@ _RISES = (0.05, 0.10, 0.14, 0.17, 0.20, 0.22, 0.24, 0.26, 0.28, 0.30, 0.35)
 _STEPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.50)
 _SLOPES = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
 _WIDTHS = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
-_GAPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.40)
+_GAPS = (0.10, 0.15, 0.20, 0.25, 0.30, 0.40)
 _FRICTIONS = (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)
 _FLIGHT = {"tread": 0.30, "flight": 5.0}
 DOSES: dict[str, Dose] = {

@@ -1,5 +1,7 @@
 """Doses: obstacles alone on flat ground, of any size, against courses and by numbers worked out by hand."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,11 @@ def test_a_command_line_names_doses():
 def test_what_cannot_be_made_is_refused(elements, at, field):
     with pytest.raises(ValueError, match=field):
         parse_doses([elements], [at])
+
+
+@pytest.mark.parametrize("name", IN_RANGE)
+def test_every_value_of_an_obstacle_is_one(name):
+    grids = DOSES[name].terrains(1, np.random.default_rng(0))
+    assert len(grids) == len(DOSES[name].values) > 5
+    assert all(np.ptp(grid) > 0.0 for grid in grids)  # level ground stops nobody, and says nothing of a size
+    assert all(not np.array_equal(*pair) for pair in itertools.pairwise(grids))
