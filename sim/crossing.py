@@ -1,5 +1,6 @@
 """Settings of the crossing task and of its physics, and what the kernels take of them."""
 
+import math
 from dataclasses import dataclass, replace
 
 import warp as wp
@@ -97,8 +98,11 @@ class SolverCfg:
 def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
     """Robot and solver with contact resolved: steps of 1 ms and contacts of 3 ms, against which a search's are judged.
 
-    Four times the steps: about five times the time.
+    Four times the steps: about five times the time. Steps are shorter where a control step does not last whole ones.
     """
-    finer = robot.physics_dt / _RESOLVED_DT
-    steps = {name: round(getattr(robot, name) * finer) for name in ("decimation", "drive_delay_steps")}
-    return replace(robot, physics_dt=_RESOLVED_DT, **steps), SolverCfg(time_constant_s=_RESOLVED_TIME_CONSTANT_S)
+    control_s = robot.physics_dt * robot.decimation
+    decimation = max(robot.decimation, math.ceil(control_s / _RESOLVED_DT - 1e-6))
+    step = round(control_s / decimation, 12)
+    delay = round(robot.drive_delay_steps * robot.physics_dt / step)
+    finer = replace(robot, physics_dt=step, decimation=decimation, drive_delay_steps=delay)
+    return finer, SolverCfg(time_constant_s=_RESOLVED_TIME_CONSTANT_S)

@@ -109,8 +109,8 @@ class FinetuneCfg(TrainCfg):
     terrains: NonNegativeInt = 0
     """Terrains at a time; 0: on CUDA 500 (Cassie: 100), on the CPU 12."""
     archive: tuple[str, ...] = ()
-    """Runs of searches, or their archive.npz, for mix generated, which share the places that not all elites fill. Left out,
-    results/<robot>/archive, or of a robot without one its newest run under runs/."""
+    """Runs of searches, or their archive.npz, for mix generated, which share the places that not all elites fill. Left
+    out, results/<robot>/archive, or of a robot without one its newest run under runs/."""
     space: str | None = None
     """Terrain space of mix hard-random: super_gaussian, course, or file.py:CLASS; super_gaussian if left out. Name a
     space of your own here too, for its elites and for a resumed training on it."""

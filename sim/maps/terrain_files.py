@@ -106,7 +106,7 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     """A scene of the terrain alone, in one file: its surface is the simulation's, between the nodes too.
 
     The geom stands turned by a quarter; x, y and z of the world are the terrain's. Its friction is below every robot's
-    own: of two MuJoCo takes the larger. Step, gravity and solver are the simulation's.
+    own: of two MuJoCo takes the larger. Step and solver are the simulation's; gravity is the earth's.
     """
     field, solver = as_hfield(terrain.heights), SolverCfg()
     root = ET.Element("mujoco", model=terrain.name)
@@ -124,6 +124,7 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     world = ET.SubElement(root, "worldbody")
     ET.SubElement(world, "light", name="sun", directional="true", pos="8 4 10", dir="0.3 0.4 -1", diffuse="0.8 0.8 0.8")
     shape = {"type": "hfield", "hfield": "terrain", "friction": str(GROUND_FRICTION), "rgba": "0.7 0.66 0.6 1"}
+    shape["solmix"] = "0"  # the stiffness of a contact is the robot's
     shape |= {"pos": _words(field.position), "quat": _words(QUARTER_TURN)}
     ET.SubElement(world, "geom", {"name": "terrain", **shape})
     for name, place, color in (("start", CrossingCfg.start, "1 1 1 1"), ("goal", CrossingCfg.goal, "0 0.62 0.45 1")):

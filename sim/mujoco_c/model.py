@@ -197,7 +197,8 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
             )
     first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]
-    model.geom_friction[geoms, 0] *= [patch.friction for patch in patches]
+    sliding = max(model.geom_friction[first, 0], GROUND_FRICTION)
+    model.geom_friction[geoms, 0] = [sliding * patch.friction for patch in patches]
     model.geom_solref[geoms], model.geom_solimp[geoms] = model.geom_solref[first], model.geom_solimp[first]
     time_constant = np.array([patch.time_constant_s for patch in patches])
     soft = time_constant > max(model.geom_solref[first, 0], 0.0)

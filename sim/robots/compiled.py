@@ -6,7 +6,7 @@ ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -202,10 +202,12 @@ def _keep_robot(spec: Any) -> list[str]:
     problems += [f'<inertial> of {body.name} ({body.info}) beside inertiafromgeom="true"' for body in lost]
     problems += [f"a tendon ({tendon.info})" for tendon in spec.tendons]
     problems += [f"a flexible body ({flex.info})" for flex in spec.flexes]
-    for body in spec.bodies:
+    taken = {geom.name for geom in spec.geoms}
+    for place, body in enumerate(spec.bodies):
         problems += [f"a ball joint ({joint.info})" for joint in body.joints if joint.type == _JOINT.mjJNT_BALL]
         for number, geom in enumerate(touching_geoms(body)):
-            geom.name = geom.name or f"{body.name}_geom_{number}"
+            geom.name = geom.name or _free_name(f"{body.name or f'body_{place}'}_geom_{number}", taken)
+            taken.add(geom.name)
             geom.contype, geom.conaffinity = 1, 0
             if geom.type in (mj.mjtGeom.mjGEOM_HFIELD, mj.mjtGeom.mjGEOM_SDF):
                 problems.append(f"a height field or distance field as geom {geom.name} ({geom.info})")
@@ -213,15 +215,24 @@ def _keep_robot(spec: Any) -> list[str]:
         refuse("body", body, gravcomp=body.gravcomp, mocap=body.mocap)
         for joint in body.joints:
             free = joint.type == _JOINT.mjJNT_FREE
+            problems += [] if free or joint.name else [f"a joint without a name ({joint.info})"]
             refuse("joint", joint, ref=joint.ref, damping=joint.damping[1:], stiffness=joint.stiffness[not free :])
     for actuator in spec.actuators:
         refuse("actuator", actuator, armature=actuator.armature, damping=actuator.damping, delay=actuator.delay)
-    for part in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs):
+    # What names a body keeps it from being fused.
+    for part in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.tuples):
         spec.delete(part)
     impratio = option.impratio
     spec.option = mj.MjSpec().option
     spec.option.gravity, spec.option.impratio = gravity, impratio
     return problems
+
+
+def _free_name(name: str, taken: Container[str]) -> str:
+    """A name that is not taken: this one, or with underscores behind it."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def _structure_problems(model: Any) -> list[str]:
@@ -236,7 +247,9 @@ def _structure_problems(model: Any) -> list[str]:
     lost = [model.body(1 + k).name for k in np.flatnonzero(~np.isfinite(poses).all(axis=1))]
     slight = [model.body(k).name for k in range(1, model.nbody)
               if model.body_inertia[k].min() < _LEAST_GYRATION**2 * model.body_mass[k]]  # fmt: skip
+    touches = model.geom_contype[model.geom_bodyid > 0].any()
     findings = [
+        ([] if touches else ["none"], "no geom touches anything: give some contype 1, in a URDF a <collision>"),
         (crowded, f"every joint must be a hinge or slide on a body of its own, unlike that of {', '.join(crowded)}"),
         (fixed, f"geoms that belong to the world, not to the robot: {', '.join(fixed)}: take them out"),
         (lost, f"position and rotation must be numbers, unlike those of {', '.join(lost)}"),
@@ -306,7 +319,7 @@ class _Drives:
         joints, count = joint_names(model), len(joint_names(model))
         self.stiffness, self.damping, self.effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
         self.control, self.problems = np.full((count, 2), np.nan), list[str]()
-        self.follow = {int(model.eq_obj1id[k]) - 1 for k in range(model.neq)}
+        self.follow = {int(model.eq_obj1id[k]) - 1 for k in np.flatnonzero(model.eq_type == mj.mjtEq.mjEQ_JOINT)}
         for k in np.flatnonzero(model.jnt_actfrclimited[1:]):
             self.effort[k] = self._least(model.jnt_actfrcrange[1 + k], f"actuatorfrcrange of {joints[k]}")
         taken: list[int] = []
@@ -344,6 +357,8 @@ class _Drives:
         return float(span[1])
 
     def _kind(self, model: Any, k: int) -> str:
+        if model.actuator_plugin[k] >= 0:
+            return "an actuator of a plugin"
         gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
         simple = model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED and not model.actuator_dyntype[k]
         if simple and model.actuator_biastype[k] == _BIAS.mjBIAS_NONE and not gain[1:].any():

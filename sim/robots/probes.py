@@ -171,14 +171,16 @@ def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
 
 
 MAX_SAG = 0.005
-"""Deepest that a sharp ridge may sink between two neighbouring probes [m]."""
+"""Deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]."""
+CAPSULE_SAG = 0.0005
+"""Deepest that it may sink between those of a capsule [m]: limbs stand, slide and hang on edges with them."""
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 
 
-def _max_spacing(radius: float) -> float:
-    """Largest distance of neighbouring probes between which a sharp ridge sinks at most :data:`MAX_SAG` [m]."""
-    sag = min(MAX_SAG, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
+def _max_spacing(radius: float, most: float = MAX_SAG) -> float:
+    """Largest distance of neighbouring probes between which a sharp ridge sinks at most so deep [m]."""
+    sag = min(most, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
 
 
@@ -192,7 +194,8 @@ def _along_z(x: float, y: float, z: _Array) -> _Array:
 
 def capsule_strips(radius: float, half_height: float) -> list[Strip]:
     """One strip along the axis (z); exact at the caps."""
-    return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, _max_spacing(radius))), radius=radius)]
+    spacing = _max_spacing(radius, CAPSULE_SAG)
+    return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, spacing)), radius=radius)]
 
 
 def box_strips(*half: float) -> list[Strip]:

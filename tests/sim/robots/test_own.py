@@ -12,6 +12,7 @@ from matplotlib.image import imsave
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
+from sim.crossing import resolved
 from sim.files.records import robot_digest
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.policy.adapters import read_row
@@ -341,3 +342,36 @@ def probes_of(builder, shape):
     counts = np.diff(probes.strip_start.numpy())
     on_shape = np.repeat(probes.strip_shape.numpy(), counts) == shape
     return probes.position.numpy()[on_shape], np.repeat(probes.strip_radius.numpy(), counts)[on_shape]
+
+
+def test_what_looks_at_a_fixed_body_is_left_out(tmp_path):
+    file = write_dog(tmp_path)
+    mark = '<body name="mark" pos="0.3 0 0"><geom size="0.01" mass="0.1"/></body><body><geom size="0.01"/></body>'
+    replace_once(file.with_suffix(".xml"), FREE, f'{FREE}{mark}<camera mode="targetbody" target="mark"/>')
+    of_file = robot_spec(get_robot(str(file))).compile()
+    assert of_file.body_jntnum[1:].tolist() == [1] * (of_file.nbody - 1) and of_file.nbody == 1 + 1 + 8
+    assert {of_file.geom(k).name for k in range(of_file.ngeom)} >= {"mark_geom_0", "body_3_geom_0"}
+
+
+def test_a_driving_plugin_and_a_robot_that_touches_nothing_are_refused(tmp_path):
+    file = write_dog(tmp_path)
+    model = file.with_suffix(".xml")
+    text = model.read_text()
+    plugin = '<plugin plugin="mujoco.pid" joint="FL_hip"><config key="kp" value="40"/></plugin>'
+    extension = '<extension><plugin plugin="mujoco.pid"/></extension></mujoco>'
+    model.write_text(text.replace(FIRST_DRIVE, plugin).replace("</mujoco>", extension))
+    with pytest.raises(ValueError, match="an actuator of a plugin on FL_hip"):
+        get_robot(str(file))
+    nothing = re.sub(' (contype|conaffinity)="[0-9]"', "", text).replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    model.write_text(nothing)
+    with pytest.raises(ValueError, match="no geom touches anything"):
+        get_robot(str(file))
+
+
+@pytest.mark.parametrize(("physics_dt", "decimation", "steps"), [(0.005, 4, 20), (0.0025, 5, 13), (0.0005, 10, 10)])
+def test_finer_physics_keeps_the_control_rate(anymal, physics_dt, decimation, steps):
+    robot = dataclasses.replace(anymal, physics_dt=physics_dt, decimation=decimation, drive_delay_steps=2)
+    finer = resolved(robot)[0]
+    assert finer.decimation == steps and finer.physics_dt <= min(0.001, physics_dt)
+    assert finer.control_dt == pytest.approx(robot.control_dt, rel=1e-9)
+    assert finer.drive_delay_steps == round(2 * physics_dt / finer.physics_dt)

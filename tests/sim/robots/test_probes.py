@@ -9,7 +9,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from sim.robots.model import build_robot
-from sim.robots.probes import MAX_MESH_PROBES, MAX_SAG, hull_probes, make_probes, shape_strips
+from sim.robots.probes import CAPSULE_SAG, MAX_MESH_PROBES, hull_probes, make_probes, shape_strips
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2.0
 
@@ -48,7 +48,7 @@ def test_probes_cover_a_shape_and_none_sticks_out(kind, size, shape):
     if kind == GeoType.CYLINDER:
         assert (np.linalg.norm(centres[:, :2], axis=1) + radii <= size[0] + 1e-9).all()
     # A needle between four probes, or a corner (rounded by (sqrt 3 - 1) r = 14.6 mm), is the worst case.
-    most = min(MAX_SAG, size[0]) if kind == GeoType.CAPSULE else 0.0147
+    most = CAPSULE_SAG if kind == GeoType.CAPSULE else 0.0147
     assert uncovered(shape.sample(4000, seed=0), strips).max() <= most + 1e-9
     for strip in strips:  # kernels.contact bounds a strip by its ends and takes first and last as its outermost
         extent = np.ptp(strip.centres, axis=0)
@@ -128,4 +128,4 @@ def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     if robot.name == "cassie":
         # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m.
         np.testing.assert_allclose(probes.strip_radius.numpy(), [0.25, 0.02, 0.02], atol=1e-6)
-        assert np.diff(starts).tolist() == [1, 6, 6]
+        assert np.diff(starts).tolist() == [1, 16, 16]
