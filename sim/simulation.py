@@ -311,15 +311,18 @@ class Simulation:
 
         It is run eagerly first, so that no kernel is loaded while recording.
         """
+
+        def record() -> Any:
+            with wp.ScopedCapture() as capture:
+                launch_all()
+            return capture.graph
+
         with wp.ScopedDevice(self.device), recording():
             launch_all()
             try:
-                with wp.ScopedCapture() as capture:
-                    launch_all()
-            except RuntimeError:  # once in a hundred hours CUDA finds a recording spoilt, and does not say by what
-                with wp.ScopedCapture() as capture:
-                    launch_all()
-        return capture.graph
+                return record()
+            except RuntimeError:  # seldom CUDA finds a recording spoilt, and does not say by what
+                return record()
 
     def launch(self, graph: Any) -> None:
         """Run a captured graph once."""

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ Tables = dict[str, Any]
 """
 _MEASURES = (*MEASURES, *CERTIFIED)
 
+Value = TypeVar("Value")
 Crossed = Mapping[str, Mapping[str, Measured]]
 """Set -> controller -> what it made of the set's terrains."""
 
@@ -210,6 +211,14 @@ def _kind_of(name: str) -> str:
     return name.partition("@")[0]
 
 
+def by_kind(row: Mapping[str, Value]) -> dict[str, list[Value]]:
+    """What there is of each kind of controller, by the kinds, from what there is of each controller by its name."""
+    kinds: dict[str, list[Value]] = {}
+    for name, value in row.items():
+        kinds.setdefault(_kind_of(name), []).append(value)
+    return kinds
+
+
 def _firsts(names: Iterable[str]) -> list[str]:
     """The first controller of each kind, in order."""
     first = {_kind_of(name): name for name in reversed([*names])}
@@ -220,12 +229,12 @@ def over_seeds(crossed: Crossed, sets: Mapping[str, TerrainSet], seed: int) -> d
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for name, row in crossed.items():
-        for kind in _firsts(row):
-            of_kind = [measured for controller, measured in row.items() if _kind_of(controller) == _kind_of(kind)]
-            for key, measure, member in _groups(sets[name]) if len(of_kind) > 1 else ():
+        several = {kind: of_kind for kind, of_kind in by_kind(row).items() if len(of_kind) > 1}
+        for kind, of_kind in several.items():
+            for key, measure, member in _groups(sets[name]):
                 values = np.array([measured.values[measure][member] for measured in of_kind])
                 mean = kind_mean([values], of_terrains(sets[name].families, member), seed, measure)
                 summary = {part: mean and mean[part] for part in ("mean", "interval")}
                 summary["values"] = [mean_of(of_one) for of_one in values]
-                summaries.setdefault(key, {}).setdefault(name, {})[_kind_of(kind)] = summary
+                summaries.setdefault(key, {}).setdefault(name, {})[kind] = summary
     return summaries

@@ -45,7 +45,7 @@ def find_run(
     ``published`` says when the robot's published archive is taken: where there is no such run, before it, or never.
     """
     if named is not None:
-        if published == "never" and RESULTS.resolve() in named.resolve().parents:
+        if published == "never" and _is_published(named):
             raise ValueError(
                 f"{named} is published and stays as it is: copy its directory below {RUNS}/, and name that"
             )
@@ -63,6 +63,11 @@ def find_run(
         )
     print(f"Run: {runs[0]}", flush=True)
     return runs[0]
+
+
+def _is_published(path: Path) -> bool:
+    """Whether a run lies among those that are published."""
+    return RESULTS.resolve() in path.resolve().parents
 
 
 def _robot_of(file: Path) -> str | None:
@@ -124,7 +129,7 @@ def folder_for(run: Path, robot: str) -> Path:
     That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
     """
     folder = directory_of(run)
-    if RESULTS.resolve() not in folder.resolve().parents:
+    if not _is_published(folder):
         return folder
     name = folder.resolve().name
     return RUNS / (f"{robot}-published" + ("" if name == "archive" else f"-{name}"))

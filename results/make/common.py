@@ -130,7 +130,7 @@ class Script:
         if self.small or not is_same_file(run / "archive.npz", published / "archive.npz"):
             run = self.runs / "copy" / name
             if not all(
-                is_same_file(run / name, published / name) for name in ("archive.npz", "archive.json", "config.json")
+                is_same_file(run / file, published / file) for file in ("archive.npz", "archive.json", "config.json")
             ):
                 shutil.rmtree(run, ignore_errors=True)
                 shutil.copytree(published, run)

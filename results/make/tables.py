@@ -19,6 +19,7 @@ from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.measures import kind_mean
 from qd.evaluate.sets import TerrainSet, elites_sha256, make_sets, paper_terrains
+from qd.evaluate.tables import by_kind
 from results.make.common import (
     SEEDS,
     Script,
@@ -72,17 +73,12 @@ def train_controllers(script: Script, trainings: Sequence[str]) -> dict[str, str
     return controllers
 
 
-def by_kind(rates: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """Goal rates of controllers by their kind, whose further seeds are called ``C-G@1``: shape (num_seeds, T)."""
-    kinds: dict[str, list[NDArray[np.float64]]] = {}
-    for name, of_controller in rates.items():
-        kinds.setdefault(name.partition("@")[0], []).append(of_controller)
-    return {kind: np.array(of_kind) for kind, of_kind in kinds.items()}
+def differences_of(rates: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
+    """How much more often each kind reaches the goal on one set than one before it: ``C-G - C-HR``.
 
-
-def differences_of(kinds: Mapping[str, NDArray[np.float64]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
-    """How much more often each kind reaches the goal on one set than one before it: ``C-G - C-HR``."""
-    differences = {}
+    Goal rates are of controllers by their name, each of shape (num_terrains,).
+    """
+    kinds, differences = {kind: np.array(of_kind) for kind, of_kind in by_kind(rates).items()}, {}
     for first, second in itertools.combinations(kinds, 2):
         mean = kind_mean([kinds[second], kinds[first]], families, seed)
         differences[f"{second} - {first}"] = mean and {"goal": mean.pop("mean"), **mean}
@@ -151,8 +147,7 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         tables,
         {
             "differences": {
-                name: tables["differences"][name] | differences_of(by_kind(rates[name]), family[name], cfg.seed)
-                for name in sets
+                name: tables["differences"][name] | differences_of(rates[name], family[name], cfg.seed) for name in sets
             }
         },
     )

@@ -360,8 +360,7 @@ def test_bias_and_distance_are_of_terrains_that_both_have():
 
 def test_differences_are_of_the_later_kind_minus_the_earlier():
     rates = {"C-HR": np.full(24, 0.75), "C-G": np.full(24, 0.52), "C-G@1": np.full(24, 0.5)}
-    kinds = tables.by_kind(rates)
-    [(pair, row)] = tables.differences_of(kinds, np.arange(24), 0).items()
+    [(pair, row)] = tables.differences_of(rates, np.arange(24), 0).items()
     assert pair == "C-G - C-HR" and row["goal"] == pytest.approx(0.51 - 0.75) and row["seeds"] == [2, 1]
 
 

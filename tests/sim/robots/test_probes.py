@@ -126,6 +126,6 @@ def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     assert [builder.shape_label[shape] for shape in shapes] == builder.shape_label  # once: no cylinders, no boxes
     np.testing.assert_array_equal(bodies, np.array(builder.shape_body)[shapes])
     if robot.name == "cassie":
-        # At r = .02 neighbours may be 2 sqrt(2 * .02 * .005 - .005^2) = .0265 m apart: six on a toe of .125 m.
+        # At r = .02 neighbours may be 2 sqrt(2 * .02 * .0005 - .0005^2) = .0089 m apart: 16 on a toe of .125 m.
         np.testing.assert_allclose(probes.strip_radius.numpy(), [0.25, 0.02, 0.02], atol=1e-6)
         assert np.diff(starts).tolist() == [1, 16, 16]
