@@ -339,7 +339,8 @@ def minimal() -> str:
     columns["margin [cm], median"] = shown("margin_m_median", ".1f", 100)
     columns |= {"fail with finer physics too": "confirmed", "faults": "faults"}
     columns["causes"] = lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:6])
-    return table(of_robots("results/{}/archive/minimal.json"), columns, upright=True)
+    found = of_robots("results/{}/archive/minimal.json")
+    return table({words: numbers for words, numbers in found.items() if numbers}, columns, upright=True)
 
 
 def packs() -> str:
