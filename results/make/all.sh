@@ -21,15 +21,15 @@ for robot in "${robots[@]}"; do
   folder=results/$robot
   make_file "$folder/base.json" base "$robot"                         # 2 min
   make_file "$folder/penalty_ratios.json" penalty_ratios "$robot"     # 1 min
-  make_file "$folder/recipes.json" recipes "$robot"                   # 25 min: nine trainings
   for part in archive archive_cma_mae independent third; do
     make_file "$folder/$part/curve.json" archive "$robot"             # 60 min: four searches, two of them judged
   done
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 10 min, most of it MuJoCo C on 16 cores
-  make_file "$folder/search.json" search "$robot"                     # 40 min: 16 searches
+  make_file "$folder/search.json" search "$robot"                     # 40 min: 11 searches
   make_file "$folder/search_noise.json" search_noise "$robot"         # 60 min: 47 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
+  make_file "$folder/recipes.json" recipes "$robot"                   # 20 min: six trainings
   make_file "$folder/rounds.json" rounds "$robot"                     # 60 min
   make_file "$folder/tables_paper_sizes.json" tables "$robot"         # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU

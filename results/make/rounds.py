@@ -13,6 +13,8 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse, publish_controller, read_made
+from sim.files.atomic import to_json, write_atomically
+from sim.policy.spec import controller_hash
 from train.cfg import HardenCfg, RunCfg
 from train.finetune import finetune
 from train.harden import ROUNDS_FILE, harden
@@ -42,12 +44,20 @@ def last_policy(script: Script) -> Path | None:
 
 
 def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
-    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
-    run = script.runs / "rounds" / f"{name}-{seed}"
-    cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
-    search(cfg, run, script.compute)
-    counts = judge_with_specialist(script, run)
-    return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
+    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None.
+
+    The run's counts.json keeps them: a controller that it has is not searched again.
+    """
+    run, searched = script.runs / "rounds" / f"{name}-{seed}", controller_hash(str(policy or script.policy))
+    made = script.read_so_far(run / "counts.json")
+    if made.get("searched_sha256") != searched:
+        cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
+        search(cfg, run, script.compute)
+        counts = judge_with_specialist(script, run)
+        row = {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
+        made = {**script.origin, "searched_sha256": searched, "row": row}
+        write_atomically(run / "counts.json", to_json(made))
+    return made["row"]
 
 
 def cfg_of(script: Script) -> HardenCfg:
@@ -66,8 +76,10 @@ def train_at_once(script: Script) -> Path:
 
 
 def harden_here(script: Script) -> dict[str, Any]:
-    """Three rounds, or in a trial a tiny one alone."""
-    cfg = cfg_of(script)
+    """Three rounds, or in a trial a tiny one alone; one that is finished is read."""
+    cfg, made = cfg_of(script), read_made(script.runs / "hardening" / ROUNDS_FILE)
+    if len(made.get("rounds", ())) > cfg.rounds:
+        return made
     if script.small:
         cfg = replace(
             cfg, rounds=1, search=replace(cfg.search, episodes=16),
