@@ -29,7 +29,7 @@ for robot in "${robots[@]}"; do
   make_file "$folder/search.json" search "$robot"                     # 40 min: 11 searches
   make_file "$folder/search_noise.json" search_noise "$robot"         # 60 min: 47 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
-  make_file "$folder/recipes.json" recipes "$robot"                   # 20 min: six trainings
+  make_file "$folder/recipes.json" recipes "$robot"                   # 10 min: three trainings
   make_file "$folder/rounds.json" rounds "$robot"                     # 60 min
   make_file "$folder/tables_paper_sizes.json" tables "$robot"         # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
