@@ -8,9 +8,9 @@ The first two are judged: contact resolved, a specialist trained on what fails, 
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from qd.judge import judge
+from qd.judge import Stage, judge
 from qd.run.directory import RunDirectory
 from results.make.common import ONCE, Script, follow_search, parse
 from train.cfg import FinetuneCfg, RunCfg
@@ -45,7 +45,14 @@ def make_archive(script: Script, name: str) -> Path:
 
 
 def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
-    """Judges a search with its own specialist among the certifiers; returns the content of archive.json."""
+    """Judges a search with its own specialist among the certifiers; returns the content of archive.json.
+
+    What today's sources have judged in all stages is read.
+    """
+    numbers = RunDirectory(run).read_summary()
+    judged_by = [numbers.get("judged_by", {}).get(stage, {}) for stage in get_args(Stage)]
+    if all(origin.get("sources_sha256") == script.origin["sources_sha256"] for origin in judged_by):
+        return numbers
     archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)
     if archive.failing.any():
         train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot), RunCfg(device=script.device))

@@ -55,8 +55,8 @@ def read(file: str) -> Any:
 
 
 def of_robots(file: str) -> dict[str, Any]:
-    """A file of both robots by their names in words."""
-    return {words: read(file.format(robot)) for robot, words in ROBOTS.items()}
+    """A file of the robots that have one, by their names in words."""
+    return {words: content for robot, words in ROBOTS.items() if (content := read(file.format(robot)))}
 
 
 def shown(key: str, form: str = ",.0f", factor: float = 1.0) -> Callable[[Any], str]:
@@ -239,7 +239,7 @@ def hardening() -> str:
     """Rounds of hardening: what a search finds of each controller, and its goal rates."""
     rows = {}
     for words, numbers in of_robots("results/{}/rounds.json").items():
-        for one in numbers.get("rounds", ()):
+        for one in numbers["rounds"]:
             goal = {name: rates.get(one["controller"]) for name, rates in numbers["tables"]["goal"].items()}
             rows[f"{words}: {one['controller']}"] = {**one, **goal}
     counts = ("elites", "corrected_elites", "failing", "faults", "faults_panel")
@@ -339,8 +339,7 @@ def minimal() -> str:
     columns["margin [cm], median"] = shown("margin_m_median", ".1f", 100)
     columns |= {"fail with finer physics too": "confirmed", "faults": "faults"}
     columns["causes"] = lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:6])
-    found = of_robots("results/{}/archive/minimal.json")
-    return table({words: numbers for words, numbers in found.items() if numbers}, columns, upright=True)
+    return table(of_robots("results/{}/archive/minimal.json"), columns, upright=True)
 
 
 def packs() -> str:

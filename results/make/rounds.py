@@ -13,8 +13,6 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse, publish_controller, read_made
-from sim.files.atomic import to_json, write_atomically
-from sim.policy.spec import controller_hash
 from train.cfg import HardenCfg, RunCfg
 from train.finetune import finetune
 from train.harden import ROUNDS_FILE, harden
@@ -31,11 +29,17 @@ TRAINED = ("hardening", "at_once")
 SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
 
 
+def read_hardening(script: Script) -> tuple[dict[str, Any], bool]:
+    """What the rounds.json of the hardening says so far, and whether all its rounds are done."""
+    made = read_made(script.runs / "hardening" / ROUNDS_FILE)
+    return made, len(made.get("rounds", ())) > cfg_of(script).rounds
+
+
 def last_policy(script: Script) -> Path | None:
     """File of the last training of the hardening that was kept; None if there is none."""
-    run = script.runs / "hardening"
-    rounds = read_made(run / ROUNDS_FILE).get("rounds", ())
-    if not script.small and len(rounds) <= cfg_of(script).rounds:
+    run, (made, is_done) = script.runs / "hardening", read_hardening(script)
+    rounds = made.get("rounds", ())
+    if not is_done:
         raise ValueError(
             f"{run} must hold a finished hardening, got {len(rounds)} searches: run the part hardening first"
         )
@@ -44,25 +48,27 @@ def last_policy(script: Script) -> Path | None:
 
 
 def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
-    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None.
-
-    The run's counts.json keeps them: a controller that it has is not searched again.
-    """
-    run, searched = script.runs / "rounds" / f"{name}-{seed}", controller_hash(str(policy or script.policy))
-    made = script.read_so_far(run / "counts.json")
-    if made.get("searched_sha256") != searched:
-        cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
-        search(cfg, run, script.compute)
-        counts = judge_with_specialist(script, run)
-        row = {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
-        made = {**script.origin, "searched_sha256": searched, "row": row}
-        write_atomically(run / "counts.json", to_json(made))
-    return made["row"]
+    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
+    run = script.runs / "rounds" / f"{name}-{seed}"
+    cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
+    search(cfg, run, script.compute)
+    counts = judge_with_specialist(script, run)
+    return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
 
 
 def cfg_of(script: Script) -> HardenCfg:
-    """Settings of the hardening; specialists judge the further searches alone, since no training needs them."""
-    return replace(HardenCfg.of(script.robot), seed=script.seed, specialists=False)
+    """Settings of the hardening, in a trial of one tiny round.
+
+    Specialists judge the further searches alone, since no training needs them.
+    """
+    cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=False)
+    if not script.small:
+        return cfg
+    return replace(
+        cfg, rounds=1, search=replace(cfg.search, episodes=16),
+        tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
+        evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
+    )  # fmt: skip
 
 
 def train_at_once(script: Script) -> Path:
@@ -76,17 +82,12 @@ def train_at_once(script: Script) -> Path:
 
 
 def harden_here(script: Script) -> dict[str, Any]:
-    """Three rounds, or in a trial a tiny one alone; one that is finished is read."""
-    cfg, made = cfg_of(script), read_made(script.runs / "hardening" / ROUNDS_FILE)
-    if len(made.get("rounds", ())) > cfg.rounds:
+    """All rounds; those that are done are read."""
+    made, is_done = read_hardening(script)
+    if is_done:
         return made
-    if script.small:
-        cfg = replace(
-            cfg, rounds=1, search=replace(cfg.search, episodes=16),
-            tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
-            evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
-        )  # fmt: skip
-    return harden(script.robot, cfg, script.runs / "hardening", script.compute, certifiers={} if script.small else None)
+    certifiers = {} if script.small else None
+    return harden(script.robot, cfg_of(script), script.runs / "hardening", script.compute, certifiers=certifiers)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import bare, common, conditions, docs, rounds, search_noise, speed, tables, train_speed
+from results.make import archive, bare, common, conditions, docs, search_noise, speed, tables, train_speed
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -90,20 +90,17 @@ def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path,
     assert common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites")) == again
 
 
-def test_a_controller_that_was_searched_again_is_not_searched_once_more(tmp_path, monkeypatch):
+def test_what_todays_sources_have_judged_in_all_stages_is_read(tmp_path, monkeypatch):
     words = ["--small", "--device", "cpu", "--out", str(tmp_path / "anymal/rounds.json")]
-    script, searched = common.parse(None, words, "rounds.json"), []
-
-    def search(cfg, run, compute):
-        run.mkdir(parents=True, exist_ok=True)
-        searched.append(cfg.policy)
-
-    monkeypatch.setattr(rounds, "search", search)
-    monkeypatch.setattr(rounds, "judge_with_specialist", lambda script, run: {"faults": len(searched)})
-    for number, name in enumerate(("one", "one", "another")):
-        (tmp_path / "policy.pt").write_text(name)
-        row = rounds.search_again(script, "hardening", tmp_path / "policy.pt", 1000)
-        assert (row["seed"], row["faults"], len(searched)) == (1000, *[(1, 1), (1, 1), (2, 2)][number])
+    script, judged = common.parse(None, words, "rounds.json"), []
+    monkeypatch.setattr(archive, "judge", lambda run, **_: judged.append(run) or SimpleNamespace(failing=np.zeros(1)))
+    stages = {name: {"sources_sha256": sources_sha256()} for name in ("fresh", "resolved", "others", "varied")}
+    of_others = {**stages, "fresh": {"sources_sha256": "of others"}}
+    without = {name: origin for name, origin in stages.items() if name != "varied"}
+    for by, passes in ((stages, 0), (of_others, 2), (without, 2), ({}, 2)):
+        judged.clear()
+        (tmp_path / "archive.json").write_text(json.dumps({"faults": 3, "judged_by": by}))
+        assert archive.judge_with_specialist(script, tmp_path)["faults"] == 3 and judged == [tmp_path] * passes
 
 
 def test_doses_are_those_of_todays_sources(tmp_path):
