@@ -26,8 +26,7 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
 PUBLISHED = (
-    "archive.npz", "archive.json", "config.json", "metrics.jsonl", "curve.json", "*.png", "minimal.*",
-    "certifiers/specialist.*",
+    "archive.npz", "archive.json", "config.json", "curve.json", "*.png", "minimal.*", "certifiers/specialist.*",
 )  # fmt: skip
 """Files of a run that are published."""
 COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")

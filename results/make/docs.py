@@ -98,7 +98,7 @@ def rate(robot: str, measure: str, terrains: str, controller: str, *, short: boo
 
 def archives() -> str:
     """What the published searches found, beside the paper."""
-    found = {f"{words}{', cma_mae' * name.endswith('mae')}": read(f"results/{robot}/{name}/archive.json")
+    found = {f"{words}{', CMA-MAE' * name.endswith('mae')}": read(f"results/{robot}/{name}/archive.json")
              for robot, words in ROBOTS.items() for name in ("archive", "archive_cma_mae")}  # fmt: skip
     found |= {f"{words}, the paper": {"episodes": 4e6, **PAPER_ARCHIVES[robot]} for robot, words in ROBOTS.items()}
     columns = {
@@ -327,7 +327,7 @@ def agreement() -> str:
     """How far rates at the search's settings lie above those of other crossings of the same terrains."""
     ways = {"again": "the same settings again", "resolved": "finer physics", "mujoco_c": "MuJoCo C, finer",
             "both_resolved": "both finer"}  # fmt: skip
-    rows = {f"{words}, {name.replace('_', '-')}: {label}": numbers[name].get(f"{way}_resolved", numbers[name][way])
+    rows = {f"{words}, {name.replace('_', '-')}: {label}": numbers[name][way]
             for words, numbers in of_robots("results/{}/agreement.json").items()
             for name in ("hard_random", "elites") for way, label in ways.items() if way in numbers[name]}  # fmt: skip
     return table(rows, {"terrains": "terrains", "goal rate": shown("goal_bias", "+.3f")})

@@ -81,19 +81,19 @@ def draw_noise() -> Figure:
 
 def draw_growth() -> Figure:
     """The published searches: corrected and failing elites over their episodes, by the paper's method too."""
-    figure = new_figure(10.5, 4.2)
+    figure = new_figure(12, 3.6)
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
-        axes.set(title=words, xlabel="episodes", ylabel="elites", xscale="log")
+        axes.set(title=words, xlabel="million episodes", ylabel="elites")
         for name, label in {"archive": "default", "archive_cma_mae": "CMA-MAE"}.items():
             rows = read(f"results/{robot}/{name}/curve.json").get("curve", ())
             for count, style in {"corrected_elites": "-", "failing": "--"}.items():
                 axes.plot(
-                    [row["episodes"] for row in rows], [row[count] for row in rows], style, marker=".",
+                    [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows], style, marker=".",
                     color="C0" if name == "archive" else "C1", label=f"{label}: {count.replace('_', ' ')}",
                 )  # fmt: skip
         axes.axhline(PAPER_ARCHIVES[robot]["elites"], color="0.5", label="the paper's elites, as found")
-        axes.legend(fontsize=8)
         axes.grid(alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside right center")
     return figure
 
 
