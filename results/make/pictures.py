@@ -85,7 +85,7 @@ def draw_growth() -> Figure:
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="million episodes", ylabel="elites")
         for name, label in {"archive": "default", "archive_cma_mae": "CMA-MAE"}.items():
-            rows = read(f"results/{robot}/{name}/curve.json").get("curve", ())
+            rows = read(f"results/{robot}/{name}/curve.json")["curve"]
             for count, style in {"corrected_elites": "-", "failing": "--"}.items():
                 axes.plot(
                     [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows], style, marker=".",
@@ -107,8 +107,7 @@ def main() -> None:
         take_still(source, "payload")
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
-        if read("results/anymal/archive/curve.json"):
-            save_figure(FOLDER / "growth.png", draw_growth())
+        save_figure(FOLDER / "growth.png", draw_growth())
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.screenshots"], check=True)
 
