@@ -9,7 +9,6 @@ again; parts of another GPU are dropped. On the CPU there is one, which joins th
 """
 
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -241,7 +240,7 @@ def time_view(robot: str, folder: Path) -> dict[str, float | None]:
             page.goto(f"http://127.0.0.1:{port}")
             page.wait_for_function("document.querySelector('#faultline [aria-label=Pause]')", timeout=300_000)
             plays_s = time.perf_counter() - began
-            server.send_signal(signal.SIGINT)
+            server.terminate()
             server.communicate()
     return {"view_to_page_s": served_s, "view_to_failure_s": plays_s}
 
