@@ -13,8 +13,8 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse, publish_controller, read_made
-from train.cfg import HardenCfg, RunCfg
-from train.finetune import finetune
+from results.make.tables import train
+from train.cfg import HardenCfg
 from train.harden import ROUNDS_FILE, harden
 
 COUNTS = (
@@ -75,10 +75,8 @@ def train_at_once(script: Script) -> Path:
     """A controller that has the steps of all rounds in one training, on the published archive."""
     cfg = cfg_of(script)
     tune = cfg.sized_tune(script.robot, script.device)
-    tune = replace(
-        tune, seed=script.seed, archive=(str(script.results / "archive"),), iterations=cfg.rounds * tune.iterations
-    )
-    return finetune(script.robot, tune, script.runs / "at_once", RunCfg(device=script.device))
+    tune = replace(tune, iterations=cfg.rounds * tune.iterations)
+    return Path(train(script, tune, "C-G", script.seed, script.runs / "at_once"))
 
 
 def harden_here(script: Script) -> dict[str, Any]:
