@@ -264,19 +264,6 @@ def searched_again() -> str:
     return table(rows, {in_words(count): spread(count) for count in counts})
 
 
-def growth() -> str:
-    """What the published searches have found after so many episodes."""
-    rows = {
-        f"{words}, {label}, {row['episodes']:,}": row
-        for robot, words in ROBOTS.items()
-        for name, label in {"archive": "seed 0", "independent": "seed 1", "third": "seed 2",
-                            "archive_cma_mae": "CMA-MAE"}.items()
-        for row in read(f"results/{robot}/{name}/curve.json").get("curve", ())
-    }  # fmt: skip
-    counts = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
-    return table(rows, {in_words(count): count for count in counts})
-
-
 def spaces() -> str:
     """Searches in different terrain spaces."""
     rows = {f"{words}, {name}": one for words, numbers in of_robots("results/{}/spaces.json").items()
@@ -484,7 +471,7 @@ def kernels() -> str:
 
 
 TABLES: dict[str, Callable[..., str]] = {make.__name__: make for make in (
-    archives, growth, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement,
+    archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement,
     minimal, packs, public_controllers, speed, kernels, noise, conditions,
     condition_examples, differences)}  # fmt: skip
 

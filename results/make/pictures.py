@@ -80,16 +80,18 @@ def draw_noise() -> Figure:
 
 
 def draw_growth() -> Figure:
-    """The published searches: corrected and failing elites over their episodes, by the paper's method too."""
+    """Corrected and failing elites of the published searches over their episodes."""
     figure = new_figure(12, 3.6)
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="million episodes", ylabel="elites")
-        for name, label in {"archive": "default", "archive_cma_mae": "CMA-MAE"}.items():
+        searches = {"archive": ("default", "C0"), "independent": ("default, two other seeds", "C9"),
+                    "third": (None, "C9"), "archive_cma_mae": ("CMA-MAE", "C1")}  # fmt: skip
+        for name, (label, color) in searches.items():
             rows = read(f"results/{robot}/{name}/curve.json")["curve"]
             for count, style in {"corrected_elites": "-", "failing": "--"}.items():
                 axes.plot(
                     [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows], style, marker=".",
-                    color="C0" if name == "archive" else "C1", label=f"{label}: {count.replace('_', ' ')}",
+                    color=color, label=label and f"{label}: {count.replace('_', ' ')}",
                 )  # fmt: skip
         axes.axhline(PAPER_ARCHIVES[robot]["elites"], color="0.5", label="the paper's elites, as found")
         axes.grid(alpha=0.3)
