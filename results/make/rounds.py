@@ -2,7 +2,8 @@
 
 The base and the last controller are searched three times more, each with a specialist of its own. The last one is
 published as results/<robot>/hardened.pt. Beside it one training on the published archive alone, of as many steps as
-all rounds together, is searched as often.
+all rounds together, is searched as often. Three rounds more of the last controller were not planned: they were begun
+when its further searches had found more than a quarter of the base's faults.
 """
 
 from collections.abc import Sequence
@@ -25,24 +26,22 @@ COUNTS = (
 EPISODES = 416_000
 SEEDS = (1000, 1001, 1002)
 """Of the further searches, which are as long as those of the rounds, and whose seeds are far from theirs."""
-TRAINED = ("hardening", "at_once")
+TRAINED = ("hardening", "at_once", "again")
 SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
 
 
-def read_hardening(script: Script) -> tuple[dict[str, Any], bool]:
-    """What the rounds.json of the hardening says so far, and whether all its rounds are done."""
-    made = read_made(script.runs / "hardening" / ROUNDS_FILE)
+def read_hardening(script: Script, name: str = "hardening") -> tuple[dict[str, Any], bool]:
+    """What the rounds.json of a hardening says so far, and whether all its rounds are done."""
+    made = read_made(script.runs / name / ROUNDS_FILE)
     return made, len(made.get("rounds", ())) > cfg_of(script).rounds
 
 
-def last_policy(script: Script) -> Path | None:
-    """File of the last training of the hardening that was kept; None if there is none."""
-    run, (made, is_done) = script.runs / "hardening", read_hardening(script)
+def last_policy(script: Script, name: str = "hardening") -> Path | None:
+    """File of the last training of a hardening that was kept; None if there is none."""
+    run, (made, is_done) = script.runs / name, read_hardening(script, name)
     rounds = made.get("rounds", ())
     if not is_done:
-        raise ValueError(
-            f"{run} must hold a finished hardening, got {len(rounds)} searches: run the part hardening first"
-        )
+        raise ValueError(f"{run} must hold a finished hardening, got {len(rounds)} searches: run the part {name} first")
     kept = [row["tuned"] for row in rounds if row["kept"]]
     return run / kept[-1] / "policy.pt" if kept else None
 
@@ -79,27 +78,34 @@ def train_at_once(script: Script) -> Path:
     return Path(train(script, tune, "C-G", script.seed, script.runs / "at_once"))
 
 
-def harden_here(script: Script) -> dict[str, Any]:
-    """All rounds; those that are done are read."""
-    made, is_done = read_hardening(script)
+def harden_here(script: Script, name: str = "hardening") -> dict[str, Any]:
+    """All rounds of a hardening, or of one again of its last controller; those that are done are read."""
+    made, is_done = read_hardening(script, name)
     if is_done:
         return made
-    certifiers = {} if script.small else None
-    return harden(script.robot, cfg_of(script), script.runs / "hardening", script.compute, certifiers=certifiers)
+    cfg, certifiers = cfg_of(script), {} if script.small else None
+    if name == "again":
+        cfg = replace(cfg, policy=str(last_policy(script) or script.policy), seed=script.seed + 1)
+    return harden(script.robot, cfg, script.runs / name, script.compute, certifiers=certifiers)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
 
-    Parts are the two trainings, and each search by what it is of and its seed; those of the hardening come after it.
-    Where no round is kept there is nothing to search again.
+    Parts are the trainings, and each search by what it is of and its seed; those of a hardening come after it.
+    Where no round is kept there is nothing to search again. The second hardening is begun as a part alone.
     """
     script = parse(__doc__, argv, "rounds.json", parts=(*TRAINED, *SEARCHES))
-    parts = script.parts or (TRAINED[:1] if script.small else (*TRAINED, *SEARCHES))
+    again, is_done = read_hardening(script, "again")
+    usual = [part for part in (*TRAINED, *SEARCHES) if is_done or not part.startswith("again")]
+    parts = script.parts or (usual[:1] if script.small else usual)
     hardening = harden_here(script) if "hardening" in parts else {}
     if "at_once" in parts:
         train_at_once(script)
-    policies = {"base": lambda _: None, "hardening": last_policy, "at_once": train_at_once}
+    if "again" in parts:
+        again = harden_here(script, "again")
+    policies = {"base": lambda _: None, "hardening": last_policy, "at_once": train_at_once,
+                "again": lambda script: last_policy(script, "again")}  # fmt: skip
     searches: dict[str, list[dict[str, Any]]] = {name: [] for name in policies}
     for name, seed in (SEARCHES[part] for part in parts if part in SEARCHES):
         policy = policies[name](script)
@@ -120,6 +126,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             "searches": searches["hardening"],
             "base_searches": searches["base"],
             "at_once_searches": searches["at_once"],
+            "again_rounds": again.get("rounds", []) if is_done else [],
+            "again_searches": searches["again"],
         }
     )
 
