@@ -89,6 +89,13 @@ def harden_here(script: Script, name: str = "hardening") -> dict[str, Any]:
     return harden(script.robot, cfg, script.runs / name, script.compute, certifiers=certifiers)
 
 
+def policy_of(script: Script, name: str) -> Path | None:
+    """The controller that further searches are of; None for the shipped one, and where no round was kept."""
+    if name == "base":
+        return None
+    return train_at_once(script) if name == "at_once" else last_policy(script, name)
+
+
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
 
@@ -96,19 +103,15 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     Where no round is kept there is nothing to search again. The second hardening is begun as a part alone.
     """
     script = parse(__doc__, argv, "rounds.json", parts=(*TRAINED, *SEARCHES))
-    again, is_done = read_hardening(script, "again")
-    usual = [part for part in (*TRAINED, *SEARCHES) if is_done or not part.startswith("again")]
+    has_again = read_hardening(script, "again")[1]
+    usual = [part for part in (*TRAINED, *SEARCHES) if has_again or not part.startswith("again")]
     parts = script.parts or (usual[:1] if script.small else usual)
-    hardening = harden_here(script) if "hardening" in parts else {}
+    hardenings = {name: harden_here(script, name) for name in ("hardening", "again") if name in parts}
     if "at_once" in parts:
         train_at_once(script)
-    if "again" in parts:
-        again = harden_here(script, "again")
-    policies = {"base": lambda _: None, "hardening": last_policy, "at_once": train_at_once,
-                "again": lambda script: last_policy(script, "again")}  # fmt: skip
-    searches: dict[str, list[dict[str, Any]]] = {name: [] for name in policies}
+    searches: dict[str, list[dict[str, Any]]] = {name: [] for name in ("base", *TRAINED)}
     for name, seed in (SEARCHES[part] for part in parts if part in SEARCHES):
-        policy = policies[name](script)
+        policy = policy_of(script, name)
         if name == "base" or policy is not None:
             searches[name].append(search_again(script, name, policy, seed))
     if script.parts:
@@ -121,12 +124,12 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             publish_controller(script, hardened, "hardened")
     return script.write(
         {
-            **hardening,
+            **hardenings["hardening"],
             "seed": script.seed,
             "searches": searches["hardening"],
             "base_searches": searches["base"],
             "at_once_searches": searches["at_once"],
-            "again_rounds": again.get("rounds", []) if is_done else [],
+            "again_rounds": hardenings.get("again", {}).get("rounds", []),
             "again_searches": searches["again"],
         }
     )
