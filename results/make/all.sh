@@ -47,6 +47,7 @@ for robot in "${robots[@]}"; do
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
   "$python" -m results.make.public "$PUBLIC"                            # 40 min
+  "$python" -m results.make.public "$PUBLIC" --speed                    # 2 min
   "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min

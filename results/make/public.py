@@ -25,12 +25,12 @@ from qd.show.elites import open_run
 from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
-from results.make.common import agreement, crossing_rates
+from results.make.common import agreement, crossing_rates, read_made
 from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
 from sim.device import resolve_device
-from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
+from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import provenance, sources_sha256
 from sim.files.settings import read_toml
 from sim.policy.imports import import_controller
@@ -157,22 +157,29 @@ def agree(crossings: Crossings, space: str, seed: int, terrains: int) -> dict[st
     return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 
+def rows_so_far(out: Path, origin: dict[str, Any]) -> dict[str, Any]:
+    """Controllers in the file, if today's sources measured them on this device, or in a trial; else none."""
+    content = read_made(out)
+    alike = all(content.get(name) == origin[name] for name in ("sources_sha256", "device", "seed", "small"))
+    return content["controllers"] if alike else {}
+
+
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Measures all of them, or those named, and writes what came of it as each is done."""
+    """Measures all of them, or those named, and writes what came of it as each is done; what is done stays done."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the publishers' files")
     parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", action="store_true", help="stills of searches that are there, and nothing else")
-    parser.add_argument("--speed", action="store_true", help="episodes a second alone, of those in the file")
+    parser.add_argument("--speed", action="store_true", help="episodes a second of those in the file, and nothing else")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
     compute = Compute(resolve_device(args.device))
     out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
     runs = out.parent / "public" if args.small else Path("runs/make") / sources_sha256()[:12] / "public"
-    if args.small and not args.pictures:
+    if args.small and not (args.pictures or args.speed):
         shutil.rmtree(runs, ignore_errors=True)
     if args.pictures:
         for name in set(args.only) & set(PICTURES):
@@ -180,21 +187,19 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             take_still(source_of_run(opened), name)
         return {}
     prepare_output(out)
-    now = provenance(compute.device, args.seed)
-    content = read_json(out) if args.speed else now | {"small": args.small, "controllers": {}}
-    if content.get("small", False) != args.small:
-        raise ValueError(f"{out} must be of a trial with --small, and of none without it")
+    origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()
     for name in args.only:
-        numbers = content["controllers"].get(name, {})
-        timed = numbers.get("timed", {})
-        if not args.speed:
-            numbers |= measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
-        elif not numbers or all(timed.get(key) == now[key] for key in ("sources_sha256", "device")):
-            continue
-        numbers |= time_alone(name, args.folder, runs, compute, seed=args.seed, small=args.small)
-        content["controllers"][name] = numbers
-        print(json.dumps({name: numbers}, indent=1), flush=True)
-        write_atomically(out, to_json(content))
+        done, last = rows_so_far(out, origin).get(name), "timed" if args.speed else "half"
+        if args.speed and done is None:
+            raise ValueError(f"{out} must hold {name} by today's sources and device: run this without --speed first")
+        if done is None or last not in done:
+            make = time_alone if args.speed else measure
+            numbers = make(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+            rows = rows_so_far(out, origin)  # another process may have written meanwhile
+            rows[name] = rows.get(name, {}) | numbers
+            content = origin | {"controllers": {name: rows[name] for name in CONTROLLERS if name in rows}}
+            print(json.dumps({name: numbers}, indent=1), flush=True)
+            write_atomically(out, to_json(content))
     return content
 
 
