@@ -77,6 +77,8 @@ class Motion:
         ``beside`` launches what a control step has beside its physics.
         """
         self.sim, self.segments = sim, segments
+        self.beside = beside
+        """Kept, since the graph works on its arrays."""
         self.robot_steps = sim.robot.decimation * sum(part.num_running * len(part.targets) for part in segments)
         """Physics steps of the robots that are not left out, in one replay of all segments."""
 
