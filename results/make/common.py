@@ -117,8 +117,8 @@ class Script:
     def read_dose(self) -> list[dict[str, Any]]:
         """Rows of dose.json beside the file, made by today's sources; in a trial none if it is not there."""
         file = self.out.with_name("dose.json")
-        content, names = read_made(file), ("sources_sha256", "seed", "robot_sha256", "penalty_definition")
-        if any(content.get(name) != self.origin[name] for name in names):
+        content = read_alike(file, self.origin, "sources_sha256", "seed", "robot_sha256", "penalty_definition")
+        if not content:
             if self.small:
                 return []
             raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
@@ -141,9 +141,8 @@ class Script:
 
         ``alike`` are further names of its origin that must be as they are now.
         """
-        content = read_made(file)
         names = ("sources_sha256", "small", "seed", "robot_sha256", "penalty_definition", "policy_sha256", *alike)
-        return content if all(content.get(name) == self.origin.get(name) for name in names) else {}
+        return read_alike(file, self.origin, *names)
 
     def write(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Writes the file, with its origin first, and prints it without that; returns its content."""
@@ -290,6 +289,12 @@ def read_made(file: Path) -> dict[str, Any]:
         return read_json(file)
     except (FileNotFoundError, ValueError):
         return {}
+
+
+def read_alike(file: Path, origin: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """What a file says if it is of an origin, by these names of it; else nothing."""
+    content = read_made(file)
+    return content if all(content.get(name) == origin.get(name) for name in names) else {}
 
 
 def is_current(file: Path) -> bool:

@@ -253,12 +253,8 @@ def searched_again() -> str:
     """What further searches find of the base, the hardened controller and one of as many steps: least to most."""
     rows = {}
     for words, numbers in of_robots("results/{}/rounds.json").items():
-        for name, label in {
-            "base_searches": "base",
-            "searches": "hardened",
-            "at_once_searches": "at once",
-            "again_searches": "hardened again",
-        }.items():
+        for name, label in {"base_searches": "base", "searches": "hardened", "at_once_searches": "at once",
+                            "again_searches": "hardened again"}.items():  # fmt: skip
             found = numbers.get(name) or ()
             rows |= {f"{words}: {label} ({len(found)})": found} if found else {}
 

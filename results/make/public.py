@@ -25,7 +25,7 @@ from qd.show.elites import open_run
 from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
-from results.make.common import agreement, crossing_rates, read_made
+from results.make.common import agreement, crossing_rates, read_alike
 from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
@@ -159,9 +159,7 @@ def agree(crossings: Crossings, space: str, seed: int, terrains: int) -> dict[st
 
 def rows_so_far(out: Path, origin: dict[str, Any]) -> dict[str, Any]:
     """Controllers in the file, if today's sources measured them on this device, or in a trial; else none."""
-    content = read_made(out)
-    alike = all(content.get(name) == origin[name] for name in ("sources_sha256", "device", "seed", "small"))
-    return content["controllers"] if alike else {}
+    return read_alike(out, origin, "sources_sha256", "device", "seed", "small").get("controllers", {})
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -189,10 +187,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     prepare_output(out)
     origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()
     for name in args.only:
-        done, last = rows_so_far(out, origin).get(name), "timed" if args.speed else "half"
+        done = rows_so_far(out, origin).get(name)
         if args.speed and done is None:
             raise ValueError(f"{out} must hold {name} by today's sources and device: run this without --speed first")
-        if done is None or last not in done:
+        if done is None or (args.speed and "timed" not in done):
             make = time_alone if args.speed else measure
             numbers = make(name, args.folder, runs, compute, seed=args.seed, small=args.small)
             rows = rows_so_far(out, origin)  # another process may have written meanwhile
