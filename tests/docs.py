@@ -17,6 +17,8 @@ PAGES = {str(path.relative_to(ROOT)): path for path in [ROOT / "README.md", *sor
 """The pages by name, such as ``docs/faults.md``."""
 _NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)(?!\w)")
 _NO_PROSE = (r"^```.*?^```$", r"^\|.*?$", r"<!--.*?-->", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+")
+_FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round}
+"""What an expression may call."""
 _KINDS = (
     r"arXiv \d+\.\d+",
     r"Python 3\.\d+",
@@ -83,7 +85,7 @@ class Number(NamedTuple):
     @property
     def value(self) -> float:
         """What the source says."""
-        return float(eval(self.expression, {"__builtins__": {}}, {"len": len, "round": round, **_content(self.source)}))
+        return float(eval(self.expression, {**_FUNCTIONS, **_content(self.source)}))
 
     def is_rounded(self, value: float) -> bool:
         """Whether the number is a value, to as many digits as it has."""

@@ -85,11 +85,11 @@ def table(rows: Mapping[str, Any], columns: Mapping[str, Column], *, upright: bo
     return "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], ["---"] * len(lines[0]), *lines[1:]))
 
 
-def rate(robot: str, measure: str, terrains: str, controller: str, *, short: bool = False) -> str:
+def rate(
+    robot: str, measure: str, terrains: str, controller: str, *, short: bool = False, file: str = "tables"
+) -> str:
     """A mean over seeds where there are several, else over terrains, with its interval unless it shall be short."""
-    tables = read(f"results/{robot}/tables.json")
-    if controller == "hardened" and controller not in tables["goal"]["hand_crafted"]:
-        tables = read(f"results/{robot}/hardened.json")
+    tables = read(f"results/{robot}/{file}.json")
     seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
     value = seeds.get("mean", tables[measure].get(terrains, {}).get(controller))
     limits = seeds.get("interval", tables["intervals"][measure].get(terrains, {}).get(controller))
@@ -141,24 +141,25 @@ def goals(robot: str, measure: str = "goal") -> str:
 def differences() -> str:
     """How much more often one kind of controller reaches the goal than another, over terrains and seeds."""
     rows = {f"{words}, {SETS[name]}": of_set for words, tables in of_robots("results/{}/tables.json").items()
-            for name, of_set in tables.get("differences", {}).items() if name in SETS}  # fmt: skip
+            for name, of_set in tables["differences"].items() if name in SETS and name not in HELD_OUT}  # fmt: skip
 
     def cell(pair: str) -> Callable[[Any], str]:
         return lambda row: value_words(row[pair]["goal"], row[pair]["interval"], "+.3f") if row.get(pair) else NONE
 
-    pairs = ("C-G - C-HR", "C-G - C-HC", "C-G - base", "hardened - C-G")
+    pairs = ("C-G - C-HR", "C-G - C-HC", "hardened - C-G")
     return table(rows, {pair: cell(pair) for pair in pairs})
 
 
 def beside_paper() -> str:
-    """No base collision and reward, and in brackets what the paper says of its controllers."""
+    """No base collision and reward at the paper's sizes, and in brackets what the paper says of its controllers."""
     names, controllers = ("hand_crafted", "hard_random", "generated"), CONTROLLERS[1:4]
     rows = {f"{words}, {SETS[name]}": (robot, name) for robot, words in ROBOTS.items() for name in names}
 
     def cell(measure: str, controller: str, form: str) -> Callable[[Any], str]:
         def words(row: tuple[str, str]) -> str:
             of_paper = PAPER[row[0]][measure][names.index(row[1])][controllers.index(controller)]
-            return f"{rate(row[0], measure, row[1], controller, short=True)} ({of_paper:{form}})"
+            of_ours = rate(row[0], measure, row[1], controller, short=True, file="tables_paper_sizes")
+            return f"{of_ours} ({of_paper:{form}})"
 
         return words
 
@@ -178,7 +179,7 @@ def methods(robot: str) -> str:
 def noise() -> str:
     """Designs of a search under noise: means over their seeds."""
     rows = {
-        f"{words}, {name} ({len(rows)})": mean_of(rows)
+        f"{words}, {name}": mean_of(rows)
         for robot, words in ROBOTS.items()
         for name, rows in searches_of(robot).items()
     }
@@ -190,12 +191,12 @@ def noise() -> str:
 
 
 def searches_of(robot: str) -> dict[str, list[Any]]:
-    """Rows of searches under noise by design: those that have several seeds, and the long ones."""
+    """Rows of searches under noise by design: those that have several seeds."""
     searches = dict[str, list[Any]]()
     for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
         if row["search"] != row["design"]:
             searches.setdefault(row["search"].partition(", seed")[0], []).append(row)
-    return {name: rows for name, rows in searches.items() if len(rows) > 1 or name.endswith("a million")}
+    return {name: rows for name, rows in searches.items() if len(rows) > 1}
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:

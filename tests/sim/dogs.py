@@ -60,17 +60,43 @@ def mjcf(*, drive: str = DRIVE, trunk: str | None = None, asset: str = "") -> st
 """
 
 
-def urdf(*, trunk: str | None = None) -> str:
-    """The URDF of docs/robots.md with all legs, a capsule tag, and visuals that are nowhere."""
-    (text,) = code_of("docs/robots.md", "xml")
-    before, _, leg = text.partition("  <!-- FR, HL")[0].partition('  <link name="FL_thigh">')
-    leg = f'  <link name="FL_thigh">{leg.replace("cylinder", "capsule", 1)}'
-    if trunk is not None:
-        before = before.replace('<box size="0.5 0.16 0.1"/>', trunk)
-    missing = '<visual><geometry><mesh filename="package://nowhere/trunk.dae"/></geometry></visual>'
-    before = before.replace("<collision>", f"{missing}<collision>")
-    legs = (leg.replace("FL_", f"{name}_").replace("0.2 0.12 0", f"{x} {y} 0") for name, (x, y) in LEGS.items())
-    return f"{before}{''.join(legs)}</robot>\n"
+def urdf(*, trunk: str = '<box size="0.5 0.16 0.1"/>') -> str:
+    """The same dog as a URDF without drives, with thighs of MuJoCo's capsules and a visual that is nowhere."""
+
+    def link(name: str, mass: float, inertia: tuple[float, float, float], z: float, shape: str, shape_z: float) -> str:
+        ixx, iyy, izz = inertia
+        return f"""
+  <link name="{name}">
+    <inertial>
+      <origin xyz="0 0 {z}"/><mass value="{mass}"/>
+      <inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+    <visual><geometry><mesh filename="package://nowhere/{name}.dae"/></geometry></visual>
+    <collision><origin xyz="0 0 {shape_z}"/><geometry>{shape}</geometry></collision>
+  </link>"""
+
+    def joint(name: str, parent: str, child: str, at: str, limits: str = "") -> str:
+        turns = f'<axis xyz="0 1 0"/><limit {limits} effort="30" velocity="30"/>' if limits else ""
+        return f"""
+  <joint name="{name}" type="{"revolute" if limits else "fixed"}">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>{turns}
+  </joint>"""
+
+    def tube(kind: str, size: tuple[float, float]) -> str:
+        return f'<{kind} radius="{size[0]}" length="{size[1]}"/>'
+
+    parts = [link("trunk", 8.0, (0.03, 0.2, 0.2), 0, trunk, 0)]
+    for leg, (x, y) in LEGS.items():
+        thigh, shank, foot = (f"{leg}_{part}" for part in ("thigh", "shank", "foot"))
+        parts += [
+            link(thigh, 0.8, (0.002, 0.002, 0.0005), -0.07, tube("capsule", THIGH), -THIGH[1] / 2),
+            joint(f"{leg}_hip", "trunk", thigh, f"{x} {y} 0", 'lower="-1.5" upper="2.5"'),
+            link(shank, 0.3, (0.0006, 0.0006, 0.0001), -0.07, tube("cylinder", SHANK), -SHANK[1] / 2),
+            joint(f"{leg}_knee", thigh, shank, "0 0 -0.15", 'lower="-2.6" upper="-0.1"'),
+            link(foot, 0.1, (0.00005,) * 3, 0, f'<sphere radius="{FOOT}"/>', 0),
+            joint(f"{leg}_ankle", shank, foot, "0 0 -0.15"),
+        ]
+    return f'<robot name="dog">{"".join(parts)}\n</robot>\n'
 
 
 GAINS = """
