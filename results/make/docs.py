@@ -171,9 +171,8 @@ def beside_paper() -> str:
 def methods(robot: str) -> str:
     """Methods of search, means over seeds, the one with most failing elites first."""
     rows = sorted(read(f"results/{robot}/search.json").get("methods", {}).items(), key=lambda row: -row[1]["failing"])
-    names = ("seeds", "elites", "corrected_elites", "failing", "confirmed", "faults_panel")
-    named = {name.replace("mixed", "cma_mae+map_elites"): one for name, one in rows if ":" not in name}
-    return table(named, {in_words(name): name for name in ("episodes", *names)})
+    names = ("episodes", "seeds", "elites", "corrected_elites", "failing", "faults_panel", "fault_families")
+    return table(dict(rows), {in_words(name): name for name in names})
 
 
 def noise() -> str:
