@@ -9,6 +9,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +83,11 @@ def table(rows: Mapping[str, Any], columns: Mapping[str, Column], *, upright: bo
     lines = [[line[k] for k in used] for line in (["", *made], *lines)]
     if upright:
         lines = [list(line) for line in zip(*lines, strict=True)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (lines[0], ["---"] * len(lines[0]), *lines[1:]))
+    head, *body = ("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join([head, "|---" * len(lines[0]) + "|", *body])
 
 
-def rate(
-    robot: str, measure: str, terrains: str, controller: str, *, short: bool = False, file: str = "tables"
-) -> str:
+def rate(robot: str, measure: str, terrains: str, controller: str, *, short: bool = False, file: str = "tables") -> str:
     """A mean over seeds where there are several, else over terrains, with its interval unless it shall be short."""
     tables = read(f"results/{robot}/{file}.json")
     seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
@@ -213,25 +213,28 @@ def conditions() -> str:
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
-    columns |= {f"... crossed with {kind} alone made nominal": kind for kind in KINDS}
+    columns |= {f"... crossed with nominal {kind}": kind for kind in KINDS}
     return table(rows, columns, upright=True)
+
+
+def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
+    """The minimal terrain of fewest parts that keeps a kind of condition, of the elites that need that kind alone."""
+    examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
+    minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
+    of_kind = [one for one in minima if examples.get(one["elite"], {}).get("needs") == kind]
+    kept = [one for one in of_kind if BUMPS + [*KINDS].index(kind) in one["bumps"]]
+    return min(kept, key=lambda one: len(one["bumps"]), default=None)
 
 
 def condition_examples() -> str:
     """The smallest failing terrains that keep the condition that their elites need; of each kind the least."""
-    lines = ["| needs | what is left | under | reach the goal | verdict |", "| --- | --- | --- | --- | --- |"]
-    for robot, words in ROBOTS.items():
-        examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
-        minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
-        for number, kind in enumerate(KINDS):
-            of_kind = [one for one in minima if examples.get(one["elite"], {}).get("needs") == kind]
-            least = min((one for one in of_kind if BUMPS + number in one["bumps"]),
-                        key=lambda one: len(one["bumps"]), default=None)  # fmt: skip
-            if least is not None:
-                bumps = sum(part < BUMPS for part in least["bumps"])
-                ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"
-                left, verdict = "; ".join(least["words"][bumps:]), least["verdict"]
-                lines.append(f"| {words}: {kind} | {ground} | {left} | {least['goal_rate']:.2f} | {verdict} |")
+    lines = ["| needs | what is left | under | reach the goal | verdict |", "|---" * 5 + "|"]
+    for (robot, words), kind in product(ROBOTS.items(), KINDS):
+        if (least := least_minimum(robot, kind)) is not None:
+            bumps = sum(part < BUMPS for part in least["bumps"])
+            ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"
+            left, verdict = "; ".join(least["words"][bumps:]), least["verdict"]
+            lines.append(f"| {words}: {kind} | {ground} | {left} | {least['goal_rate']:.2f} | {verdict} |")
     return "\n".join(lines)
 
 
@@ -273,20 +276,19 @@ def spaces() -> str:
     return table(rows, {in_words(name): name for name in names})
 
 
-def sizes() -> str:
+def sizes(robot: str) -> str:
     """The size of an obstacle that half of the robots get over, with contact resolved; a range where it is not sharp.
 
     In brackets stands the last size tried, if over half get over that. Obstacles that stop nobody so are left out.
     """
-    columns, rows = {}, {}
-    for words, numbers in of_robots("results/{}/dose-resolved.json").items():
-        for half in numbers["half"]:
-            name, obstacle = f"{words}: {half['controller']}", half["element"].replace("_", " ")
-            row = rows.setdefault(f"{obstacle}, {half['parameter']} {half['unit']}".strip(), {})
-            row[name] = size_words(half, numbers["dose"])
-            columns[name] = lambda row, name=name: row.get(name, NONE)
+    numbers, rows = read(f"results/{robot}/dose-resolved.json"), dict[str, dict[str, str]]()
+    for half in numbers.get("half", ()):
+        named, measure = half["element"].replace("_", " "), f"{half['parameter']} {half['unit']}".strip()
+        obstacle = measure if named == half["parameter"] else f"{named}, {measure}"
+        rows.setdefault(obstacle, {})[half["controller"]] = size_words(half, numbers["dose"])
     stopping = {name: row for name, row in rows.items() if not all(size.startswith("(") for size in row.values())}
-    return table(stopping, columns)
+    columns = dict.fromkeys(half["controller"] for half in numbers.get("half", ()))
+    return table(stopping, {name: lambda row, name=name: row.get(name, NONE) for name in columns})
 
 
 def size_words(half: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:

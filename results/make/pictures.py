@@ -21,7 +21,7 @@ from qd.show.elites import open_run
 from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import Source, save, source_of_map, source_of_run
-from results.make.docs import PAPER_ARCHIVES, ROBOTS, read
+from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
 from sim.files.figures import new_figure
 from sim.robots.find import get_robot
 
@@ -53,11 +53,10 @@ def take_still(source: Source, name: str) -> None:
 
 
 def payload_source() -> Source | None:
-    """The first minimal terrain of the published search under conditions whose cause is a payload; None without any."""
-    run = Path("results/anymal/conditions")
-    minima = read(f"{run}/minimal.json").get("elites", ())
-    numbers = [str(minimal["elite"]) for minimal in minima if (minimal["cause"] or {}).get("kind") == "payload"]
-    return source_of_run(open_run("anymal", run), minimal=numbers[0]) if numbers else None
+    """The smallest minimal terrain of the published search under conditions that needs a payload; None without any."""
+    least = least_minimum("anymal", "payload")
+    opened = open_run("anymal", Path("results/anymal/conditions"))
+    return source_of_run(opened, minimal=str(least["elite"])) if least else None
 
 
 def draw_noise() -> Figure:

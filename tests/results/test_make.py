@@ -395,7 +395,7 @@ def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
     monkeypatch.setattr(docs, "ROOT", tmp_path)
     monkeypatch.setattr(docs, "of_robots", lambda file: {"Dog": {"spaces": {"course": counts}}})
     assert docs.main(["--check"]) == 1 and docs.main([]) == 0 and docs.main(["--check"]) == 0
-    lines = ["Before.", "<!-- table: spaces -->", "|  | elites |", "| --- | --- |", "| Dog, course | 1,234 |"]
+    lines = ["Before.", "<!-- table: spaces -->", "|  | elites |", "|---|---|", "| Dog, course | 1,234 |"]
     assert (tmp_path / "README.md").read_text().splitlines() == [*lines, "<!-- end -->", "Behind."]
     with pytest.raises(ValueError, match="absent"):
         docs.with_tables("<!-- table: absent -->\n<!-- end -->")
