@@ -213,7 +213,8 @@ def conditions() -> str:
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
-    columns |= {f"... crossed with nominal {kind}": kind for kind in KINDS}
+    columns |= {f"... with nominal {kind}": kind for kind in KINDS}
+    columns["... with none of these alone"] = "needs_no_single_one"
     return table(rows, columns, upright=True)
 
 
