@@ -220,10 +220,11 @@ def conditions() -> str:
 
 def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
     """The minimal terrain of fewest parts that keeps a kind of condition, of the elites that need that kind alone."""
-    examples = {one["elite"]: one for one in read(f"results/{robot}/conditions.json")["conditions"]["examples"]}
+    needs = read(f"results/{robot}/conditions.json").get("conditions", {})
+    numbers = {one["elite"] for one in needs.get("examples", ()) if one["needs"] == kind}
     minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
-    of_kind = [one for one in minima if examples.get(one["elite"], {}).get("needs") == kind]
-    kept = [one for one in of_kind if BUMPS + [*KINDS].index(kind) in one["bumps"]]
+    part = BUMPS + [*KINDS].index(kind)
+    kept = [one for one in minima if one["elite"] in numbers and part in one["bumps"]]
     return min(kept, key=lambda one: len(one["bumps"]), default=None)
 
 

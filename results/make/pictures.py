@@ -55,8 +55,9 @@ def take_still(source: Source, name: str) -> None:
 def payload_source() -> Source | None:
     """The smallest minimal terrain of the published search under conditions that needs a payload; None without any."""
     least = least_minimum("anymal", "payload")
-    opened = open_run("anymal", Path("results/anymal/conditions"))
-    return source_of_run(opened, minimal=str(least["elite"])) if least else None
+    if least is None:
+        return None
+    return source_of_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
 
 def draw_noise() -> Figure:
