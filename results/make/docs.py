@@ -8,6 +8,7 @@ else than the files.
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -178,11 +179,11 @@ def methods(robot: str) -> str:
 def noise() -> str:
     """Designs of a search under noise: means over their seeds."""
     rows = {
-        f"{words}, {name}": mean_of(rows)
+        f"{words}, {name}": {**mean_of(rows), "seeds": len(rows)}
         for robot, words in ROBOTS.items()
         for name, rows in searches_of(robot).items()
     }
-    names = ("episodes", "elites", "corrected_elites", "failing", "families")
+    names = ("episodes", "seeds", "elites", "corrected_elites", "failing", "families")
     columns: dict[str, Column] = {in_words(name): name for name in names}
     columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
     columns["two fresh lots"] = shown("two_lots_agree", ".2f")
@@ -190,12 +191,12 @@ def noise() -> str:
 
 
 def searches_of(robot: str) -> dict[str, list[Any]]:
-    """Rows of searches under noise by design: those that have several seeds."""
+    """Rows of searches under noise by design, without the long ones."""
     searches = dict[str, list[Any]]()
     for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
-        if row["search"] != row["design"]:
-            searches.setdefault(row["search"].partition(", seed")[0], []).append(row)
-    return {name: rows for name, rows in searches.items() if len(rows) > 1}
+        if row["search"] == f"{row['design']}, seed {row['seed']}":
+            searches.setdefault(row["design"], []).append(row)
+    return searches
 
 
 def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -365,6 +366,7 @@ def public_controllers() -> str:
 
         return words
 
+    devices = {one["timed"]["device"] for one in numbers.values() if "timed" in one}
     ways, found = ("searched", "resolved", "mujoco_c"), ("episodes", "elites", "corrected_elites", "failing",
                                                          "confirmed", "faults")  # fmt: skip
     columns: dict[str, Column] = {
@@ -376,8 +378,7 @@ def public_controllers() -> str:
             lambda one: " / ".join(f"{one['agreement'][way]:.2f}" for way in ways),
         "half get over a kerb of [m]": half("step_up"),
         "... stairs of [m]": half("stairs_up"),
-        "episodes/s of 32,768 robots": "episodes_per_s_32768",
-        "... on": lambda one: one.get("timed", {}).get("device", NONE),
+        f"episodes/s of 32,768 robots on {', '.join(sorted(devices)) or NONE}": "episodes_per_s_32768",
         **{in_words(name): inside("archive", name) for name in found},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
     }  # fmt: skip
@@ -401,14 +402,17 @@ def speed() -> str:
     rows = {}
     for robot, words in ROBOTS.items():
         numbers, scale = (read(f"results/{robot}/{name}.json") for name in ("speed", "scale"))
-        origins = [one for one in (*(numbers.get("measured") or {"": numbers}).values(), scale) if one.get("device")]
+        made = (*(numbers.get("measured") or {"": numbers}).values(), *(numbers.get("training") or ()), scale)
+        origins = [one for one in made if one.get("device")]
         named = {
             key: ", ".join(dict.fromkeys(str(one[key])[: 28 if key == "device" else 7] for one in origins))
             for key in ("device", "commit")
         }
         by_ray = "; ".join(f"{one['workers']}: {one['episodes_per_s']:,.0f}" for one in scale.get("rows", ()))
-        largest = [one for one in numbers.get("kernels") or () if one.get("share", 0.0) >= 0.04]
-        shares = ", ".join(f"{kernel_words(one['name'])} {one['share']:.0%}" for one in largest)
+        kernel_shares = Counter[str]()
+        for one in numbers.get("kernels") or ():
+            kernel_shares[kernel_words(one["name"])] += one["share"]
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in kernel_shares.most_common() if share >= 0.04)
         of_others = {"ray": by_ray, "kernels": shares}
         rows[words] = {**numbers, "named": {**named, **{key: text or NONE for key, text in of_others.items()}}}
     mixed, million, minutes = "cma_mae+map_elites", {"form": ".1f", "factor": 1e-6}, {"form": ".1f", "factor": 1 / 60}
@@ -428,9 +432,9 @@ def speed() -> str:
         f"... by `{mixed}` [s]": inside("wide", mixed, "iteration_s_median", form=".1f"),
         f"... minutes by `{mixed}`": inside("wide", mixed, "minutes_per_4m_episodes", form=".1f"),
         "preset small on a CPU [minutes]": inside("cpu", "archive_wall_s", **minutes),
-        **{f"{count:,} robots standing: physics steps/s [million]{alone}":
+        **{f"{count:,} robots standing: {alone}physics steps/s [million]":
            inside("flat", count, f"world_steps_per_s{key}", **million)
-           for count in (4096, 32768) for alone, key in (("", ""), (", mujoco_warp alone", "_mujoco_warp"))},
+           for count in (4096, 32768) for alone, key in (("", ""), ("mujoco_warp's ", "_mujoco_warp"))},
         "training: environment steps/s of 4,096 robots": trained("train_env_steps_per_s"),
         "... of 8,192 robots": trained("train_env_steps_per_s_8192"),
         "... of 8,192 on each of two GPUs": trained("train_env_steps_per_s_2gpu"),
@@ -445,7 +449,7 @@ def speed() -> str:
 
 
 def trained(key: str) -> Callable[[Any], str]:
-    """A cell: a rate of training, with device, commit, day and packages of its row in ``training``."""
+    """A cell: a rate of training, with packages if its row in ``training`` has others."""
 
     def cell(row: Any) -> str:
         rate, rows = row.get(key), row.get("training") or ()
@@ -453,7 +457,7 @@ def trained(key: str) -> Callable[[Any], str]:
         if one is None:
             return NONE
         packages = [f"{name} {version}" for name, version in one.get("versions", {}).items()]
-        return f"{rate:,.0f} ({', '.join([one['device'], one['commit'][:7], one['date'][:10], *packages])})"
+        return f"{rate:,.0f}" + (f" ({', '.join(packages)})" if packages else "")
 
     return cell
 

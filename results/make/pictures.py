@@ -1,8 +1,9 @@
 """The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures`` with some of their kinds.
 
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
-robots' controllers of the day cross them. ``stills`` shows one that a payload breaks. ``pages`` takes the pictures of
-the viewer and of the report. ``curves`` draws what the published files say of searches.
+robots' controllers of the day cross them. ``stills`` shows one that a payload breaks, and the worst course where its
+search is here (results.make.spaces). ``pages`` takes the pictures of the viewer and of the report. ``curves`` draws
+what the published files say of searches.
 """
 
 import subprocess
@@ -23,6 +24,7 @@ from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import Source, save, source_of_map, source_of_run
 from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
 from sim.files.figures import new_figure
+from sim.files.records import sources_sha256
 from sim.robots.find import get_robot
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
@@ -60,19 +62,23 @@ def payload_source() -> Source | None:
     return source_of_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
 
+def course_source() -> Source | None:
+    """The worst terrain of ANYmal's search of courses by today's sources; None if it is not on this machine."""
+    run = Path("runs/make") / sources_sha256()[:12] / "anymal/spaces/course"
+    return source_of_run(open_run("anymal", run)) if run.exists() else None
+
+
 def draw_noise() -> Figure:
     """Searches under noise: corrected elites against the share of elites that is in its cell again."""
     figure, handles = new_figure(12, 4.2), dict[str, Any]()
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="share of elites in their cell again", ylabel="corrected elites")
         rows = read(f"results/{robot}/search_noise.json")["rows"]
-        finals = [*dict.fromkeys(row["design"] for row in rows if row["search"] != row["design"])]
-        for row in rows:
+        designs = sorted({row["design"] for row in rows})
+        for row in sorted(rows, key=lambda row: row["search"]):
+            label = row["search"].partition(", seed")[0]
+            mark, color = "*" if label.endswith("a million") else "o", f"C{designs.index(row['design'])}"
             place = row["elites_same_cell"] / row["elites"], row["corrected_elites"]
-            label, mark, color = "other designs, half as long", ".", "0.6"
-            if row["search"] != row["design"]:
-                label = row["search"].partition(", seed")[0]
-                mark, color = "*" if label.endswith("a million") else "o", f"C{finals.index(row['design'])}"
             (handles[label],) = axes.plot(*place, mark, color=color)
         axes.grid(alpha=0.3)
     figure.legend([*handles.values()], [*handles], fontsize=7, loc="outside right center")
@@ -105,8 +111,10 @@ def main() -> None:
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
-    if "stills" in wanted and (source := payload_source()) is not None:
-        take_still(source, "payload")
+    if "stills" in wanted:
+        for name, source in {"payload": payload_source(), "course": course_source()}.items():
+            if source is not None:
+                take_still(source, name)
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())

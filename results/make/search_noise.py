@@ -1,8 +1,8 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
-Each design searches in 200,000 episodes; those of ``FINALS`` in 400,000 too, with three seeds, and some in a million.
-Then all elites cross two lots of 40 fresh episodes. The share that both put into one cell (``two_lots_agree``) is about
-what an archive has whose elites are as well known as by 40 episodes.
+Each design searches in 400,000 episodes with three seeds, and some in a million with one. Then all elites cross two
+lots of 40 fresh episodes. The share that both put into one cell (``two_lots_agree``) is about what an archive has whose
+elites are as well known as by 40 episodes.
 """
 
 from collections.abc import Sequence
@@ -21,64 +21,23 @@ from qd.workers.cross import Crossings
 from results.make.common import ONCE, Script, file_name, parse
 from sim.spaces.registry import get_space
 
-SEED, EPISODES = 9, 200_000
-"""Of the screening."""
-FINAL_SEEDS, FINAL_EPISODES = (0, 1, 2), 400_000
+SEEDS, EPISODES = (0, 1, 2), 400_000
+LONG_EPISODES = 1_000_000
 THREES = {"replicas": 3, "batch_size": 67, "again": 66, "candidates": 12}
 PAIRS = {"replicas": 2, "batch_size": 110, "again": 90, "candidates": 12}
 SINGLES = {"replicas": 1, "batch_size": 220, "again": 180, "candidates": 6}
-SETTLED = {"settling": 1}
-FEW_EMITTERS = {"emitters": 20, "groups": 4}
 DESIGNS: dict[str, dict[str, Any]] = {
     "once": ONCE,
-    "10 episodes": {**ONCE, "replicas": 10, "batch_size": 40, "candidates": 10},
-    "5 episodes": {**ONCE, "replicas": 5, "batch_size": 80, "candidates": 8},
     "threes, half again": THREES,
-    "threes, half again, settled": {**THREES, **SETTLED},
-    "threes, quarter again": {**THREES, "batch_size": 100, "again": 33},
     "pairs, half again": PAIRS,
-    "pairs, half again, settled": {**PAIRS, **SETTLED},
-    "pairs, quarter again": {**PAIRS, "batch_size": 150, "again": 50},
+    "pairs, half again, settled": {**PAIRS, "settling": 1},
     "singles, half again": SINGLES,
-    "threes, half again, fewer candidates": {**THREES, "candidates": 6},
-    "threes, half again, learn longer": {**THREES, "training_steps": 1000},
-    "threes, more again": {**THREES, "batch_size": 50, "again": 83},
-    "threes, 40 emitters": {**THREES, "emitters": 40},
-    "threes, 20 emitters": {**THREES, **FEW_EMITTERS},
-    "pairs, 40 emitters": {**PAIRS, "emitters": 40},
-    "pairs, 40 emitters, settled": {**PAIRS, **SETTLED, "emitters": 40},
-    "pairs, 20 emitters": {**PAIRS, **FEW_EMITTERS},
-    "pairs, 20 emitters, 100 steps": {**PAIRS, **FEW_EMITTERS, "training_steps": 100},
-    "pairs, 20 emitters, settled": {**PAIRS, **FEW_EMITTERS, "settling": 2},
-    "pairs, 10 emitters": {**PAIRS, "emitters": 10, "groups": 2},
-    "pairs, more again": {**PAIRS, "batch_size": 80, "again": 120},
-    "pairs, learn longer": {**PAIRS, "training_steps": 1000},
-    "pairs, 24 candidates": {**PAIRS, "candidates": 24},
-    "pairs, 5 generations": {**PAIRS, "generations": 5},
-    "pairs, 20 generations": {**PAIRS, "generations": 20},
-    "pairs, explore a tenth": {**PAIRS, "explore_share": 0.1},
-    "pairs, explore half": {**PAIRS, "explore_share": 0.5},
-    "pairs, iso sigma .05": {**PAIRS, "iso_sigma": 0.05},
-    "pairs, iso sigma .01": {**PAIRS, "iso_sigma": 0.01},
-    "pairs, line sigma .4": {**PAIRS, "line_sigma": 0.4},
-    "pairs, crossover .6": {**PAIRS, "crossover_share": 0.6},
-    "threes, crossover .6": {**THREES, "crossover_share": 0.6},
-    "singles, crossover .6": {**SINGLES, "crossover_share": 0.6},
-    "singles, quarter again": {**SINGLES, "batch_size": 300, "again": 100},
-    "singles, more again": {**SINGLES, "batch_size": 160, "again": 240},
 }
 """Settings of preset wide that each design changes."""
-FINALS = ("once", "threes, half again", "pairs, half again", "pairs, half again, settled", "singles, half again")
-LONG = ("threes, half again", "pairs, half again", "singles, half again", "threes, 40 emitters")
-SEARCHES = (
-    {name: (name, SEED, EPISODES) for name in DESIGNS}
-    | {f"{name}, seed {seed}": (name, seed, FINAL_EPISODES) for name in FINALS for seed in FINAL_SEEDS}
-    | {
-        f"{name}, seed 0": (name, 0, FINAL_EPISODES)
-        for name in ("threes, 20 emitters", "pairs, 20 emitters", "pairs, 20 emitters, settled")
-    }
-    | {f"{name}, a million": (name, 0, 1_000_000) for name in LONG}
-)
+LONG = ("threes, half again", "pairs, half again", "singles, half again")
+SEARCHES = {f"{name}, seed {seed}": (name, seed, EPISODES) for seed in SEEDS for name in DESIGNS} | {
+    f"{name}, a million": (name, 0, LONG_EPISODES) for name in LONG
+}
 """Design, seed and episodes of each search."""
 
 
