@@ -114,16 +114,6 @@ class Script:
         """A published archive of archive.py; in a trial too."""
         return read_archive_of(self.robot, self.results / name)
 
-    def read_dose(self) -> list[dict[str, Any]]:
-        """Rows of dose.json beside the file, made by today's sources; in a trial none if it is not there."""
-        file = self.out.with_name("dose.json")
-        content = read_alike(file, self.origin, "sources_sha256", "seed", "robot_sha256", "penalty_definition")
-        if not content:
-            if self.small:
-                return []
-            raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
-        return content["dose"]
-
     def run_of_archive(self, name: str = "archive") -> Path:
         """The run of a published archive to work in; a copy of what is published where the run itself is gone."""
         run, published = self.runs / name, self.results / name

@@ -1,4 +1,4 @@
-"""What breaks the controller under conditions and terrain alone does not, and the dose beside it: conditions.json.
+"""What breaks the controller under conditions and terrain alone does not: conditions.json.
 
 Terrains and conditions are searched together. Then the elites that fail are crossed once more, under nominal
 conditions, and without each kind of condition alone, from the same starts, so that a kind that does nothing changes
@@ -100,21 +100,12 @@ def examples_of(archive: Archive, cured: NDArray[np.int64], needed: dict[str, ND
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Searches, and takes conditions away; the doses of conditions are those of dose.json.
-
-    Where the file is of today's sources only its doses are made anew, since controllers may have come since.
-    """
+    """Searches, and takes conditions away."""
     script = parse(__doc__, argv, "conditions.json")
-    so_far = script.read_so_far(script.out)
-    dose = [row for row in script.read_dose() if row["parameter"] in KINDS]
-    if "conditions" in so_far and not script.small:
-        return script.add(so_far, {"dose": dose})
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
-    return script.write(
-        {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed, "dose": dose}
-    )
+    return script.write({"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed})
 
 
 if __name__ == "__main__":

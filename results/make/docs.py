@@ -352,7 +352,8 @@ def public_controllers() -> str:
     """Published controllers of others: how they walk, and what breaks them."""
     named = {"go2-robot-lab": "Go2, robot_lab", "go2-himloco": "Go2, HIMLoco", "go1-playground": "Go1, Playground",
              "g1-unitree": "G1, unitree_rl_gym"}  # fmt: skip
-    numbers = read("results/public.json").get("controllers", {})
+    content = read("results/public.json")
+    numbers = content.get("controllers", {})
 
     def both(key: str, form: str) -> Callable[[Any], str]:
         return lambda one: " / ".join(format(one["check"][f"flat_{key}{way}"], form) for way in ("", "_mujoco_c"))
@@ -366,7 +367,6 @@ def public_controllers() -> str:
 
         return words
 
-    devices = {one["timed"]["device"] for one in numbers.values() if "timed" in one}
     ways, found = ("searched", "resolved", "mujoco_c"), ("episodes", "elites", "corrected_elites", "failing",
                                                          "confirmed", "faults")  # fmt: skip
     columns: dict[str, Column] = {
@@ -378,7 +378,7 @@ def public_controllers() -> str:
             lambda one: " / ".join(f"{one['agreement'][way]:.2f}" for way in ways),
         "half get over a kerb of [m]": half("step_up"),
         "... stairs of [m]": half("stairs_up"),
-        f"episodes/s of 32,768 robots on {', '.join(sorted(devices)) or NONE}": "episodes_per_s_32768",
+        f"episodes/s of 32,768 robots on {content.get('device', NONE)}": "episodes_per_s_32768",
         **{in_words(name): inside("archive", name) for name in found},
         "causes": lambda one: ", ".join(f"{cause} {count}" for cause, count in [*one["causes"].items()][:4]),
     }  # fmt: skip

@@ -23,6 +23,7 @@ from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import Source, save, source_of_map, source_of_run
 from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
+from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.files.records import sources_sha256
 from sim.robots.find import get_robot
@@ -65,16 +66,18 @@ def payload_source() -> Source | None:
 def course_source() -> Source | None:
     """The worst terrain of ANYmal's search of courses by today's sources; None if it is not on this machine."""
     run = Path("runs/make") / sources_sha256()[:12] / "anymal/spaces/course"
-    return source_of_run(open_run("anymal", run)) if run.exists() else None
+    if not (run / "archive.npz").exists():
+        print(f"{run} is not here: the picture of a course stays as it is.")
+        return None
+    return source_of_run(open_run("anymal", run))
 
 
 def draw_noise() -> Figure:
     """Searches under noise: corrected elites against the share of elites that is in its cell again."""
-    figure, handles = new_figure(12, 4.2), dict[str, Any]()
+    figure, handles, designs = new_figure(12, 4.2), dict[str, Any](), list(DESIGNS)
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="share of elites in their cell again", ylabel="corrected elites")
         rows = read(f"results/{robot}/search_noise.json")["rows"]
-        designs = sorted({row["design"] for row in rows})
         for row in sorted(rows, key=lambda row: row["search"]):
             label = row["search"].partition(", seed")[0]
             mark, color = "*" if label.endswith("a million") else "o", f"C{designs.index(row['design'])}"

@@ -1,8 +1,8 @@
 """Searches under noise by design, and how much of what each finds is there again: search_noise.json.
 
-Each design searches in 400,000 episodes with three seeds, and some in a million with one. Then all elites cross two
-lots of 40 fresh episodes. The share that both put into one cell (``two_lots_agree``) is about what an archive has whose
-elites are as well known as by 40 episodes.
+Each design searches in about 400,000 episodes with three seeds, and some in a million with one. Then all elites cross
+two lots of 40 fresh episodes. The share that both put into one cell (``two_lots_agree``) is about what an archive has
+whose elites are as well known as by 40 episodes.
 """
 
 from collections.abc import Sequence

@@ -18,7 +18,7 @@ import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import archive, bare, common, conditions, docs, search_noise, speed, tables, train_speed
+from results.make import archive, bare, common, docs, search_noise, speed, tables, train_speed
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -103,27 +103,6 @@ def test_what_todays_sources_have_judged_in_all_stages_is_read(tmp_path, monkeyp
         judged.clear()
         (tmp_path / "archive.json").write_text(json.dumps({"faults": 3, "judged_by": by}))
         assert archive.judge_with_specialist(script, tmp_path)["faults"] == 3 and judged == [tmp_path] * passes
-
-
-def test_doses_are_those_of_todays_sources(tmp_path):
-    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/spaces.json")], "spaces.json")
-    file = tmp_path / "anymal/dose.json"
-    dose = json.loads((MAKE.parent / "anymal/dose.json").read_text()) | {"sources_sha256": sources_sha256()}
-    file.write_text(json.dumps(dose))
-    assert script.read_dose() == dose["dose"]
-    file.write_text(json.dumps(dose | {"seed": 1}))
-    with pytest.raises(ValueError, match="must be of today's sources"):
-        script.read_dose()
-
-
-def test_conditions_of_todays_sources_take_new_doses_alone(tmp_path):
-    words = ["--device", "cpu", "--out", str(tmp_path / "anymal/conditions.json")]
-    origin = common.parse(None, words, "conditions.json").origin
-    rows = [{"parameter": "push", "goal_rate": 0.5}, {"parameter": "height", "goal_rate": 0.1}]
-    (tmp_path / "anymal/dose.json").write_text(json.dumps(origin | {"dose": rows}))
-    before = origin | {"date": "then", "conditions": {"failing": 3}, "dose": []}
-    (tmp_path / "anymal/conditions.json").write_text(json.dumps(before))
-    assert conditions.main(words) == before | {"dose": rows[:1]}
 
 
 def test_what_is_published_goes_with_its_archive(tmp_path):
