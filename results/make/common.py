@@ -72,9 +72,8 @@ class Script:
 
     @property
     def runs(self) -> Path:
-        """Folder for runs that are not published; runs of other sources are not gone on with."""
-        made = Path("runs/make") / sources_sha256()[:12] / self.robot.name
-        return self.out.parent / "runs" if self.small else made
+        """Folder for the robot's runs that are not published."""
+        return self.out.parent / "runs" if self.small else runs_of_today() / self.robot.name
 
     def search_cfg(self, iterations: int | None = None, *, episodes: int | None = None, **changes: Any) -> SearchCfg:
         """Settings of a search of preset wide; in a trial of four terrains, which no specialist can be trained on.
@@ -279,6 +278,11 @@ def read_made(file: Path) -> dict[str, Any]:
         return read_json(file)
     except (FileNotFoundError, ValueError):
         return {}
+
+
+def runs_of_today() -> Path:
+    """Folder for runs that are not published, by today's sources; runs of other sources are not gone on with."""
+    return Path("runs/make") / sources_sha256()[:12]
 
 
 def read_alike(file: Path, origin: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -22,10 +22,10 @@ from qd.show.elites import open_run
 from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
 from qd.show.replay import Source, save, source_of_map, source_of_run
+from results.make.common import runs_of_today
 from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
-from sim.files.records import sources_sha256
 from sim.robots.find import get_robot
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
@@ -65,7 +65,7 @@ def payload_source() -> Source | None:
 
 def course_source() -> Source | None:
     """The worst terrain of ANYmal's search of courses by today's sources; None if it is not on this machine."""
-    run = Path("runs/make") / sources_sha256()[:12] / "anymal/spaces/course"
+    run = runs_of_today() / "anymal/spaces/course"
     if not (run / "archive.npz").exists():
         print(f"{run} is not here: the picture of a course stays as it is.")
         return None

@@ -25,13 +25,13 @@ from qd.show.elites import open_run
 from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
-from results.make.common import agreement, crossing_rates, read_alike
+from results.make.common import agreement, crossing_rates, read_alike, runs_of_today
 from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.records import provenance, sources_sha256
+from sim.files.records import provenance
 from sim.files.settings import read_toml
 from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
@@ -176,7 +176,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     compute = Compute(resolve_device(args.device))
     out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
-    runs = out.parent / "public" if args.small else Path("runs/make") / sources_sha256()[:12] / "public"
+    runs = out.parent / "public" if args.small else runs_of_today() / "public"
     if args.small and not (args.pictures or args.speed):
         shutil.rmtree(runs, ignore_errors=True)
     if args.pictures:
