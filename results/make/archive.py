@@ -12,17 +12,17 @@ from typing import Any, get_args
 
 from qd.judge import Stage, judge
 from qd.run.directory import RunDirectory
-from results.make.common import ONCE, Script, follow_search, parse
+from results.make.common import PAPER_SIZE, Script, follow_search, parse
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
 SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
     "archive": ({}, 0),
-    "archive_cma_mae": ({"method": "cma_mae", **ONCE, "emitters": 10, "groups": 1}, 0),
+    "archive_cma_mae": ({"method": "cma_mae", **PAPER_SIZE}, 0),
     "independent": ({}, 1),
     "third": ({}, 2),
 }
-"""Changes of preset wide, and seed of each; the paper has ten emitters of 20 terrains."""
+"""Changes of preset wide, and seed of each."""
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
 PUBLISHED = (

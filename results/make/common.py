@@ -38,6 +38,10 @@ SEEDS = (0, 1, 2)
 """Seeds of everything that is done several times."""
 ONCE = {"replicas": 20, "batch_size": 20, "again": 0, "candidates": 20}
 """Changes of preset wide: each terrain is crossed once, in the paper's 20 episodes."""
+CURVE_FILE = "curve.json"
+"""File of a run: counts after each step of its search."""
+PAPER_SIZE = {**ONCE, "emitters": 10, "groups": 1}
+"""Changes of preset wide: the paper's iterations, of ten emitters and 20 terrains each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,14 +165,14 @@ def follow_search(
     Returns ``counts`` of each point, which the run's curve.json keeps: what is in it is not searched again. At the last
     point it is judged by ``last_stages``.
     """
-    rows = {row["iterations"]: row for row in script.read_so_far(run / "curve.json").get("curve", [])}
+    rows = {row["iterations"]: row for row in script.read_so_far(run / CURVE_FILE).get("curve", [])}
     for iterations in points:
         if iterations not in rows:
             search(replace(cfg, iterations=iterations), run, script.compute)
             judge(run, stages=last_stages if iterations == points[-1] else ("fresh",), compute=script.compute)
             numbers = RunDirectory(run).read_summary()
             rows[iterations] = {"iterations": iterations, **{count: numbers.get(count) for count in counts}}
-            write_atomically(run / "curve.json", to_json({**script.origin, "curve": [*rows.values()]}))
+            write_atomically(run / CURVE_FILE, to_json({**script.origin, "curve": [*rows.values()]}))
     return [rows[iterations] for iterations in points]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from qd.evaluate.marks import marks_of
 from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, space_of, split_elites
 from results.make.common import parse
 
@@ -17,7 +18,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures every set's terrains on the CPU."""
     script = parse(__doc__, argv, "distances.json")
     archive, independent = script.read_archive(), script.read_archive("independent")
-    trained_on = archive.genes[split_elites(archive).train][: 20 if script.small else None]
+    split = split_elites(archive)
+    held_out = set(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
+    genes = archive.genes[split.train]  # training leaves out those that are equal to one held out
+    trained_on = genes[[mark not in held_out for mark in marks_of(genes)]][: 20 if script.small else None]
     count = 5 if script.small else paper_terrains(script.robot.name)
     names = ("hard_random", "generated", "generated_far", "generated_independent")
     sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=space_of(archive))

@@ -2,8 +2,9 @@
 
 The base and the last controller are searched three times more, each with a specialist of its own. The last one is
 published as results/<robot>/hardened.pt. Beside it one training on the published archive alone, of as many steps as
-all rounds together, is searched as often. Three rounds more of the last controller were not planned: they were begun
-when its further searches had found more than a quarter of the base's faults.
+all rounds together, is searched as often, and crosses the sets of tables.py: tables_at_once.json. Three rounds more of
+the last controller were not planned: they were begun when its further searches had found more than a quarter of the
+base's faults.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from typing import Any
 from qd.search import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse, publish_controller, read_made
-from results.make.tables import train
+from results.make.tables import train, write_tables
 from train.cfg import HardenCfg
 from train.harden import ROUNDS_FILE, harden
 
@@ -26,7 +27,9 @@ COUNTS = (
 EPISODES = 416_000
 SEEDS = (1000, 1001, 1002)
 """Of the further searches, which are as long as those of the rounds, and whose seeds are far from theirs."""
-TRAINED = ("hardening", "at_once", "again")
+MADE = ("command", "commit", "date")
+"""Of a hardening, which is older than the file."""
+TRAINED, COMPARED = ("hardening", "at_once", "again"), "hardening and at_once"
 SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
 
 
@@ -100,12 +103,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
 
     Parts are the trainings, and each search by what it is of and its seed; those of a hardening come after it.
-    Where no round is kept there is nothing to search again. The second hardening is begun as a part alone.
+    Where no round is kept there is nothing to search again.
     """
-    script = parse(__doc__, argv, "rounds.json", parts=(*TRAINED, *SEARCHES))
-    has_again = read_hardening(script, "again")[1]
-    usual = [part for part in (*TRAINED, *SEARCHES) if has_again or not part.startswith("again")]
-    parts = script.parts or (usual[:1] if script.small else usual)
+    all_parts = (*TRAINED, *SEARCHES, COMPARED)
+    script = parse(__doc__, argv, "rounds.json", parts=all_parts)
+    parts = script.parts or (all_parts[:1] if script.small else all_parts)
     hardenings = {name: harden_here(script, name) for name in ("hardening", "again") if name in parts}
     if "at_once" in parts:
         train_at_once(script)
@@ -114,6 +116,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         policy = policy_of(script, name)
         if name == "base" or policy is not None:
             searches[name].append(search_again(script, name, policy, seed))
+    if COMPARED in parts:
+        controllers = {"at_once": str(train_at_once(script)), "hardened": str(last_policy(script) or script.policy)}
+        write_tables(replace(script, out=script.results / "tables_at_once.json"), controllers)
     if script.parts:
         return searches
     hardened = last_policy(script)
@@ -124,8 +129,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             publish_controller(script, hardened, "hardened")
     return script.write(
         {
-            **hardenings["hardening"],
-            "seed": script.seed,
+            **{name: value for name, value in hardenings["hardening"].items() if name not in script.origin},
+            "hardenings": {name: {key: made[key] for key in MADE} for name, made in hardenings.items()},
             "searches": searches["hardening"],
             "base_searches": searches["base"],
             "at_once_searches": searches["at_once"],

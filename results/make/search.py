@@ -2,7 +2,9 @@
 
 Each search of preset wide is extended step by step; after each step all elites cross fresh episodes. At the end, those
 that fail cross with contact resolved and are crossed by the robot's panel. The default is searched with three seeds,
-others with two. It crosses 14,400 episodes less: at first there is nothing to cross again.
+others with two. It crosses 14,400 episodes less: at first there is nothing to cross again. Methods that learn from one
+iteration to the next have many of the paper's size, too, in place of a few of preset wide. These searches were added
+when all others were done.
 """
 
 from collections.abc import Sequence
@@ -10,16 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from results.make.common import ONCE, Script, file_name, follow_search, mean_over_seeds, parse
+from results.make.common import CURVE_FILE, ONCE, PAPER_SIZE, Script, file_name, follow_search, mean_over_seeds, parse
 
 DEFAULT = "surrogate"
 METHODS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
-    "cma_mae+map_elites": {"method": "cma_mae+map_elites", **ONCE},
-    "cma_mae": {"method": "cma_mae", **ONCE},
-    "map_elites": {"method": "map_elites", **ONCE},
     "hard_random": {"method": "hard_random", **ONCE},
 }
+for _name in ("cma_mae+map_elites", "cma_mae", "map_elites"):
+    METHODS |= {_name: {"method": _name, **ONCE}, f"{_name}, 10 emitters": {"method": _name, **PAPER_SIZE}}
 """What each method changes in preset wide; as in the paper, others than the default cross each terrain once."""
 SEEDS = (10, 11, 12)
 """Others than those by which the default was chosen."""
@@ -30,12 +31,15 @@ JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 
 def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
-    """Counts of a search after each step."""
+    """Counts of a search after each step; the last ones with the origin of the search."""
     cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
     run, counts = script.runs / "search" / file_name(f"{method}, seed {seed}"), ("episodes", *COUNTS, *JUDGED)
-    return follow_search(
+    *rows, last = follow_search(
         script, run, cfg, script.iterations_of(cfg, *STEPS), counts, ("fresh", "resolved", "others")
     )  # fmt: skip
+    origin = script.read_so_far(run / CURVE_FILE)
+    named = {"method": method, "search_seed": seed, **{key: origin[key] for key in ("commit", "device", "date")}}
+    return [*rows, named | last]
 
 
 def seeds_of(method: str) -> tuple[int, ...]:
@@ -68,7 +72,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         for count in (*COUNTS, *JUDGED):
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
         numbers[name]["curve"] = curve_of(rows_of_seeds)
-    return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"]})
+    searches = [rows_of_seed[-1] for rows_of_seeds in rows.values() for rows_of_seed in rows_of_seeds]
+    return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"], "searches": searches})
 
 
 if __name__ == "__main__":
