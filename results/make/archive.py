@@ -13,6 +13,7 @@ from typing import Any, get_args
 from qd.judge import Stage, judge
 from qd.run.directory import RunDirectory
 from results.make.common import PAPER_SIZE, Script, follow_search, parse
+from sim.files.atomic import to_json, write_atomically
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
@@ -26,7 +27,7 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
 PUBLISHED = (
-    "archive.npz", "archive.json", "config.json", "curve.json", "*.png", "minimal.*", "certifiers/specialist.*",
+    "curve.json", "archive.npz", "archive.json", "config.json", "*.png", "minimal.*", "certifiers/specialist.*",
 )  # fmt: skip
 """Files of a run that are published."""
 COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
@@ -40,6 +41,8 @@ def make_archive(script: Script, name: str) -> Path:
     follow_search(script, run, cfg, points, COUNTS)
     if not script.small and name.startswith("archive"):  # on a CPU a training takes hours
         judge_with_specialist(script, run)
+    summary = RunDirectory(run).read_summary()
+    write_atomically(run / "archive.json", to_json({**summary, "method": cfg.scheduler.method}))
     return run
 
 
@@ -64,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     script = parse(__doc__, argv, "archive/archive.json", parts=tuple(SEARCHES))
     for name in script.parts or SEARCHES:
         run = make_archive(script, name)
-        files = PUBLISHED if name != "third" else ("curve.json",)
+        files = {"third": PUBLISHED[:1], "archive": (*PUBLISHED, "metrics.jsonl")}.get(name, PUBLISHED)
         script.publish(run, script.out.parent.parent / name, files)
 
 

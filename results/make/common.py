@@ -26,6 +26,7 @@ from qd.run.directory import RunDirectory, read_archive_of
 from qd.run.settings import SearchCfg, preset
 from qd.search import search
 from qd.workers.evaluator import Compute
+from sim.conditions import KINDS
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import DIFFERENCES, bootstrap_interval, t_interval
@@ -116,6 +117,15 @@ class Script:
     def read_archive(self, name: str = "archive") -> Archive:
         """A published archive of archive.py; in a trial too."""
         return read_archive_of(self.robot, self.results / name)
+
+    def read_dose(self, *, conditions: bool) -> list[dict[str, Any]]:
+        """The base's rows of dose.json beside the file, of conditions or of obstacles; in a trial none without it."""
+        file = self.out.with_name("dose.json")
+        content = read_alike(file, self.origin, "sources_sha256", "seed", "robot_sha256", "penalty_definition")
+        if not content and not self.small:
+            raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
+        rows = [row for row in content.get("dose", ()) if row["controller"] == "base"]
+        return [row for row in rows if (row["parameter"] in KINDS) == conditions]
 
     def run_of_archive(self, name: str = "archive") -> Path:
         """The run of a published archive to work in; a copy of what is published where the run itself is gone."""

@@ -1,4 +1,4 @@
-"""What breaks the controller under conditions and terrain alone does not: conditions.json.
+"""What breaks the controller under conditions and terrain alone does not, and how much it bears: conditions.json.
 
 Terrains and conditions are searched together. Then the elites that fail are crossed once more, under nominal
 conditions, and without each kind of condition alone, from the same starts, so that a kind that does nothing changes
@@ -105,7 +105,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
-    return script.write({"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed})
+    numbers = {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed}
+    return script.write({**numbers, "dose": script.read_dose(conditions=True)})
 
 
 if __name__ == "__main__":

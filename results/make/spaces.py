@@ -1,4 +1,4 @@
-"""What breaks the controller in each terrain space: spaces.json."""
+"""What breaks the controller in each terrain space, and which size of an obstacle does: spaces.json."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
                         compute=script.compute)  # fmt: skip
         summary = RunDirectory(run).read_summary()
         numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
-    return script.write({"spaces": numbers})
+    return script.write({"spaces": numbers, "dose": script.read_dose(conditions=False)})
 
 
 if __name__ == "__main__":

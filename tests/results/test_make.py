@@ -18,7 +18,7 @@ import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import archive, bare, common, docs, search_noise, speed, tables, train_speed
+from results.make import archive, bare, common, docs, rounds, search, search_noise, speed, tables, train_speed
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
 from sim.terrain import NUM_COLS, NUM_ROWS
@@ -103,6 +103,37 @@ def test_what_todays_sources_have_judged_in_all_stages_is_read(tmp_path, monkeyp
         judged.clear()
         (tmp_path / "archive.json").write_text(json.dumps({"faults": 3, "judged_by": by}))
         assert archive.judge_with_specialist(script, tmp_path)["faults"] == 3 and judged == [tmp_path] * passes
+
+
+def test_doses_are_the_bases_by_todays_sources(tmp_path):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/spaces.json")], "spaces.json")
+    file, origin = tmp_path / "anymal/dose.json", {**script.origin, "sources_sha256": sources_sha256()}
+    rows = [{"controller": one, "parameter": of} for one in ("base", "C-G") for of in ("push", "height")]
+    file.write_text(json.dumps({**origin, "dose": rows}))
+    assert [script.read_dose(conditions=one) for one in (True, False)] == [rows[:1], rows[1:2]]
+    file.write_text(json.dumps({**origin, "seed": 1, "dose": rows}))
+    with pytest.raises(ValueError, match="must be of today's sources"):
+        script.read_dose(conditions=True)
+
+
+def test_rounds_say_when_their_hardenings_were_made_and_when_the_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results/anymal").mkdir(parents=True)
+    made = {"command": "harden", "commit": "first", "date": "then", "device": "a GPU", "rounds": [{"faults": 3}]}
+    monkeypatch.setattr(rounds, "harden_here", lambda script, name: made | {"seed": 5})
+    monkeypatch.setattr(rounds, "train_at_once", lambda script: Path("at_once.pt"))
+    monkeypatch.setattr(rounds, "last_policy", lambda script, name="hardening": Path("hardened.pt"))
+    monkeypatch.setattr(rounds, "search_again", lambda script, name, policy, seed: {"of": name, "seed": seed})
+    monkeypatch.setattr(rounds, "publish_controller", lambda script, policy, name: None)
+    crossed = {}
+    monkeypatch.setattr(rounds, "write_tables", lambda script, of: crossed.update({script.out.name: of}))
+    monkeypatch.setenv("FAULTLINE_COMMIT", "second")
+    report = rounds.main(["--device", "cpu"])
+    of_hardening = {"command": "harden", "commit": "first", "date": "then"}
+    assert (report["commit"], report["seed"], report["rounds"]) == ("second", 0, [{"faults": 3}])
+    assert report["hardenings"] == {"hardening": of_hardening, "again": of_hardening}
+    assert [one["of"] for one in report["again_searches"]] == ["again"] * 3
+    assert crossed == {"tables_at_once.json": {"at_once": "at_once.pt", "hardened": "hardened.pt"}}
 
 
 def test_what_is_published_goes_with_its_archive(tmp_path):
@@ -287,6 +318,24 @@ def test_rows_that_are_there_keep_their_commit(tmp_path, monkeypatch):
     one, other = "once, seed 0", "once, seed 1"
     assert run("first", one) == run("second", one) == ("first", [(one, "first")])
     assert run("third", one, other) == ("third", [(one, "first"), (other, "third")])
+
+
+def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
+    monkeypatch.chdir(tmp_path)
+    without_figures(monkeypatch)
+    out = tmp_path / "anymal/search.json"
+    for commit in ("first", "second"):
+        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
+        report = search.main(["--small", "--device", "cpu", "--out", str(out)])
+        (row,) = report["searches"]
+        assert (report["commit"], row["commit"], row["method"], row["search_seed"]) == (
+            commit,
+            "first",
+            "surrogate",
+            10,
+        )
+        assert row["elites"] == report["methods"]["surrogate"]["elites"]
 
 
 def test_what_a_search_asks_for_is_remembered(tmp_path, monkeypatch):
