@@ -17,7 +17,7 @@ PAGES = {str(path.relative_to(ROOT)): path for path in [ROOT / "README.md", *sor
 """The pages by name, such as ``docs/faults.md``."""
 _NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)(?!\w)")
 _NO_PROSE = (r"^```.*?^```$", r"^\|.*?$", r"<!--.*?-->", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+")
-_FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round}
+_FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round, "sum": sum}
 """What an expression may call."""
 _KINDS = (
     r"arXiv \d+\.\d+",

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 from qd.judge import Stage, judge
 from qd.run.directory import RunDirectory
-from results.make.common import PAPER_SIZE, Script, follow_search, parse
+from results.make.common import CURVE_FILE, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
@@ -27,9 +27,9 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
 PUBLISHED = (
-    "curve.json", "archive.npz", "archive.json", "config.json", "*.png", "minimal.*", "certifiers/specialist.*",
+    "archive.npz", "archive.json", "config.json", "*.png", "minimal.*", "certifiers/specialist.*", CURVE_FILE,
 )  # fmt: skip
-"""Files of a run that are published."""
+"""Files of a run that are published, the one last by which all.sh knows that it is done."""
 COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
 
 
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     script = parse(__doc__, argv, "archive/archive.json", parts=tuple(SEARCHES))
     for name in script.parts or SEARCHES:
         run = make_archive(script, name)
-        files = {"third": PUBLISHED[:1], "archive": (*PUBLISHED, "metrics.jsonl")}.get(name, PUBLISHED)
+        files = {"third": (CURVE_FILE,), "archive": ("metrics.jsonl", *PUBLISHED)}.get(name, PUBLISHED)
         script.publish(run, script.out.parent.parent / name, files)
 
 

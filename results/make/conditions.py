@@ -102,11 +102,12 @@ def examples_of(archive: Archive, cured: NDArray[np.int64], needed: dict[str, ND
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches, and takes conditions away."""
     script = parse(__doc__, argv, "conditions.json")
+    dose = script.read_dose(conditions=True)
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
     numbers = {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed}
-    return script.write({**numbers, "dose": script.read_dose(conditions=True)})
+    return script.write({**numbers, "dose": dose})
 
 
 if __name__ == "__main__":

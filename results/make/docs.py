@@ -119,19 +119,22 @@ def archives() -> str:
     return table({name: numbers for name, numbers in found.items() if numbers}, columns, upright=True)
 
 
-def training() -> str:
-    """Goal rates of every controller; the set that is none of its own first."""
+def training(measure: str = "goal") -> str:
+    """Rates of every controller, the set that is none of its own first; of the goal with intervals."""
     rows = {f"{words}, {SETS[name]}": (robot, name)
             for robot, words in ROBOTS.items() for name in reversed(SETS) if name != HELD_OUT[1]}  # fmt: skip
-    return table(rows, {one: lambda row, one=one: rate(row[0], "goal", row[1], one) for one in CONTROLLERS})
+    short = measure != "goal"
+    return table(
+        rows, {one: lambda row, one=one: rate(row[0], measure, row[1], one, short=short) for one in CONTROLLERS}
+    )
 
 
-def goals(robot: str, measure: str = "goal") -> str:
+def goals(robot: str) -> str:
     """Goal rates of every controller with 95 % intervals, and on the certified held-out terrains alone."""
     tables = read(f"results/{robot}/tables.json")
-    rows = {f"{SETS[name]} ({tables['terrains'][name]})": (measure, name) for name in reversed(SETS)}
+    rows = {f"{SETS[name]} ({tables['terrains'][name]})": ("goal", name) for name in reversed(SETS)}
     certified = tables["certified"][HELD_OUT[0]]["terrains"]
-    rows[f"{SETS[HELD_OUT[0]]}, certified ({certified})"] = (f"certified_{measure}", HELD_OUT[0])
+    rows[f"{SETS[HELD_OUT[0]]}, certified ({certified})"] = ("certified_goal", HELD_OUT[0])
     return table(rows, {one: lambda row, one=one: rate(robot, row[0], row[1], one) for one in CONTROLLERS})
 
 

@@ -27,7 +27,7 @@ COUNTS = (
 EPISODES = 416_000
 SEEDS = (1000, 1001, 1002)
 """Of the further searches, which are as long as those of the rounds, and whose seeds are far from theirs."""
-MADE = ("command", "commit", "date")
+MADE = ("command", "commit", "device", "date")
 """Of a hardening, which is older than the file."""
 TRAINED, COMPARED = ("hardening", "at_once", "again"), "hardening and at_once"
 SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
@@ -116,8 +116,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         policy = policy_of(script, name)
         if name == "base" or policy is not None:
             searches[name].append(search_again(script, name, policy, seed))
-    if COMPARED in parts:
-        controllers = {"at_once": str(train_at_once(script)), "hardened": str(last_policy(script) or script.policy)}
+    if COMPARED in parts and (policy := last_policy(script)) is not None:
+        controllers = {"at_once": str(train_at_once(script)), "hardened": str(policy)}
         write_tables(replace(script, out=script.results / "tables_at_once.json"), controllers)
     if script.parts:
         return searches

@@ -27,7 +27,7 @@ def causes_of(archive: Archive) -> dict[str, int]:
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches each space as long, and judges what was found."""
     script = parse(__doc__, argv, "spaces.json")
-    numbers = {}
+    numbers, dose = {}, script.read_dose(conditions=False)
     for name in SPACES:
         run = script.runs / "spaces" / name
         search(script.search_cfg(13, seed=script.seed, space=name), run, script.compute)
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
                         compute=script.compute)  # fmt: skip
         summary = RunDirectory(run).read_summary()
         numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
-    return script.write({"spaces": numbers, "dose": script.read_dose(conditions=False)})
+    return script.write({"spaces": numbers, "dose": dose})
 
 
 if __name__ == "__main__":

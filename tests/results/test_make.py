@@ -129,7 +129,7 @@ def test_rounds_say_when_their_hardenings_were_made_and_when_the_file(tmp_path, 
     monkeypatch.setattr(rounds, "write_tables", lambda script, of: crossed.update({script.out.name: of}))
     monkeypatch.setenv("FAULTLINE_COMMIT", "second")
     report = rounds.main(["--device", "cpu"])
-    of_hardening = {"command": "harden", "commit": "first", "date": "then"}
+    of_hardening = {"command": "harden", "commit": "first", "device": "a GPU", "date": "then"}
     assert (report["commit"], report["seed"], report["rounds"]) == ("second", 0, [{"faults": 3}])
     assert report["hardenings"] == {"hardening": of_hardening, "again": of_hardening}
     assert [one["of"] for one in report["again_searches"]] == ["again"] * 3
