@@ -106,8 +106,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     archive, numbers = search_under_conditions(script)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
-    numbers = {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed}
-    return script.write({**numbers, "dose": dose})
+    return script.write(
+        {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed, "dose": dose}
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How far test terrains lie from the elites trained on: distances.json, RMS of the heights' differences [m].
+"""How far test terrains lie from the elites C-G was trained on: distances.json, RMS of the heights' differences [m].
 
 Elites of one archive descend from each other, and a held-out one may be a near copy of one that was trained on. Then a
 rate on held-out elites says little of other terrains.
@@ -9,19 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.marks import marks_of
+from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, space_of, split_elites
-from results.make.common import parse
+from results.make.common import parse, published_controllers
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures every set's terrains on the CPU."""
     script = parse(__doc__, argv, "distances.json")
     archive, independent = script.read_archive(), script.read_archive("independent")
-    split = split_elites(archive)
-    held_out = set(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
-    genes = archive.genes[split.train]  # training leaves out those that are equal to one held out
-    trained_on = genes[[mark not in held_out for mark in marks_of(genes)]][: 20 if script.small else None]
+    genes, marks = archive.genes[split_elites(archive).train], recorded_marks(published_controllers(script)["C-G"])
+    trained_on = genes[[mark in marks for mark in marks_of(genes)]][: 20 if script.small else None]
     count = 5 if script.small else paper_terrains(script.robot.name)
     names = ("hard_random", "generated", "generated_far", "generated_independent")
     sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=space_of(archive))

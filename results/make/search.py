@@ -15,12 +15,13 @@ import numpy as np
 from results.make.common import CURVE_FILE, ONCE, PAPER_SIZE, Script, file_name, follow_search, mean_over_seeds, parse
 
 DEFAULT = "surrogate"
+LEARNING = ("cma_mae+map_elites", "cma_mae", "map_elites")
+"""Others than the default that learn from one iteration to the next."""
 METHODS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
-    "hard_random": {"method": "hard_random", **ONCE},
+    **{name: {"method": name, **ONCE} for name in ("hard_random", *LEARNING)},
+    **{f"{name}, 10 emitters": {"method": name, **PAPER_SIZE} for name in LEARNING},
 }
-for _name in ("cma_mae+map_elites", "cma_mae", "map_elites"):
-    METHODS |= {_name: {"method": _name, **ONCE}, f"{_name}, 10 emitters": {"method": _name, **PAPER_SIZE}}
 """What each method changes in preset wide; as in the paper, others than the default cross each terrain once."""
 SEEDS = (10, 11, 12)
 """Others than those by which the default was chosen."""
@@ -65,14 +66,14 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         return {}
     methods = [(DEFAULT, SEEDS[:1])] if script.small else [(name, seeds_of(name)) for name in METHODS]
     rows = {name: [follow(script, name, seed) for seed in seeds] for name, seeds in methods}
-    numbers = {}
+    numbers, searches = {}, list[dict[str, Any]]()
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
         numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
         for count in (*COUNTS, *JUDGED):
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
         numbers[name]["curve"] = curve_of(rows_of_seeds)
-    searches = [rows_of_seed[-1] for rows_of_seeds in rows.values() for rows_of_seed in rows_of_seeds]
+        searches += last
     return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"], "searches": searches})
 
 

@@ -329,12 +329,8 @@ def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
         monkeypatch.setenv("FAULTLINE_COMMIT", commit)
         report = search.main(["--small", "--device", "cpu", "--out", str(out)])
         (row,) = report["searches"]
-        assert (report["commit"], row["commit"], row["method"], row["search_seed"]) == (
-            commit,
-            "first",
-            "surrogate",
-            10,
-        )
+        assert (report["commit"], row["commit"]) == (commit, "first")
+        assert (row["method"], row["search_seed"]) == ("surrogate", 10)
         assert row["elites"] == report["methods"]["surrogate"]["elites"]
 
 
