@@ -46,13 +46,13 @@ COMMANDS: dict[str, dict[str, Command]] = {
 """What can be done, by what it is for; first the six that a newcomer needs."""
 
 API = {
-    "search": "qd.search",
-    "judge": "qd.judge",
+    "search": "qd.search.loop",
+    "judge": "qd.faults.judge",
     "cross": "qd.workers.cross",
     "evaluate": "qd.evaluate.evaluate",
     "make_sets": "qd.evaluate.sets",
     "finetune": "train.finetune",
-    "preset": "qd.run.settings",
+    "preset": "qd.search.settings",
     "FinetuneCfg": "train.cfg",
     "Compute": "qd.workers.evaluator",
     "get_robot": "sim.robots.find",

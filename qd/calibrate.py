@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.run.directory import RUNS
+from qd.search.directory import RUNS
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute
 from qd.workers.invalid import refuse_all_invalid
@@ -21,9 +21,9 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.base import MOST_HEIGHT
-from sim.spaces.registry import at_height
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.base import MOST_HEIGHT
+from sim.terrains.spaces.registry import at_height
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _ENOUGH = 200  # failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are
 _MOST = 5  # times as many terrains as to begin with

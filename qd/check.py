@@ -9,22 +9,22 @@ import numpy as np
 
 from qd.calibrate import calibrate, fitting_height
 from qd.evaluate.dose import measure_dose
-from qd.fitness import FAILING_GOAL_RATE
-from qd.run.directory import RUNS
+from qd.search.directory import RUNS
+from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, check_policy
+from sim.controllers.spec import crosser_name
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.mujoco_c.crossing import cross_terrains
-from sim.policy.spec import crosser_name
 from sim.robots.find import read_penalty_scales
-from sim.robots.own import describe_inferred
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, describe_standing, stand
+from sim.robots.user import describe_inferred
 from sim.rollout import RolloutResult
-from sim.spaces.dose import parse_doses
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.doses import parse_doses
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _WALKS = 8  # episodes on flat ground in each simulator
 _APART = 0.05  # share by which speeds may differ

@@ -9,10 +9,10 @@ import tyro
 from msgspec import Meta
 
 from qd.evaluate.labels import COMPARED, SetsCfg
-from qd.run.presets import PRESETS, SchedulerCfg, preset_of
+from qd.search.presets import PRESETS, SchedulerCfg, preset_of
+from sim.controllers.spec import controllers_of
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_words
 from sim.files.settings import NonNegativeInt, PositiveInt
-from sim.policy.spec import controllers_of
 from sim.robots.find import get_robot, robot_of
 
 
@@ -82,7 +82,7 @@ class Archive(ControllerFlags, WorkerFlags):
         if folder is None:
             preset = peek(argv, "--preset") or default_preset(argv)
             return cls(preset=preset, **preset_of(preset))
-        from qd.run.directory import RunDirectory
+        from qd.search.directory import RunDirectory
 
         cfg = RunDirectory(Path(folder)).read_cfg()
         weights = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam")}
@@ -93,11 +93,11 @@ class Archive(ControllerFlags, WorkerFlags):
     def execute(self) -> None:
         """Searches, and judges what was found."""
         from qd.check import made_ready
-        from qd.judge import find_search, judge
-        from qd.run.directory import free_path
-        from qd.run.settings import preset
-        from qd.search import say_what_stops_the_robot, search
-        from sim.spaces.registry import at_height, load_space, space_at
+        from qd.faults.judge import find_search, judge
+        from qd.search.directory import free_path
+        from qd.search.loop import say_what_stops_the_robot, search
+        from qd.search.settings import preset
+        from sim.terrains.spaces.registry import at_height, load_space, space_at
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
         compute = _compute(self)
@@ -147,7 +147,7 @@ class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
 
     def named(self) -> tuple[Path, dict[str, Any]]:
         """The run, and what the command line names beside it."""
-        from qd.run.directory import find_run
+        from qd.search.directory import find_run
 
         robot = get_robot(self.robot)
         return find_run(robot, self.run, published="never"), {
@@ -178,8 +178,8 @@ class Judge(_OnRun):
 
     def execute(self) -> None:
         """Judges the run."""
-        from qd.judge import judge
-        from qd.search import say_what_stops_the_robot
+        from qd.faults.judge import judge
+        from qd.search.loop import say_what_stops_the_robot
 
         run, named = self.named()
         archive = judge(run, stages=self.stages, **named)
@@ -209,7 +209,7 @@ class Minimise(_OnRun):
 
     def execute(self) -> None:
         """Finds the minimal terrains, and prints them."""
-        from qd.minimise import minimise
+        from qd.faults.minimise.minimise import minimise
 
         run, named = self.named()
         minimise(run, elite=self.elite, how=self.how, judged=self.judge or bool(self.certifiers), **named)
@@ -233,7 +233,7 @@ class Import:
 
     def execute(self) -> None:
         """Writes the files."""
-        from sim.policy.imports import import_controller
+        from sim.controllers.imports import import_controller
 
         import_controller(self.source, self.model, self.out)
 
@@ -364,7 +364,7 @@ class Dose(RobotFlag, WorkerFlags):
     def execute(self) -> None:
         """Measures."""
         from qd.evaluate.dose import measure_dose
-        from sim.spaces.dose import parse_doses
+        from sim.terrains.doses import parse_doses
 
         robot = get_robot(self.robot)
         measure_dose(

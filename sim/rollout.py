@@ -17,14 +17,14 @@ from kernels.penalties import PENALTIES, add_penalties
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
-from sim.bank import TerrainBank
+from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
+from sim.controllers.runner import PolicyRunner
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
-from sim.ground import GroundMaps
-from sim.policy.loaders import Policy, PolicySpec, load_policy, prepare_torch
-from sim.policy.runner import PolicyRunner
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.bank import TerrainBank
+from sim.terrains.ground import GroundMaps
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,6 @@ from kernels.observation import Sensors
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.restart import clear_rows
 from kernels.state import make_zeros
-from sim.bank import TerrainBank
-from sim.conditions import MOST_DELAY_S, MOST_LAG_S
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
 from sim.robots.compiled import robot_spec
@@ -29,6 +27,8 @@ from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
 from sim.solver import TheirDynamics, dynamics_of
+from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions import MOST_DELAY_S, MOST_LAG_S
 
 
 class Simulation:

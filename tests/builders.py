@@ -9,11 +9,11 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from qd.archive import FRESH, Archive, FaultCounts, FreshValues, write_archive
+from qd.search.archive import FRESH, Archive, FaultCounts, FreshValues, write_archive
 from sim.files.atomic import to_json
 from sim.files.records import robot_identity
 from sim.robots.shipped import ROBOTS
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 OBSERVATIONS, ACTIONS = 235, 12
 

@@ -14,14 +14,14 @@ import pytest
 import torch
 import warp as wp
 
-from qd.run.directory import RESULTS
-from sim.bank import TerrainBank
+from qd.search.directory import RESULTS
 from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.records import provenance
 from sim.robots.find import get_robot
 from sim.robots.shipped import ROBOTS
 from sim.simulation import Simulation
+from sim.terrains.bank import TerrainBank
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
 

@@ -14,8 +14,8 @@ import tyro
 
 import faultline
 from qd.workers.evaluator import Compute
-from sim.policy.described import TERMS, Described, read_controller
-from sim.policy.loaders import load_policy
+from sim.controllers.described import TERMS, Described, read_controller
+from sim.controllers.loaders import load_policy
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from tests import docs as pages
@@ -112,7 +112,7 @@ def test_the_script_of_a_page_searches_judges_crosses_and_trains(tmp_path, monke
     (text,) = code_of("docs/searching.md", "python")
     smaller = "iterations=1, replicas=2, scheduler=SchedulerCfg(emitters=1, batch_size=4))"
     small = text.replace("iterations=5)", smaller).replace("iterations=100)", "iterations=1, num_envs=4, terrains=2)")
-    (tmp_path / "search.py").write_text("from qd.run.presets import SchedulerCfg\n" + small)
+    (tmp_path / "search.py").write_text("from qd.search.presets import SchedulerCfg\n" + small)
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Compute, "open", lambda self, cfg: open_stand_in(cfg))

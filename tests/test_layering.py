@@ -22,7 +22,7 @@ LIBRARY_DOORS = {  # a room, or a folder of one
     "rsl_rl": ("train",),
     "PIL": ("sim", "qd"),
     "imageio_ffmpeg": ("qd",),
-    "torch": ("sim", "train", "qd/surrogate.py", "qd/networks.py"),
+    "torch": ("sim", "train", "qd/search/surrogate.py", "qd/search/networks.py"),
     "onnx": ("sim", "train"),
     "onnxruntime": ("sim",),
     "viser": ("qd/show/view",),
@@ -102,7 +102,7 @@ def test_few_imports_are_hidden_and_only_the_registry_loads_commands():
     ("path", "source"),
     [
         ("kernels/a.py", "import sim"),
-        ("sim/a.py", "def f():\n    from qd.archive import read"),
+        ("sim/a.py", "def f():\n    from qd.search.archive import read"),
         ("qd/a.py", "import importlib\nimportlib.import_module('train.base')"),
         ("qd/a.py", "__import__('torch')"),
         ("qd/a.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),

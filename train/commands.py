@@ -139,7 +139,7 @@ def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
 
 def _run_dir(flags: _OfTraining, name: str) -> Path:
     """Where a training works; a new directory is called after ``name`` and the time."""
-    from qd.run.directory import free_path
+    from qd.search.directory import free_path
 
     if flags.resume is not None and flags.run_dir is not None:
         raise ValueError("--resume goes on where it is, got --run-dir too: leave it out")

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 
 from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
 from qd.evaluate.sets import elites_sha256, read_elites, space_of, split_elites
-from qd.faults import SPECIALIST as CERTIFIER
-from qd.judge import CERTIFIERS_FOLDER
-from qd.run.directory import RunDirectory, directory_of, find_run
+from qd.faults.judge import CERTIFIERS_FOLDER
+from qd.faults.numbers import SPECIALIST as CERTIFIER
+from qd.search.directory import RunDirectory, directory_of, find_run
+from sim.controllers.loaders import load_checkpoint
+from sim.controllers.onnx import export_onnx
+from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
-from sim.policy.loaders import load_checkpoint
-from sim.policy.onnx import export_onnx
-from sim.policy.spec import SHIPPED, controller_hash
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import identity, load_space, space_at
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.registry import identity, load_space, space_at
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from qd.archive import read_archive
 from qd.evaluate.evaluate import EPISODES, cross_sets, evaluate, sizes_for
 from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
 from qd.evaluate.show import show_table
-from qd.judge import judge
-from qd.run.directory import ROUNDS_FILE, RunDirectory, claimed
-from qd.run.settings import SearchCfg, differences, preset
-from qd.search import search
+from qd.faults.judge import judge
+from qd.search.archive import read_archive
+from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed
+from qd.search.loop import search
+from qd.search.settings import SearchCfg, differences, preset
 from qd.workers.evaluator import Compute, check_policy
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
@@ -30,7 +30,7 @@ from sim.files.intervals import value_words
 from sim.files.records import identity
 from sim.files.settings import check
 from sim.robots.robot import RobotCfg
-from sim.spaces.registry import load_space, space_at
+from sim.terrains.spaces.registry import load_space, space_at
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
 from train.ppo.checkpoint import CHECKPOINT, read_start
@@ -62,8 +62,8 @@ def harden(
     evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
 
     What ``run_dir`` has done already is not done again. ``certifiers`` are controllers by name that judge the searches;
-    those of :func:`qd.judge.judge` if None. Returns the content of ``rounds.json``, which is written after each round:
-    the counts of all searches, which trainings were kept and why, and the tables of all controllers.
+    those of :func:`qd.faults.judge.judge` if None. Returns the content of ``rounds.json``, which is written after each
+    round: the counts of all searches, which trainings were kept and why, and the tables of all controllers.
     """
     hardening = _Hardening(robot, cfg, run_dir, compute, certifiers)
     content = hardening.content

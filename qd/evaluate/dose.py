@@ -12,18 +12,18 @@ from kernels.episode import Outcome
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
-from qd.fitness import FAILING_GOAL_RATE
-from qd.run.directory import RUNS
+from qd.search.directory import RUNS
+from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
+from sim.controllers.spec import about_controllers
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import resamples, value_words, wilson_interval
 from sim.files.records import robot_identity
-from sim.policy.spec import about_controllers
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.dose import Dose
+from sim.terrains.doses import Dose
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from qd.archive import ARCHIVE_FILE, Archive
 from qd.evaluate.labels import COMPARED, HELD_OUT, SetsCfg
 from qd.evaluate.marks import check_untrained, recorded_marks
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
@@ -23,16 +22,17 @@ from qd.evaluate.sets import (
 )
 from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Tables, check_seeds, make_tables
-from qd.run.directory import RUNS, search_seed
+from qd.search.archive import ARCHIVE_FILE, Archive
+from qd.search.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy
+from sim.controllers.spec import about_controllers, crosser_name, spec_of
 from sim.files.command import publish
 from sim.files.records import identity, robot_identity
-from sim.policy.spec import about_controllers, crosser_name, spec_of
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.registry import load_space, space_at
+from sim.terrains.spaces.registry import load_space, space_at
 
 EPISODES = 20
 """Episodes a terrain on a GPU."""

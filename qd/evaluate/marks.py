@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.controllers.loaders import read_weights
+from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json
-from sim.policy.loaders import read_weights
-from sim.policy.spec import ControllerSpec
 
 TRAINED_ON = "trained_on"
 """Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""

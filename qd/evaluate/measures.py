@@ -13,7 +13,7 @@ from qd.evaluate.labels import RATES as RATE_MEASURES
 from sim.files.intervals import DIFFERENCES, RATES, bootstrap_interval
 from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
-from sim.terrain import CROSSING_TYPES
+from sim.terrains.hand_crafted import CROSSING_TYPES
 
 VELOCITY_FROM_S = 2.0
 """The velocity error counts from this time of an episode on [s]: before it the robot gets going."""

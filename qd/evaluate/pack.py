@@ -16,32 +16,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
 from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.measures import interval_of, mean_of, terrain_rates
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_pack, show_pack_test
-from qd.faults import EPISODES, SPECIALIST, fresh_counts, judgement, rate_of
-from qd.fitness import FAILING_GOAL_RATE
-from qd.groups import families_of, rank, verdict_of
-from qd.judge import certifiers_of, find_search
-from qd.minima import read_minimal
-from qd.run.directory import RUNS
+from qd.faults.families import families_of, rank, verdict_of
+from qd.faults.judge import certifiers_of, find_search
+from qd.faults.minimise.results import read_minimal
+from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_of
+from qd.search.archive import Archive
+from qd.search.directory import RUNS
+from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
-from sim.bank import heights_of
+from sim.controllers.spec import about_controllers, crosser_name, is_same
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
 from sim.files.intervals import RATES, wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.files.records import identity
-from sim.policy.spec import about_controllers, crosser_name, is_same
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.rollout import RolloutResult
-from sim.spaces.registry import get_space
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.bank import heights_of
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.spaces.registry import get_space
 
 PACK_FILE, TERRAINS_FILE = "pack.json", "pack.npz"
 HEIGHT_UNIT_M = 1e-3

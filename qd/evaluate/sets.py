@@ -17,17 +17,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
 from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.evaluate.marks import marks_of
-from qd.groups import families_of, rms_distances
-from qd.run.directory import read_archive_of, search_seed
-from sim.bank import heights_of
+from qd.faults.families import families_of, rms_distances
+from qd.search.archive import Archive
+from qd.search.directory import read_archive_of, search_seed
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import get_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import NUM_COLS, NUM_ROWS, hand_crafted_crossings
+from sim.terrains.bank import heights_of
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.registry import get_space
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 Part = Literal["test", "validation"]
 """What terrains are for: to be reported, or to choose settings by."""
@@ -64,13 +64,14 @@ class TerrainSet:
     numbers: NDArray[np.int64]
     """Number of each terrain: of an elite its row in the archive, of others their place in the set; shape (T,)."""
     types: NDArray[np.int64] | None = None
-    """Index into :data:`sim.terrain.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
+    """Index into :data:`sim.terrains.hand_crafted.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
     levels: NDArray[np.int64] | None = None
     """Level of each hand-crafted terrain, shape (T,)."""
     space: str = SUPER_GAUSSIAN.name
-    """Terrain space of genes, as :func:`sim.spaces.registry.load_space` takes it."""
+    """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
     families: NDArray[np.int64] | None = None
-    """Number of each elite's family (:func:`qd.groups.families_of`), shape (T,); None of independent terrains."""
+    """Number of each elite's family (:func:`qd.faults.families.families_of`), shape (T,); None of independent
+    terrains."""
     elites: Archive | None = None
     """The elites, with what is known of them; None of other terrains."""
 

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES
 from qd.evaluate.measures import Measured, bounds_of, interval_of, kind_mean, mean_of, of_terrains
 from qd.evaluate.sets import TerrainSet
-from qd.fitness import FAILING_GOAL_RATE
+from qd.search.fitness import FAILING_GOAL_RATE
+from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.intervals import wilson_interval
 from sim.files.records import check_robot
-from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 
 Tables = dict[str, Any]

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from sim.controllers.spec import controllers_of
 from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_words
 from sim.files.settings import NonNegativeInt, PositiveInt
-from sim.policy.spec import controllers_of
 from sim.robots.find import get_robot
 
 
@@ -174,7 +174,7 @@ class Export(ControllerFlags, EliteFlags):
 
     def _make_pack(self) -> None:
         from qd.evaluate.pack import make_pack
-        from qd.run.directory import find_run
+        from qd.search.directory import find_run
         from qd.workers.evaluator import Compute
 
         making, robot = self.making, get_robot(self.robot or "anymal")

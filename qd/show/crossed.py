@@ -10,13 +10,13 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.groups import way_to_end
+from qd.faults.families import way_to_end
 from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
-from sim.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 from sim.rates import typical_outcome
 from sim.recording.recorder import Recording
+from sim.terrains.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
 
 class Ending(NamedTuple):

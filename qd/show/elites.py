@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, read_archive
-from qd.causes import UNCLEAR
-from qd.faults import certifier_of
-from qd.fitness import FitnessCfg
-from qd.groups import rank
-from qd.judge import CERTIFIERS_FOLDER, controllers_in
-from qd.minimise import MinimalTerrains, read_minimal
-from qd.run.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
-from qd.run.settings import SearchCfg, find_policy
+from qd.faults.causes import UNCLEAR
+from qd.faults.families import rank
+from qd.faults.judge import CERTIFIERS_FOLDER, controllers_in
+from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
+from qd.faults.numbers import certifier_of
+from qd.search.archive import Archive, read_archive
+from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
+from qd.search.fitness import FitnessCfg
+from qd.search.settings import SearchCfg, find_policy
+from sim.controllers.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.files.command import chosen_elites, command_line
-from sim.policy.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
 from sim.robots.find import get_robot, robot_of
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
-from sim.spaces.registry import get_space
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.registry import get_space
 
 
 class Terrain(NamedTuple):

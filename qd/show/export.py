@@ -5,22 +5,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qd.archive import Archive
 from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
-from qd.groups import VERDICTS, Ranking, rank
-from qd.minima import read_minimal
-from qd.run.directory import RUNS, folder_for
-from qd.run.progress import Bar
+from qd.faults.families import VERDICTS, Ranking, rank
+from qd.faults.minimise.results import read_minimal
+from qd.search.archive import Archive
+from qd.search.directory import RUNS, folder_for
+from qd.search.progress import Bar
 from qd.show.elites import OpenedRun
-from sim.bank import terrains_of
+from sim.controllers.loaders import load_checkpoint
+from sim.controllers.onnx import export_onnx
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
 from sim.files.records import provenance
-from sim.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
-from sim.policy.loaders import load_checkpoint
-from sim.policy.onnx import export_onnx
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
+from sim.terrains.bank import terrains_of
+from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 
 INDEX_FILE, README_FILE = "index.json", "README.md"
 """What was exported, and how other programs take it, in the folder of the files."""

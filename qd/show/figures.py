@@ -11,16 +11,16 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.faults import FRESH_EPISODES
-from sim.bank import terrains_of
+from qd.faults.numbers import FRESH_EPISODES
+from qd.search.archive import Archive
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import value_words
-from sim.ground import GroundMaps
-from sim.maps.picture import LENGTH, WIDTH, height_colors, tinted
-from sim.spaces.base import TerrainSpace
+from sim.terrains.bank import terrains_of
+from sim.terrains.ground import GroundMaps
+from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
+from sim.terrains.spaces.base import TerrainSpace
 
 _BLUE = "#0072b2"
 _SUN = (-0.45, 0.35)  # where the light of a relief comes from: how much slopes along x and y gain by it

@@ -16,19 +16,19 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
-from qd.groups import way_to_end
-from qd.judge import CERTIFIERS_FOLDER, controllers_in
-from qd.run.progress import Bar
+from qd.faults.families import way_to_end
+from qd.faults.judge import CERTIFIERS_FOLDER, controllers_in
+from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
 from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
+from sim.controllers.spec import SHIPPED, label_suffix, spec_of
 from sim.crossing import CrossingCfg
-from sim.maps.picture import LENGTH, height_colors
 from sim.mujoco_c.model import surface_heights
-from sim.policy.spec import SHIPPED, label_suffix, spec_of
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
+from sim.terrains.maps.picture import LENGTH, height_colors
 
 FPS, GIF_FPS = 25, 12.5
 """Pictures a second of a film and of a GIF, whose pictures last whole hundredths of a second."""

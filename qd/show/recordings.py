@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.run.directory import RUNS
-from qd.run.progress import Bar
+from qd.search.archive import Archive
+from qd.search.directory import RUNS
+from qd.search.progress import Bar
 from qd.workers.cross import Cache
 from qd.workers.evaluator import episode_seeds
+from sim.controllers.spec import controller_hash
 from sim.files.records import code_fingerprint, robot_identity
-from sim.ground import GroundMaps
-from sim.policy.spec import controller_hash
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording, record
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
-from sim.spaces.registry import get_space, identity, load_space
+from sim.terrains.ground import GroundMaps
+from sim.terrains.spaces.registry import get_space, identity, load_space
 
 FOLDER = RUNS / "recordings"
 AT_ONCE = 32
@@ -49,7 +49,7 @@ class Wanted:
     terrain_seed: int
     """Seed of the terrain's episodes."""
     space: str = "super_gaussian"
-    """Terrain space of genes, as :func:`sim.spaces.registry.load_space` takes it."""
+    """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
     ground: GroundMaps | None = field(default=None, compare=False)
     """Friction and softness beside heights."""
 

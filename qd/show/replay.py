@@ -8,23 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from kernels.episode import Outcome
-from qd.descriptors import Cells
-from qd.faults import elite_words
-from qd.fitness import Evaluation, FitnessCfg, evaluation_of
-from qd.run.directory import RUNS, folder_for
+from qd.faults.numbers import elite_words
+from qd.search.descriptors import Cells
+from qd.search.directory import RUNS, folder_for
+from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of
 from qd.show.crossed import draw_crossing, title_of
 from qd.show.elites import OpenedRun, Terrain
 from qd.show.figures import label_of, look_of
 from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
 from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
+from sim.controllers.spec import ControllerSpec, crosser_name
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.figures import as_png
 from sim.files.intervals import rate_words, wilson_interval
-from sim.maps.heightmap import as_terrain, fitted, read_heightmap
-from sim.policy.spec import ControllerSpec, crosser_name
 from sim.recording.recorder import Recording
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
+from sim.terrains.maps.heightmap import as_terrain, fitted, read_heightmap
 
 OWN_FOLDER = RUNS / "terrains"
 """Where what is made of a user's own terrains goes."""
@@ -110,7 +110,7 @@ def source_of_map(
     policy: str | None = None,
     **crossing: Any,
 ) -> Source:
-    """A height map of one's own, as :func:`sim.maps.heightmap.read_heightmap` takes it; ``crossing`` as of a run."""
+    """A height map of one's own, as :func:`sim.terrains.maps.heightmap.read_heightmap` takes it."""
     heightmap = read_heightmap(file, size_m=size_m, scale_m=scale_m, offset_m=offset_m)
     print(f"{file}: {fitted(heightmap)}", flush=True)
     heights, controller = as_terrain(heightmap), policy or str(robot.policy_file)

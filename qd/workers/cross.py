@@ -17,20 +17,20 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.run.progress import Bar
+from qd.search.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import arrays_of, join_results
+from sim.controllers.spec import controller_hash, spec_of
 from sim.files.atomic import locked, write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
 from sim.files.records import code_fingerprint, robot_identity
 from sim.mujoco_c.crossing import cross_terrains
-from sim.policy.spec import controller_hash, spec_of
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.registry import identity, load_space
+from sim.terrains.spaces.registry import identity, load_space
 
 How = Literal["searched", "resolved", "mujoco_c"]
 """Physics of the search; the same with contact resolved; MuJoCo C, with contact resolved there too."""
@@ -190,7 +190,7 @@ class Crossings:
         at_most: int | None = None,
         invalid_ok: bool = False,
     ) -> RolloutResult:
-        """Lets a controller (:func:`sim.policy.loaders.load_policy`) cross each terrain in ``replicas`` episodes.
+        """Lets a controller (:func:`sim.controllers.loaders.load_policy`) cross each terrain in ``replicas`` episodes.
 
         Terrains are genes of a space, shape (B, num_genes), or heights [m], shape (B, nrow, ncol), each with a seed,
         uint32 of shape (B,). Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from qd.workers.process import WorkerProcess
 from qd.workers.shards import join_results
+from sim.controllers.loaders import load_policy
 from sim.crossing import SolverCfg, resolved
 from sim.device import resolve_device as resolve_warp_device
 from sim.files.records import provenance
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import CrossingCfg, Rollout, RolloutResult
-from sim.spaces.registry import load_space
+from sim.terrains.spaces.registry import load_space
 
 _MIN_ROWS = 4  # fewest robots of a simulation: one more process costs more than fewer of them gain
 _MOST_ENVS = {"cuda": 32_768, "cpu": 32}  # of a worker, when there is work for more
@@ -87,7 +87,7 @@ class EvaluatorCfg(Compute):
     robot: RobotCfg | str
     """The robot, or the name of a shipped one."""
     policy: str
-    """Controller, as :func:`sim.policy.loaders.load_policy` takes it."""
+    """Controller, as :func:`sim.controllers.loaders.load_policy` takes it."""
     num_terrains: int
     """Terrains under way at once; of more, half as many follow each time that the first half is done."""
     num_replicas: int
@@ -99,7 +99,7 @@ class EvaluatorCfg(Compute):
     reward: bool = False
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     space: str = "super_gaussian"
-    """Terrain space of the genes, as :func:`sim.spaces.registry.load_space` takes it."""
+    """Terrain space of the genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
     resolved: bool = False
     """Whether contact is resolved (:func:`sim.crossing.resolved`), which takes five times as long."""
 

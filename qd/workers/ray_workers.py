@@ -24,14 +24,14 @@ from ray.exceptions import RayError, RayTaskError
 from qd.workers.evaluator import Build, EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
 from qd.workers.process import EvaluatorError
 from qd.workers.shards import copied, flaw_of, join_results
+from sim.controllers.spec import ControllerSpec
 from sim.files.command import debugging
 from sim.files.records import code_fingerprint
-from sim.ground import joined_name, split_name
-from sim.policy.spec import ControllerSpec
 from sim.robots.find import get_robot
-from sim.robots.own import PackedRobot, pack_robot
+from sim.robots.user import PackedRobot, pack_robot
 from sim.rollout import RolloutResult
-from sim.spaces.registry import is_own
+from sim.terrains.ground import joined_name, split_name
+from sim.terrains.spaces.registry import is_own
 
 _ROOMS = ("kernels", "sim", "qd")
 _CONNECT_LIMIT_S = 10.0

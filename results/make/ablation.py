@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from qd.archive import Archive
-from qd.faults import FRESH_EPISODES, fresh_numbers
-from qd.groups import families_of
-from qd.judge import FRESH_STREAM, elite_seeds, fresh_values
-from qd.run.settings import SearchCfg
-from qd.search import search
+from qd.faults.families import families_of
+from qd.faults.judge import FRESH_STREAM, elite_seeds, fresh_values
+from qd.faults.numbers import FRESH_EPISODES, fresh_numbers
+from qd.search.archive import Archive
+from qd.search.loop import search
+from qd.search.settings import SearchCfg
 from qd.workers.cross import Crossings
 from qd.workers.shards import arrays_of
 from results.make.common import ONCE, parse
-from sim.spaces.registry import get_space
+from sim.terrains.spaces.registry import get_space
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
 MOST_ELITES, STREAM = 200, 3  # of the random numbers that choose them

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.fitness import FAILING_GOAL_RATE
-from qd.groups import families_of
+from qd.faults.families import families_of
+from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings, How
 from results.make.common import Script, agreement, crossing_rates, parse
-from sim.spaces.registry import SUPER_GAUSSIAN, get_space
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 
 KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else
 HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from qd.judge import Stage, judge
-from qd.run.directory import RunDirectory
+from qd.faults.judge import Stage, judge
+from qd.search.directory import RunDirectory
 from results.make.common import CURVE_FILE, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically
 from train.cfg import FinetuneCfg, RunCfg

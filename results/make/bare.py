@@ -16,11 +16,11 @@ from torch.profiler import ProfilerActivity, profile
 
 from kernels.conditions import Condition
 from kernels.episode import Outcome, make_episodes
-from sim.bank import TerrainBank
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.bank import TerrainBank
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
 SEGMENT_STEPS = 10  # control steps: over 0.2 s a replayed robot still moves as the recorded one did
 SEGMENT_EVERY = 20

@@ -20,13 +20,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.archive import Archive
-from qd.judge import Stage, judge
-from qd.run.directory import RunDirectory, read_archive_of
-from qd.run.settings import SearchCfg, preset
-from qd.search import search
+from qd.faults.judge import Stage, judge
+from qd.search.archive import Archive
+from qd.search.directory import RunDirectory, read_archive_of
+from qd.search.loop import search
+from qd.search.settings import SearchCfg, preset
 from qd.workers.evaluator import Compute
-from sim.conditions import KINDS
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import DIFFERENCES, bootstrap_interval, t_interval
@@ -34,6 +33,7 @@ from sim.files.records import identity, provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
+from sim.terrains.conditions import KINDS
 
 SEEDS = (0, 1, 2)
 """Seeds of everything that is done several times."""

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive, goal_rates
-from qd.faults import EPISODES
-from qd.fitness import FAILING_GOAL_RATE
-from qd.judge import elite_seeds, judge, outcome_counts
-from qd.minimise import minimise
-from qd.run.directory import RunDirectory
-from qd.search import search
+from qd.faults.judge import elite_seeds, judge, outcome_counts
+from qd.faults.minimise.minimise import minimise
+from qd.faults.numbers import EPISODES
+from qd.search.archive import Archive, goal_rates
+from qd.search.directory import RunDirectory
+from qd.search.fitness import FAILING_GOAL_RATE
+from qd.search.loop import search
 from qd.workers.cross import Crossings
 from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
-from sim.conditions import KINDS
-from sim.spaces.dose import CONDITIONS_SPACE as SPACE
-from sim.spaces.registry import get_space
+from sim.terrains.conditions import KINDS
+from sim.terrains.doses import CONDITIONS_SPACE as SPACE
+from sim.terrains.spaces.registry import get_space
 
 EPISODES_SEARCHED = 400_000
 _STREAM = 2000

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
-from sim.conditions import KINDS
 from sim.files.intervals import value_words
+from sim.terrains.conditions import KINDS
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}

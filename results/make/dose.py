@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from qd.evaluate.dose import measure_dose
 from results.make.common import parse, published_controllers
-from sim.spaces.dose import DOSES, parse_doses
+from sim.terrains.doses import DOSES, parse_doses
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -6,7 +6,7 @@ They are of the independent search, which no published controller has trained on
 from collections.abc import Sequence
 
 from qd.evaluate.pack import make_pack
-from qd.judge import judge
+from qd.faults.judge import judge
 from results.make.common import parse, published_controllers
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from qd.workers.cross import Crossings
 from results.make.common import parse
-from sim.spaces.registry import SUPER_GAUSSIAN
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from qd.judge import controllers_in
+from qd.faults.judge import controllers_in
 from qd.show.crossed import title_of, typical_episode
 from qd.show.elites import open_run
 from qd.show.figures import save_figure

@@ -17,10 +17,10 @@ import numpy as np
 from qd.check import made_ready, walk
 from qd.evaluate.dose import measure_dose
 from qd.evaluate.evaluate import evaluate_rates
-from qd.judge import judge
-from qd.run.directory import RunDirectory
-from qd.run.settings import preset
-from qd.search import search
+from qd.faults.judge import judge
+from qd.search.directory import RunDirectory
+from qd.search.loop import search
+from qd.search.settings import preset
 from qd.show.elites import open_run
 from qd.show.replay import source_of_run
 from qd.workers.cross import Crossings, How
@@ -29,16 +29,16 @@ from results.make.common import agreement, crossing_rates, read_alike, runs_of_t
 from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
 from results.make.speed import time_crossings
+from sim.controllers.imports import import_controller
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.records import provenance
 from sim.files.settings import read_toml
-from sim.policy.imports import import_controller
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import MOST_HEIGHT
-from sim.spaces.dose import parse_doses
-from sim.spaces.registry import SUPER_GAUSSIAN, load_space
+from sim.terrains.doses import parse_doses
+from sim.terrains.spaces.base import MOST_HEIGHT
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 

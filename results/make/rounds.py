@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from qd.search import search
+from qd.search.loop import search
 from results.make.archive import judge_with_specialist
 from results.make.common import Script, parse, publish_controller, read_made
 from results.make.tables import train, write_tables

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from qd.run.settings import preset
+from qd.search.settings import preset
 from qd.workers.evaluator import EvaluatorCfg, available_cores, open_evaluator
 from results.make.common import parse
-from sim.spaces.registry import SUPER_GAUSSIAN
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN
 
 ROUNDS = 3
 """Evaluations timed of each, after one that is not; the median counts."""

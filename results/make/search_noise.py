@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from qd.faults import FRESH_EPISODES
-from qd.groups import families_of
-from qd.judge import FRESH_STREAM, elite_seeds, fresh_values, judge
-from qd.pool import chance_to_stay
-from qd.run.directory import RunDirectory
-from qd.search import search
+from qd.faults.families import families_of
+from qd.faults.judge import FRESH_STREAM, elite_seeds, fresh_values, judge
+from qd.faults.numbers import FRESH_EPISODES
+from qd.search.directory import RunDirectory
+from qd.search.loop import search
+from qd.search.pool import chance_to_stay
 from qd.workers.cross import Crossings
 from results.make.common import ONCE, Script, file_name, parse
-from sim.spaces.registry import get_space
+from sim.terrains.spaces.registry import get_space
 
 SEEDS, EPISODES = (0, 1, 2), 400_000
 LONG_EPISODES = 1_000_000

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-from qd.archive import Archive
-from qd.groups import rank
-from qd.judge import judge
-from qd.run.directory import RunDirectory
-from qd.search import search
+from qd.faults.families import rank
+from qd.faults.judge import judge
+from qd.search.archive import Archive
+from qd.search.directory import RunDirectory
+from qd.search.loop import search
 from results.make.common import parse
-from sim.spaces.registry import get_space
+from sim.terrains.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")
 COUNTS = (

@@ -25,12 +25,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from qd.archive import read_archive
-from qd.fitness import FAILING_GOAL_RATE
-from qd.run.directory import Metrics, RunDirectory
-from qd.run.settings import SearchCfg, preset
-from qd.scheduler import Scheduler
-from qd.search import search
+from qd.search.archive import read_archive
+from qd.search.directory import Metrics, RunDirectory
+from qd.search.fitness import FAILING_GOAL_RATE
+from qd.search.loop import search
+from qd.search.scheduler import Scheduler
+from qd.search.settings import SearchCfg, preset
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator
 from results.make.agreement import compare, cross_in_all_ways
@@ -38,7 +38,7 @@ from results.make.bare import bare_rates, kernel_shares, standing_rates
 from results.make.common import ONCE, Script, parse
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
-from sim.spaces.registry import SUPER_GAUSSIAN, load_space
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
 
 WARM_UP = 2
 WIDE = ("surrogate", "cma_mae+map_elites")

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import read_archive
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.measures import kind_mean
 from qd.evaluate.sets import TerrainSet, elites_sha256, make_sets, paper_terrains
 from qd.evaluate.tables import by_kind
+from qd.search.archive import read_archive
 from results.make.common import (
     SEEDS,
     Script,
@@ -29,9 +29,9 @@ from results.make.common import (
     published_controllers,
     read_made,
 )  # fmt: skip
+from sim.controllers.spec import controller_hash
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
-from sim.policy.spec import controller_hash
 from train.cfg import LARGE, FinetuneCfg, RunCfg
 from train.finetune import finetune
 from train.ppo.checkpoint import CHECKPOINT

@@ -16,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sim.policy.spec import ControllerSpec, controller_hash
+from sim.controllers.spec import ControllerSpec, controller_hash
 from sim.robots.model_files import read_model_files
 from sim.robots.robot import RobotCfg
 

@@ -27,11 +27,10 @@ from kernels.penalties import PENALTIES
 from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
-from sim.bank import TerrainBank, terrains_of
-from sim.conditions import NOMINAL
+from sim.controllers.loaders import Policy, load_policy, prepare_torch
+from sim.controllers.runner import forget_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
 from sim.crossing import resolved as with_contact_resolved
-from sim.ground import GroundMaps
 from sim.mujoco_c.model import (
     NO_SOFTNESS,
     Array,
@@ -45,12 +44,13 @@ from sim.mujoco_c.model import (
     to_mujoco,
     vary_model,
 )
-from sim.policy.loaders import Policy, load_policy, prepare_torch
-from sim.policy.runner import forget_all
 from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.spaces.base import TerrainSpace
+from sim.terrains.bank import TerrainBank, terrains_of
+from sim.terrains.conditions import NOMINAL
+from sim.terrains.ground import GroundMaps
+from sim.terrains.spaces.base import TerrainSpace
 
 _WARNINGS = [
     getattr(mj.mjtWarning, f"mjWARN_{name}")

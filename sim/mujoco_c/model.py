@@ -17,12 +17,12 @@ from kernels.conditions import Condition
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
-from sim.ground import PATCHES, GroundMaps
-from sim.maps.hfield import QUARTER_TURN, Margins, as_hfield
 from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.ground import PATCHES, GroundMaps
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.maps.hfield import QUARTER_TURN, Margins, as_hfield
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = 4 << 20  # bytes
@@ -73,8 +73,8 @@ def crossing_model(
     the robot: a box where the patch is level, else a heightfield. Patches that follow each other along the way are one
     where they are alike in every row.
 
-    Heights [m] have shape (nrow, ncol), at :data:`sim.terrain.SPACING`; ``ground`` is that of this one terrain. The
-    contact time constant [s] is of all geoms, critically damped; the file's if None.
+    Heights [m] have shape (nrow, ncol), at :data:`sim.terrains.hand_crafted.SPACING`; ``ground`` is that of this one
+    terrain. The contact time constant [s] is of all geoms, critically damped; the file's if None.
     """
     spec = robot_spec(robot)
     spec.memory = _MEMORY

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from sim.bank import heights_of
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes, read_arrays
-from sim.ground import GroundMaps
 from sim.recording.recorder import FRAME_ARRAYS, Recording
-from sim.spaces.registry import get_space, is_own
+from sim.terrains.bank import heights_of
+from sim.terrains.ground import GroundMaps
+from sim.terrains.spaces.registry import get_space, is_own
 
 FORMAT = "faultline recording 3"
 """Name and version in every file."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, PENALTIES
 from sim.files.records import identity, provenance
-from sim.ground import GroundMaps
 from sim.rollout import Rollout, RolloutResult
+from sim.terrains.ground import GroundMaps
 
 FRAME_ARRAYS: dict[str, type[np.floating]] = {
     "base_position": np.float32,

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sim.ground import GroundMaps
 from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_CONTROLLER, TOUCH, scene_model
 from sim.robots.compiled import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import touches_of
+from sim.terrains.ground import GroundMaps
 
 _MAX_GEOMS = 20_000
 _GHOST_OPACITY = 0.4

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
-from sim.ground import GroundMaps
-from sim.maps.hfield import surface_of
-from sim.maps.picture import height_colors, tinted
 from sim.robots.compiled import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, shown_spec
-from sim.terrain import SPACING
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import SPACING
+from sim.terrains.maps.hfield import surface_of
+from sim.terrains.maps.picture import height_colors, tinted
 
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""

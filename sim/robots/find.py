@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.records import check_identity
-from sim.policy.spec import controller_hash
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
@@ -25,7 +25,7 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     if spec in ROBOTS:
         return ROBOTS[spec]
     if spec.endswith((".py", ".toml")):
-        from sim.robots.own import load_robot  # Newton takes seconds to load: not for the help of commands
+        from sim.robots.user import load_robot  # Newton takes seconds to load: not for the help of commands
 
         return load_robot(Path(spec))
     known = ", ".join(ROBOTS)

@@ -9,14 +9,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.bank import TerrainBank, heights_of
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot
 from sim.robots.probes import extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import SPACING
+from sim.terrains.bank import TerrainBank, heights_of
+from sim.terrains.hand_crafted import SPACING
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _GRAVITY = 9.81
 _TERRAINS = 4

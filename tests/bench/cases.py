@@ -21,8 +21,8 @@ from kernels.super_gaussian import LOWER, NEGLIGIBLE, UPPER, rasterise
 from sim.crossing import CrossingCfg, make_task
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.bench import counterparts
 from tests.bench.ceiling import Work
 

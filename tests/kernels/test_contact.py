@@ -6,8 +6,8 @@ import warp as wp
 
 from kernels.contact import Contacts, Probes, collide_strips, make_contacts, sum_forces
 from kernels.ground import FIRM, Ground
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import SPACING, crossing_terrain
+from sim.terrains.hand_crafted import SPACING, crossing_terrain
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
 from tests.kernels.states import filled, make_terrain
 

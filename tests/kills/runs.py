@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 import faultline
-from qd import search as searching
-from qd.archive import ARCHIVE_FILE
-from qd.run.checkpoint import load_checkpoint
-from qd.run.directory import CHECKPOINT_FILE, CONFIG_FILE
+from qd.search import loop as searching
+from qd.search.archive import ARCHIVE_FILE
+from qd.search.checkpoint import load_checkpoint
+from qd.search.directory import CHECKPOINT_FILE, CONFIG_FILE
 from sim.robots.find import get_robot
 from tests.kills.faults import Steps
 from tests.qd.searches import crossing_by, rows_of

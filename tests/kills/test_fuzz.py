@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from qd.archive import read_archive, write_archive
-from qd.run.checkpoint import load_checkpoint, save_checkpoint
+from qd.search.archive import read_archive, write_archive
+from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.cross import Cache
-from sim.policy.loaders import load_policy
+from sim.controllers.loaders import load_policy
 from sim.recording.file import read_recording
 from sim.robots.find import get_robot
 from tests.builders import judged_archive

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import read_archive, write_archive
-from qd.judge import judge
+from qd.faults.judge import judge
+from qd.search.archive import read_archive, write_archive
 from tests.qd.searches import run, without_figures
 from tests.qd.stand_in import compute_by, open_stand_in
 

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from qd import search as searching
-from qd.archive import Archive
-from qd.fitness import FitnessCfg
-from qd.run.presets import SchedulerCfg
-from qd.run.settings import SearchCfg
-from qd.search import search
+from qd.search import loop as searching
+from qd.search.archive import Archive
+from qd.search.fitness import FitnessCfg
+from qd.search.loop import search
+from qd.search.presets import SchedulerCfg
+from qd.search.settings import SearchCfg
 from qd.show import figures
 from qd.workers.evaluator import Compute
+from sim.controllers.spec import controller_hash
 from sim.files.records import robot_identity
-from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
 from tests.qd import stand_in
 from tests.qd.stand_in import compute_by, open_stand_in

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from qd import check
-from qd.archive import read_archive
 from qd.commands import Archive
-from qd.judge import judge
-from qd.run import settings
-from qd.search import say_what_stops_the_robot
+from qd.faults.judge import judge
+from qd.search import settings
+from qd.search.archive import read_archive
+from qd.search.loop import say_what_stops_the_robot
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot

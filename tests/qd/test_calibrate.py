@@ -11,8 +11,8 @@ from qd.calibrate import calibrate, fitting_height, measured
 from sim.files.records import identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
-from sim.spaces.registry import get_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.registry import get_space
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.robots import Robots
 from tests.qd.stand_in import compute_by, make_result

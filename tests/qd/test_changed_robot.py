@@ -5,8 +5,8 @@ import json
 
 import pytest
 
+from sim.controllers.loaders import load_policy
 from sim.files.records import identity, robot_digest, robot_identity
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot, robot_of
 from sim.robots.shipped import ROBOTS
 from tests.builders import rsl_rl_actor, save_checkpoint

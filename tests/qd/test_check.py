@@ -9,7 +9,7 @@ from qd.commands import Check
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot, read_penalty_scales
-from sim.spaces.registry import get_space, space_at
+from sim.terrains.spaces.registry import get_space, space_at
 from tests.qd.robots import Robots
 from tests.qd.stand_in import compute_by
 from tests.sim.dogs import CONTROLLER, write_dog, write_toml

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.archive import read_archive, write_archive
-from qd.causes import causes_at, effects_of
 from qd.commands import Archive
-from qd.minimise import minimise
-from qd.run import settings
+from qd.faults.causes import causes_at, effects_of
+from qd.faults.minimise.minimise import minimise
+from qd.search import settings
+from qd.search.archive import read_archive, write_archive
 from qd.show.commands import Export
-from sim.bank import terrains_of
 from sim.files.command import run_command
-from sim.maps.heightmap import read_heightmap
-from sim.spaces.registry import get_space
+from sim.terrains.bank import terrains_of
+from sim.terrains.maps.heightmap import read_heightmap
+from sim.terrains.spaces.registry import get_space
 from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.robots import Robots

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import read_archive
-from sim.maps.heightmap import read_heightmap
+from qd.search.archive import read_archive
+from sim.terrains.maps.heightmap import read_heightmap
 from tests.docs import ROOT
 from tests.sim.dogs import write_dog
-from tests.sim.spaces.spaces import write_ridges
+from tests.sim.terrains.spaces.spaces import write_ridges
 
 RUN_COMMANDS = """
 import contextlib, io, json, sys

@@ -21,7 +21,7 @@ from qd.workers.evaluator import Compute
 from results.make import archive, bare, common, docs, rounds, search, search_noise, speed, tables, train_speed
 from sim.files.records import sources_sha256
 from sim.rollout import Rollout
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.searches import rows_of, run, without_figures
 from tests.qd.stand_in import Stub, make_result
 from train.ppo.learner import Ranks

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from sim.controllers.loaders import load_policy
 from sim.mujoco_c.crossing import Episodes, cross
 from sim.mujoco_c.model import GROUND, crossing_model
-from sim.policy.loaders import load_policy
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
 
 def on_plane(robot, quat_wxyz=(1, 0, 0, 0)) -> mujoco.MjModel:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.bank import TerrainBank
 from sim.crossing import CrossingCfg
-from sim.ground import GroundMaps
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.simulation import Simulation
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.bank import TerrainBank
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from tests.sim.policies import stand
 
 NODE_X = np.arange(NUM_COLS) * SPACING

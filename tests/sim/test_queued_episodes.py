@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from sim.bank import heights_of
+from sim.controllers.loaders import load_policy
 from sim.crossing import CrossingCfg
-from sim.policy.loaders import load_policy
 from sim.rollout import Rollout
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import crossing_terrain
+from sim.terrains.bank import heights_of
+from sim.terrains.hand_crafted import crossing_terrain
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.policies import stretch
 from tests.sim.scenes import FLAT, ONLY_ANYMAL, spike
 

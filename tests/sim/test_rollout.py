@@ -6,8 +6,8 @@ import pytest
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
 from sim.rollout import Rollout
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import crossing_terrain
+from sim.terrains.hand_crafted import crossing_terrain
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.policies import Remembers
 from tests.sim.scenes import FLAT, crossing, positions, put
 

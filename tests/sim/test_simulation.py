@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.bank import TerrainBank
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import resolve_device
 from sim.simulation import Simulation
+from sim.terrains.bank import TerrainBank
 from tests.sim.scenes import GAINS, Stepper, put, standing
 
 

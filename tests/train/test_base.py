@@ -10,9 +10,9 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sim.controllers.loaders import load_policy
 from sim.files.atomic import locked
 from sim.files.command import Interrupted, run_command
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import train

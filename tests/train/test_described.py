@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from qd.judge import controllers_in
+from qd.faults.judge import controllers_in
+from sim.controllers.described import read_controller
+from sim.controllers.loaders import load_policy
 from sim.mujoco_c.crossing import cross, draw_starts
-from sim.policy.described import read_controller
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_toml
 from tests.train.conftest import begun
 from tests.train.starts import PPO

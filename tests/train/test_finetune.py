@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from qd.archive import write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.sets import split_elites
+from qd.search.archive import write_archive
+from sim.controllers.loaders import load_policy
+from sim.controllers.spec import controller_hash
 from sim.files.command import run_command
-from sim.policy.loaders import load_policy
-from sim.policy.spec import controller_hash
 from sim.robots.find import get_robot
-from sim.spaces import registry as spaces
+from sim.terrains.spaces import registry as spaces
 from tests.builders import fresh_values, make_archive, write_run
-from tests.sim.spaces.spaces import write_ridges
+from tests.sim.terrains.spaces.spaces import write_ridges
 from tests.train.conftest import begun
 from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg

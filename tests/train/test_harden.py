@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from qd.archive import read_archive, write_archive
 from qd.evaluate.marks import marks_of, recorded_marks
 from qd.evaluate.sets import generated_set, make_sets, split_elites
+from qd.search.archive import read_archive, write_archive
 from qd.workers.evaluator import Compute
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command

@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
+from sim.controllers.described import ControllerCfg, Described, read_controller
+from sim.controllers.loaders import load_described, load_policy, read_weights
+from sim.controllers.mlp import ACTIVATIONS, MlpPolicy
+from sim.controllers.spec import in_one_line, weights_file
 from sim.files.atomic import write_atomically
-from sim.policy.described import ControllerCfg, Described, read_controller
-from sim.policy.loaders import load_described, load_policy, read_weights
-from sim.policy.mlp import ACTIVATIONS, MlpPolicy
-from sim.policy.spec import in_one_line, weights_file
 from sim.robots.robot import RobotCfg
 
 FORMAT = "faultline training checkpoint 2"

@@ -15,7 +15,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import distributed
 
-from sim.policy.spec import in_one_line
+from sim.controllers.spec import in_one_line
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD, Start, State
 from train.ppo.ppo import CapturedPPO, runner_settings

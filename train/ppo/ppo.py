@@ -6,8 +6,8 @@ import torch
 from rsl_rl.algorithms import PPO
 from torch import nn
 
+from sim.controllers.described import ControllerCfg
 from sim.device import recording
-from sim.policy.described import ControllerCfg
 from train.ppo.cfg import PpoCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on

@@ -10,7 +10,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[repo
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from kernels.rewards import REWARDS
-from qd.run.progress import clock
+from qd.search.progress import clock
 from sim.files.atomic import explain_failed_write
 from sim.files.intervals import value_words
 from train.ppo.checkpoint import STD

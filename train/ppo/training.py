@@ -12,16 +12,16 @@ from typing import Any, Literal
 
 import torch
 
-from qd.archive import ARCHIVE_FILE
 from qd.evaluate.marks import TRAINED_ON
-from qd.run.directory import CHECKPOINT_FILE
-from qd.run.settings import differences
+from qd.search.archive import ARCHIVE_FILE
+from qd.search.directory import CHECKPOINT_FILE
+from qd.search.settings import differences
+from sim.controllers.described import ControllerCfg, text_of
+from sim.controllers.spec import is_same
 from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.records import provenance, robot_digest
-from sim.policy.described import ControllerCfg, text_of
-from sim.policy.spec import is_same
 from sim.robots.robot import RobotCfg
 from train.cfg import TrainCfg
 from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, read_checkpoint, write_checkpoint

@@ -9,7 +9,7 @@ from msgspec import Meta
 from sim.files.settings import Interval, NonNegativeFloat, NonNegativeInt, PositiveFloat, problems
 from sim.robots.robot import RobotCfg
 from sim.robots.training import MOST_SPREAD, NoiseCfg, TrainingCfg
-from sim.terrain import NUM_LEVELS
+from sim.terrains.hand_crafted import NUM_LEVELS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim.ground import GroundMaps
-from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, TILE_TYPES, crossing_terrain, training_tiles
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import NUM_COLS, NUM_LEVELS, NUM_ROWS, TILE_TYPES, crossing_terrain, training_tiles
 from train.task.cfg import CurriculumCfg
 
 

@@ -6,12 +6,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.bank import terrains_of
-from sim.ground import GroundMaps
 from sim.robots.training import Draw
-from sim.spaces.base import TerrainSpace
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
+from sim.terrains.bank import terrains_of
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from train.task.curriculum import Tiles
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains

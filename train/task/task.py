@@ -24,12 +24,12 @@ from kernels.training import (
     seed_restarts,
 )
 from sim import crossing
-from sim.bank import TerrainBank
+from sim.controllers.loaders import prepare_torch
 from sim.crossing import CAPACITY_OVERFLOWS
-from sim.policy.loaders import prepare_torch
 from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
+from sim.terrains.bank import TerrainBank
 from train.task.cfg import TaskCfg
 from train.task.curriculum import Tiles, make_tiles
 

@@ -8,7 +8,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from kernels.episode import Outcome
-from sim.policy.described import ControllerCfg, Described
+from sim.controllers.described import ControllerCfg, Described
 from train.task.task import CommandTask
 
 

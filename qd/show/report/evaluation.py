@@ -7,7 +7,7 @@ from typing import Any
 from qd.evaluate import labels
 from qd.evaluate.labels import FATES, SETS
 from qd.evaluate.tables import as_tables
-from qd.run.directory import ROUNDS_FILE
+from qd.search.directory import ROUNDS_FILE
 from qd.show.report.page import Table, check_page, origin_rows, percent, publish_page
 from sim.files.atomic import read_json
 from sim.files.command import command_line

@@ -11,7 +11,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 from PIL import Image
 
-from qd.run.progress import clock
+from qd.search.progress import clock
 from qd.show.replay import save
 from sim.files.atomic import prepare_output
 from sim.files.figures import as_image

@@ -13,11 +13,11 @@ from qd.show.crossed import episode_beside, moment_of_failure, typical_episode
 from qd.show.figures import relief
 from qd.show.film import clear_elevation
 from qd.show.report.page import picture_source
-from sim.bank import heights_of, terrains_of
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
-from sim.spaces.base import TerrainSpace
+from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.spaces.base import TerrainSpace
 
 TILE = (96, 48)
 """Width and height of a small picture [pixels]."""

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qd.archive import Archive
 from qd.evaluate.tables import read_tables
-from qd.faults import further_rates
-from qd.groups import VERDICTS, Ranking, rank
-from qd.minimise import read_minimal
-from qd.run.directory import ROUNDS_FILE, folder_for
-from qd.run.progress import Bar
+from qd.faults.families import VERDICTS, Ranking, rank
+from qd.faults.minimise.minimise import read_minimal
+from qd.faults.numbers import further_rates
+from qd.search.archive import Archive
+from qd.search.directory import ROUNDS_FILE, folder_for
+from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, draw_crossing, rates_of
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Cross, Recordings, on_elite
@@ -19,8 +19,8 @@ from qd.show.report.page import Table, check_page, figure_source, publish_page
 from qd.show.report.pictures import close_pictures, failure_of, same_moment, why_no_pictures
 from qd.show.report.search import content_of
 from qd.workers.evaluator import check_policy, resolve_device
+from sim.controllers.spec import spec_of
 from sim.files.records import without_machine
-from sim.policy.spec import spec_of
 from sim.recording.recorder import Recording
 
 _OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown

@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.faults import fault_numbers
-from qd.groups import VERDICTS, Ranking, summary_of
-from qd.minimise import MinimalTerrains
-from qd.run.directory import METRICS_FILE, Metrics, RunDirectory
+from qd.faults.families import VERDICTS, Ranking, summary_of
+from qd.faults.minimise.minimise import MinimalTerrains
+from qd.faults.numbers import fault_numbers
+from qd.search.archive import Archive
+from qd.search.directory import METRICS_FILE, Metrics, RunDirectory
 from qd.show.crossed import Rate
 from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
+from sim.controllers.spec import SHIPPED, ControllerSpec, spec_of
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.records import without_machine
-from sim.policy.spec import SHIPPED, ControllerSpec, spec_of
 
 _MOST_BARS = 10
 _FAULT = VERDICTS.index("fault")

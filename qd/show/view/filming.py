@@ -6,7 +6,7 @@ from typing import Any
 
 import viser
 
-from qd.run.directory import folder_for
+from qd.search.directory import folder_for
 from qd.show.film import film
 from qd.show.view.crosser import Common
 from qd.show.view.recorder import Report

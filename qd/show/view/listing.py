@@ -8,15 +8,15 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.archive import Archive
-from qd.faults import certifier_of, elite_words
-from qd.groups import ORDERS, VERDICTS, Ranking, rank
-from qd.minimise import MinimalTerrains
+from qd.faults.families import ORDERS, VERDICTS, Ranking, rank
+from qd.faults.minimise.minimise import MinimalTerrains
+from qd.faults.numbers import certifier_of, elite_words
+from qd.search.archive import Archive
 from qd.show.crossed import ARRIVED, FAILED, rates_of
 from sim.crossing import CrossingCfg
 from sim.files.intervals import rate_words
 from sim.recording.recorder import Recording
-from sim.spaces.base import TerrainSpace
+from sim.terrains.spaces.base import TerrainSpace
 
 _GREY, _LISTED, _PICKED = "#d8d8d8", "#2171b5", "#d55e00"
 RATES = {"goal_rate": "reached the goal", "collision_rate": "base collision", "other_rate": "out of time, off it",
@@ -50,7 +50,7 @@ class Listing:
         return {name: self.ranking.order(name) for name in ORDERS}
 
     def listed(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
-        """Numbers of the elites of a cause, or of all, in one of the :data:`qd.groups.ORDERS`."""
+        """Numbers of the elites of a cause, or of all, in one of the :data:`qd.faults.families.ORDERS`."""
         numbers = self._orders[order]
         return numbers[np.isin(numbers, self.ranking.by_cause()[cause])] if cause else numbers
 
@@ -60,7 +60,7 @@ class Listing:
         return {"all": "", **{f"{cause} ({len(members):,})": cause for cause, members in rows.items()}}
 
     def verdict(self, number: int) -> str:
-        """One of :data:`qd.groups.VERDICTS`."""
+        """One of :data:`qd.faults.families.VERDICTS`."""
         return VERDICTS[int(self.ranking.elites.verdict[number])]
 
     def rows_html(self, numbers: Sequence[int]) -> str:

@@ -9,12 +9,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.ground import GroundMaps
-from sim.maps.hfield import surface_of
-from sim.maps.picture import height_colors, tinted
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
-from sim.terrain import SPACING
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import SPACING
+from sim.terrains.maps.hfield import surface_of
+from sim.terrains.maps.picture import height_colors, tinted
 
 _LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84

@@ -15,14 +15,14 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from viser import uplot
 
-from qd.groups import ORDERS, summary_of
+from qd.faults.families import ORDERS, summary_of
 from qd.show.crossed import ENDINGS
 from qd.show.figures import label_of, look_of
 from qd.show.view.listing import FITNESS_WORDS, Column, Listing, map_svg, table_html
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, first_view_of
-from sim.maps.picture import SLIPPERY, SOFT, height_colors
 from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
+from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
 _WIDTH, _NARROW_WIDTH = 360, 300  # of a panel [pixels]
 _WIDE = 1300  # a window from here on has room for two wide panels; in a narrower one the archive is folded [pixels]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from qd.show.view.meshes import Part, arrow_mesh, arrow_pose, in_linear_light, terrain_mesh
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
-from sim.ground import GroundMaps
 from sim.mujoco_c.model import surface_heights
 from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
-from sim.terrain import SPACING
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import SPACING
 
 FORCE_COLOR, COMMAND_COLOR = (0.84, 0.10, 0.11), (0.0, 0.62, 0.45)
 """Of arrows, RGB, 0 to 1."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.minimise import MinimalTerrains, read_minimal
+from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Wanted, on_elite
 from qd.show.view.listing import Listing
 from qd.workers.evaluator import check_policy
-from sim.policy.spec import ControllerSpec, controllers_of
+from sim.controllers.spec import ControllerSpec, controllers_of
 from sim.robots.robot import RobotCfg
 
 SEARCHED = "searched controller"

@@ -21,8 +21,8 @@ from qd.show.view.playing import episodes_by_ending, paths_of
 from qd.show.view.recorder import Report
 from qd.show.view.scene import Points, Scene, View, first_view_of, overview_of
 from qd.show.view.show import SEARCHED
-from sim.bank import terrains_of
 from sim.recording.recorder import Recording
+from sim.terrains.bank import terrains_of
 
 _BAR_S = 0.1  # real time from one update of the bar's time to the next, while playing
 _ADDRESS_S = 1.0  # real time from one update of the address to the next; browsers take no more than some three a second

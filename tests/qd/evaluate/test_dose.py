@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
-from sim.spaces.dose import parse_doses
+from sim.terrains.doses import parse_doses
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 

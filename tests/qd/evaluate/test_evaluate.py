@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import write_archive
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
+from qd.search.archive import write_archive
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from tests.builders import make_archive

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.archive import read_archive
 from qd.commands import Evaluate
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
@@ -22,12 +21,13 @@ from qd.evaluate.pack import (
     with_rates,
     write_terrains,
 )
-from qd.judge import judge
-from qd.minimise import minimise
+from qd.faults.judge import judge
+from qd.faults.minimise.minimise import minimise
+from qd.search.archive import read_archive
 from sim.files.command import run_command
 from sim.files.records import identity
 from sim.robots.shipped import ROBOTS
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 

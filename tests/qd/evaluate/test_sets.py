@@ -18,10 +18,10 @@ from qd.evaluate.sets import (
     set_rng,
     split_elites,
 )
-from qd.run.settings import as_settings
-from sim.bank import heights_of
-from sim.spaces.course import COURSE
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from qd.search.settings import as_settings
+from sim.terrains.bank import heights_of
+from sim.terrains.spaces.course import COURSE
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, make_archive, write_run
 from tests.qd.searches import CFG
 

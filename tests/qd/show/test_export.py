@@ -9,8 +9,8 @@ import pytest
 
 from qd.show.elites import open_run
 from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
-from sim.bank import heights_of
-from sim.maps.heightmap import as_terrain, read_heightmap
+from sim.terrains.bank import heights_of
+from sim.terrains.maps.heightmap import as_terrain, read_heightmap
 from tests.builders import fresh_values, small_archive, write_run
 
 

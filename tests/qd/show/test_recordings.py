@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qd.show.recordings import Recordings, on_elite
-from sim.ground import GroundMaps
+from sim.terrains.ground import GroundMaps
 from tests.builders import small_archive
 from tests.qd.recordings import stand_in_cross
 

@@ -10,19 +10,19 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Invalidity, Outcome
-from qd.archive import write_archive
-from qd.descriptors import Cells
-from qd.groups import rank
-from qd.run.directory import RunDirectory
+from qd.faults.families import rank
+from qd.search.archive import write_archive
+from qd.search.descriptors import Cells
+from qd.search.directory import RunDirectory
 from qd.show.commands import Export, Replay
 from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
 from qd.show.view.show import find_show
+from sim.controllers.spec import controller_hash
 from sim.files.command import run_command
 from sim.files.records import identity, robot_identity
-from sim.policy.spec import controller_hash
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import FRAMES, recording_of
 from tests.qd.searches import CFG

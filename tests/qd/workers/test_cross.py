@@ -12,7 +12,7 @@ from qd.workers.evaluator import Compute
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from sim.robots.find import get_robot
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.robots import Robots
 from tests.qd.stand_in import assert_same, compute_by

@@ -9,14 +9,14 @@ import warp as wp
 
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import PENALTIES
+from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
 from sim.mujoco_c.model import GROUND, crossing_model, step_penalties, to_mujoco
-from sim.policy.loaders import load_policy
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
 from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
 from tests.sim.plain_mujoco import cross_and_keep, rays_from_above

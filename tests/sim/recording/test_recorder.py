@@ -11,7 +11,7 @@ from sim.crossing import CrossingCfg
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import FRAME_ARRAYS, Recording, record
 from sim.rollout import Rollout
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.plain_mujoco import to_c
 from tests.sim.scenes import FLAT, slope, spike
 

@@ -6,7 +6,7 @@ import pytest
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.recording.scene import ground_paint, scene_model
-from sim.terrain import NUM_COLS, NUM_ROWS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.sim.plain_mujoco import rays_from_above, to_c
 from tests.sim.scenes import standing as standing_robots
 

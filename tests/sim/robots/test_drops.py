@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.bank import heights_of
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot
 from sim.robots.probes import extents
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import CROSSING_TYPES, SPACING, crossing_terrain
+from sim.terrains.bank import heights_of
+from sim.terrains.hand_crafted import CROSSING_TYPES, SPACING, crossing_terrain
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
 from tests.sim.scenes import FLAT, NODE_X, Stepper, free_body, lying, positions, put, simulate, standing, velocities
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.terrain import NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
+from sim.terrains.hand_crafted import NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
 from train.task.curriculum import CurriculumCfg, make_tiles
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sim.bank import terrains_of
-from sim.spaces.course import COURSE
-from sim.spaces.registry import get_space
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrain import CROSSING_TYPES
+from sim.terrains.bank import terrains_of
+from sim.terrains.hand_crafted import CROSSING_TYPES
+from sim.terrains.spaces.course import COURSE
+from sim.terrains.spaces.registry import get_space
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from train.task.mix import Mix
 
 ELITES = SUPER_GAUSSIAN.hard_random(7, 0)

@@ -8,9 +8,9 @@ import torch
 
 from kernels.conditions import Condition
 from kernels.episode import Outcome
-from sim.conditions import NOMINAL
-from sim.ground import GroundMaps
 from sim.robots.find import get_robot
+from sim.terrains.conditions import NOMINAL
+from sim.terrains.ground import GroundMaps
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
 from train.task.cfg import NoiseCfg, TaskCfg, task_problems

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
-from qd.archive import read_archive
-from qd.run.settings import as_settings, preset
+from qd.search.archive import read_archive
+from qd.search.settings import as_settings, preset
 from qd.show.report import report
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot

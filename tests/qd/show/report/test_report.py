@@ -11,15 +11,15 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.archive import FaultCounts, read_archive, write_archive
-from qd.groups import VERDICTS, Ranking, elites_of, rank, summary_of
+from qd.faults.families import VERDICTS, Ranking, elites_of, rank, summary_of
+from qd.search.archive import FaultCounts, read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.page import percent
 from qd.show.report.pictures import TILE, failure_of, same_moment, sheet_of
 from qd.show.report.search import causes_of
+from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
-from sim.policy.spec import controller_hash
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd.recordings import recording_of
 from tests.qd.show.report.pages import grouped_archive, make_run, minimal_of, reporter, text_of
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qd.show.view.listing import Listing
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.minimise import MinimalTerrains
+from qd.faults.minimise.minimise import MinimalTerrains
 from qd.show.crossed import moment_of_failure, typical_episode
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App

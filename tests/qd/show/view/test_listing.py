@@ -5,7 +5,7 @@ import numpy as np
 
 from qd.show.view.listing import Listing, column_of, table_html
 from qd.show.view.panels import Clock, Selection
-from sim.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from qd.archive import write_archive
+from qd.search.archive import write_archive
 from qd.show.view.app import check_port
 from qd.show.view.show import find_show
 from tests.builders import small_archive

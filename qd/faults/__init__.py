@@ -1,0 +1,1 @@
+"""Which failures are faults of the controller: judging, causes, families, minimal terrains."""

@@ -1,0 +1,1 @@
+"""Minimal terrains: the smallest ones on which a controller still fails."""

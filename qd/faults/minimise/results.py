@@ -1,0 +1,80 @@
+"""Minimal terrains of a run, as its files have them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.search.archive import Archive
+from sim.files.atomic import read_json
+from sim.files.command import chosen_elites
+from sim.files.intervals import value_words
+from sim.files.npz import read_arrays
+
+MINIMAL_FILE = "minimal.npz"
+NUMBERS_FILE = "minimal.json"
+
+_ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinimalTerrains:
+    """Minimal terrains of elites that are in an archive."""
+
+    numbers: dict[str, Any]
+    """As ``minimal.json`` has them."""
+    genes: dict[int, NDArray[np.float32]]
+    """By number of the elite, each of shape (num_genes,)."""
+
+    def chosen(self, text: str, run: object) -> list[int]:
+        """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
+        return chosen_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
+
+    def entry(self, number: int) -> dict[str, Any]:
+        """What ``minimal.json`` says of the minimal terrain of an elite."""
+        return next(entry for entry in self.numbers["elites"] if entry["elite"] == number)
+
+    def words(self, number: int) -> str:
+        """What is known of the minimal terrain of an elite, in a sentence."""
+        entry = self.entry(number)
+        rate = value_words(entry["goal_rate"], entry["goal_interval"], ".0%")
+        words = f"{len(entry['bumps'])} of {entry['of']} parts; goal reached {rate} when they were found"
+        if entry["cause"]:
+            words += f"; cause: {entry['cause']['kind']}"
+        return words + (f"; margin {100 * entry['margin_m']:.1f} cm" if entry["margin_m"] is not None else "")
+
+
+def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
+    """The minimal terrains of a run's folder; None where nobody looked for them.
+
+    What is of other elites than the archive's is left out; None if all are.
+    """
+    file = folder / NUMBERS_FILE
+    if not file.exists():
+        return None
+    try:
+        numbers, arrays = read_json(file), read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
+        entries, genes = numbers["elites"], arrays["genes"]
+        shape = (len(entries), archive.genes.shape[1])
+        if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
+            raise ValueError(f"{NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
+        if not all(set(_ENTRY) <= set(entry) for entry in entries):
+            raise ValueError(f"expected {', '.join(_ENTRY)} of each")
+    except Exception as error:  # a damaged zip archive can fail with anything
+        files = f"{folder / NUMBERS_FILE} and {MINIMAL_FILE}"
+        what = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(
+            f"{files} must be minimal terrains of the archive beside them: {what}: remove both, or run `faultline "
+            "minimise` again"
+        ) from None
+    # A search that went on may have found others of these numbers.
+    names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
+    rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
+    if not rows:
+        return None
+    return MinimalTerrains(
+        numbers=numbers | {"elites": [entries[row] for row in rows]},
+        genes={entries[row]["elite"]: genes[row] for row in rows},
+    )

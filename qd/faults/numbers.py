@@ -1,0 +1,205 @@
+"""Faults in numbers and words: what is known of the elites on which a controller fails.
+
+An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
+controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
+certificate is not known to be passable. A fault is robust if it is one under varied conditions too
+(:data:`sim.terrains.spaces.under_conditions.VARIED`).
+"""
+
+from collections.abc import Container, Mapping, Sequence
+from itertools import compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
+from qd.search.fitness import FITNESS_FLOOR
+from sim.files.intervals import bootstrap_interval, rate_words, wilson_interval
+
+FRESH_EPISODES = 40
+"""Episodes that each elite is evaluated again with."""
+EPISODES = 20
+"""Episodes of each other kind that an elite is judged by."""
+SPECIALIST = "specialist"
+"""Name of the certifier that was trained for one search, on its failing elites; all others are the panel."""
+
+_INVALID = OUTCOMES.index("invalid")
+OF_VARIED = ("crossed_varied", "robust")
+"""Numbers of :func:`fault_numbers` that only those have who were judged under varied conditions."""
+
+
+def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What a search found and how much it took, as reports have it; ``metrics`` has a row an iteration."""
+    with_collision = int((archive.collision_rate > 0.0).sum())  # in any episode; the bit is of 20
+    return {
+        "iterations": archive.iterations,
+        "terrains_evaluated": sum(row["terrains"] for row in metrics),
+        "episodes": sum(row["episodes"] for row in metrics),
+        "elites": len(archive),
+        "reachable_cells": archive.cells.num_cells,
+        "reachable_coverage": archive.reachable_coverage,
+        "qd_score": archive.qd_score,
+        "mean_fitness": archive.mean_fitness,
+        "with_collision": with_collision,
+        "without_collision": len(archive) - with_collision,
+        "wall_s": sum(row["wall_s"] for row in metrics),
+        "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
+    }
+
+
+def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
+    """What fresh episodes say of an archive, as reports have it."""
+    std, corrected = fresh.penalty_std[fresh.valid].sum(axis=1), fresh.corrected_elites()
+    families = None if archive.family is None else archive.family[fresh.valid]
+    return {
+        "reevaluated": len(fresh.reproduced),
+        "elites_reproduced": int(fresh.reproduced.sum()),
+        "elites_same_cell": int((fresh.valid & (fresh.cell == archive.cell)).sum()),
+        "mean_std": float(std.mean()) if len(std) else None,
+        "mean_std_interval": bootstrap_interval(std, 0, families=families),
+        "mean_fitness_corrected": float(fresh.fitness[fresh.valid].mean()) if len(std) else None,
+        "corrected_elites": len(corrected),
+        "corrected_coverage": len(corrected) / archive.cells.num_cells,
+        "corrected_qd_score": float((fresh.fitness[corrected] - FITNESS_FLOOR).sum()),
+    }
+
+
+def fault_numbers(
+    archive: Archive, families: NDArray[np.int64] | None = None, seen: NDArray[np.bool_] | None = None
+) -> dict[str, Any]:
+    """The numbers of faults, as ``archive.json`` has them; None of what is not known.
+
+    ``families`` has shape (N,); ``seen``, of shape (N, C), says whether a certifier has trained on kin of an elite.
+    """
+    faults, failing, confirmed = archive.counts, archive.failing, archive.confirmed
+    names = faults.certifiers
+    counts = ("confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
+    numbers: dict[str, Any] = {
+        "failing": None if archive.fresh is None else int(failing.sum()),
+        **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
+        "families": None if families is None else len(np.unique(families)),
+        "certifiers": list(names),
+    }
+    if archive.faults is None or not failing.any():
+        return numbers
+    resolved = failing & faults.resolved_outcomes.any(axis=1)
+    certificates = faults.certificates() & failing[:, None]
+    numbers["crossed_resolved"] = int(resolved.sum())
+    numbers["certificates"] = [
+        {
+            "controller": name,
+            "policy_sha256": digest,
+            "crossed": int((faults.certifier_outcomes[:, column].any(axis=1) & failing).sum()),
+            "certified": int(certificates[:, column].sum()),
+        }
+        for column, (name, digest) in enumerate(zip(names, faults.certifier_sha256, strict=True))
+    ]
+    if resolved.any():
+        numbers["confirmed"] = int(confirmed.sum())
+    if names:
+        numbers["certified"] = int(certificates.any(axis=1).sum())
+    if names and resolved.any():
+        of_panel = np.array(names) != SPECIALIST
+        is_fault = confirmed & certificates.any(axis=1)
+        numbers["faults"] = None if of_panel.all() else int(is_fault.sum())
+        numbers["faults_panel"] = int((confirmed & certificates[:, of_panel].any(axis=1)).sum())
+        if seen is not None:
+            numbers["faults_unseen"] = int((confirmed & (certificates & ~seen).any(axis=1)).sum())
+        if families is not None:
+            numbers["fault_families"] = len(np.unique(families[is_fault]))
+        if faults.varied_outcomes is not None:
+            numbers["crossed_varied"] = int((is_fault & faults.varied_outcomes.any(axis=1)).sum())
+            numbers["robust"] = int(archive.robust.sum())
+    return numbers
+
+
+def count_faults(archive: Archive) -> int | None:
+    """Faults by all certifiers, or by the panel where there is no specialist; None if nobody knows."""
+    numbers = fault_numbers(archive)
+    return numbers["faults_panel"] if numbers["faults"] is None else numbers["faults"]
+
+
+def certifier_of(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
+    """Name of the certifier that crosses an elite most often, of all or of some; None if none has a certificate."""
+    if not archive.certified[number]:
+        return None
+    faults = archive.counts
+    rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
+    rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
+    names = [name for name, rate in rate_of.items() if rate > 0.0 and (among is None or name in among)]
+    return max(names, key=rate_of.__getitem__, default=None)
+
+
+def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
+    """Further episodes on an elite that reached the goal, and valid ones, by who crossed it how, in words."""
+    faults = archive.counts
+    counts = {"With contact resolved (steps of 1 ms)": faults.resolved_outcomes[number]}
+    if faults.varied_outcomes is not None:
+        counts["Under varied conditions"] = faults.varied_outcomes[number]
+    for column, name in enumerate(faults.certifiers):
+        counts[name] = faults.certifier_outcomes[number, column]
+        counts[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, column]
+        if faults.certifier_varied_outcomes is not None:
+            counts[f"{name} under varied conditions"] = faults.certifier_varied_outcomes[number, column]
+    return {who: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for who, ends in counts.items() if ends.any()}
+
+
+def elite_words(archive: Archive, number: int) -> list[str]:
+    """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
+    faults, rates = archive.counts, further_rates(archive, number)
+    sentences = [f"{who}: {rate_words(*rate)} reach the goal." for who, rate in rates.items()]
+    if not sentences:
+        return []
+    crossers = [*compress(faults.certifiers, faults.certificates()[number].tolist())]
+    if not archive.failing[number]:
+        sentences.append("It does not fail by its fresh episodes.")
+    elif crossers:
+        robust = "a robust" if archive.robust[number] else "a"
+        kind = f"{robust} fault" if archive.confirmed[number] else "certified but not confirmed"
+        crosses = f"{' and '.join(crossers)} cross{'es' * (len(crossers) == 1)}"
+        sentences.append(f"It is {kind}: a terrain that {crosses} and this controller does not.")
+    else:
+        confirmed = "" if archive.confirmed[number] else "not "
+        sentences.append(f"It is {confirmed}confirmed, and not known to be passable.")
+    return sentences
+
+
+def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:
+    """The fresh episodes of an elite by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
+    fresh = archive.fresh
+    assert fresh is not None
+    valid, invalid = int(fresh.counted[number]), int(fresh.invalid_episodes[number])
+    goal, collided = (round(float(rate[number]) * valid) for rate in (fresh.goal_rate, fresh.collision_rate))
+    return np.array([goal, collided, valid - goal - collided, invalid])
+
+
+def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
+    """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
+    valid, rate = int(counts.sum() - counts[_INVALID]), float(goal_rates(counts))
+    interval = [round(limit, 4) for limit in wilson_interval(int(counts[0]), valid)]
+    return {"goal_rate": None if np.isnan(rate) else rate, "goal_interval": interval, "valid_episodes": valid}
+
+
+def judgement(archive: Archive, number: int) -> dict[str, Any]:
+    """What is known of an elite under other conditions, as JSON values; None of what nobody looked at.
+
+    ``resolved`` is the rate with contact resolved; ``certificates`` has of each controller that certifies it name,
+    hash, and rates at the ``searched`` settings and with contact ``resolved``. ``varied`` is that under varied
+    conditions of one that was crossed so, its own and its certifiers'.
+    """
+    faults = archive.counts
+    resolved, varied = faults.resolved_outcomes[number], faults.varied_outcomes
+    kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
+    if faults.certifier_varied_outcomes is not None:
+        kinds["varied"] = faults.certifier_varied_outcomes
+    under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_of(varied[number])}
+    return under_varied | {
+        "resolved": rate_of(resolved) if resolved.any() else None,
+        "certificates": [
+            {"controller": name, "policy_sha256": digest}
+            | {kind: rate_of(counts[number, column]) for kind, counts in kinds.items()}
+            for column, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
+            if faults.certificates()[number, column]
+        ],
+    }

@@ -1,0 +1,1 @@
+"""The search: its loop, archive, cells, fitness, methods, and the directory of a run."""

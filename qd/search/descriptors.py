@@ -1,0 +1,139 @@
+"""Descriptors: in which proportions a controller is penalised, and the cell of the archive that this falls into.
+
+The ratios of a terrain sum to 1, so most tuples of intervals can never occur. Cells are numbered over the reachable
+tuples alone: those that hold more than single points of the plane sum(ratios) = 1.
+"""
+
+import math
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_MAX_CELLS = 500_000  # an archive holds all of its cells in memory
+_SUM_TOLERANCE = 1e-9  # a mean over 20 episodes of ratios that sum to 1 is off by about 1e-16
+
+
+def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64]:
+    """Mean over a terrain's valid episodes of each penalty's share in the sum of an episode's penalties.
+
+    Scaled penalties are not negative, shape (num_terrains, num_replicas, num_penalties), and may be anything in
+    episodes that are not ``valid``, shape (num_terrains, num_replicas). Ratios have shape (num_terrains,
+    num_penalties), each row sums to 1. They are equal in an episode without any, and where no episode is valid.
+    """
+    valid = np.asarray(valid, dtype=bool)[..., None]
+    penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)
+    equal, sums = np.full_like(penalties, 1.0 / penalties.shape[-1]), penalties.sum(axis=-1, keepdims=True)
+    ratios = np.divide(penalties, sums, out=equal, where=sums > 0.0)
+    count = valid.sum(axis=1)
+    total = np.where(valid, ratios, 0.0).sum(axis=1)
+    return np.divide(total, count, out=np.full_like(total, 1.0 / penalties.shape[-1]), where=count > 0)
+
+
+class Cells:
+    """The reachable cells of an archive, numbered from 0, and the mapping of ratios to them.
+
+    A tuple of interval indices i_1 .. i_n (each in 0 .. intervals - 1) spans a box whose lower corner sums to
+    sum(i) / intervals and whose upper corner to (sum(i) + n) / intervals. The plane sum(ratios) = 1 passes through
+    the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple of which it only touches a corner does
+    not count. With a collision bit every tuple is two cells, the one with a collision in the upper half of the numbers.
+
+    Args:
+        num_ratios: Number of ratio descriptors, at least 2.
+        intervals: Intervals that [0, 1] is divided into; 1.0 belongs to the last.
+        collision_bit: Whether a base collision is a descriptor too: in any of 20 episodes, as far as those crossed say
+            (:attr:`qd.search.fitness.Evaluation.collides`).
+    """
+
+    def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
+        if num_ratios < 2:
+            raise ValueError(f"num_ratios must be at least 2, got {num_ratios}: a single ratio is always 1")
+        if math.comb(intervals + num_ratios - 1, intervals) > _MAX_CELLS:
+            raise ValueError(
+                f"intervals must leave fewer than {_MAX_CELLS:,} cells for {num_ratios} penalties, got {intervals}: "
+                "take fewer"
+            )
+        self.num_ratios = num_ratios
+        self.intervals = intervals
+        self.collision_bit = collision_bit
+
+    @property
+    def num_cells(self) -> int:
+        """Number of reachable cells."""
+        return len(self.tuples) * (2 if self.collision_bit else 1)
+
+    @cached_property
+    def tuples(self) -> NDArray[np.int64]:
+        """The reachable interval tuples in lexicographic order, shape (num_tuples, num_ratios)."""
+        tuples = np.zeros((1, 0), dtype=np.int64)
+        for _ in range(self.num_ratios):
+            longer = [np.column_stack([tuples, np.full(len(tuples), index)]) for index in range(self.intervals)]
+            tuples = np.vstack(longer)
+            tuples = tuples[tuples.sum(axis=1) < self.intervals]
+        tuples = tuples[tuples.sum(axis=1) + self.num_ratios > self.intervals]
+        return tuples[np.lexsort(tuples.T[::-1])]
+
+    @cached_property
+    def codes(self) -> NDArray[np.int64]:
+        """One number a reachable tuple, its digits to the base of the intervals, ascending, shape (num_tuples,)."""
+        return self._code(self.tuples)
+
+    def _code(self, tuples: NDArray[np.int64]) -> NDArray[np.int64]:
+        """One number a tuple, in lexicographic order."""
+        return np.asarray(np.ravel_multi_index(tuple(tuples.T), (self.intervals,) * self.num_ratios), dtype=np.int64)
+
+    def cell_of(self, ratios: ArrayLike, collided: ArrayLike | None = None) -> NDArray[np.int64]:
+        """Index of the reachable cell of each row of ratios, shape (batch,).
+
+        Args:
+            ratios: Float64 ratios, each row not negative and summing to 1, shape (batch, num_ratios).
+            collided: The collision bit, shape (batch,); needed where there is one.
+        """
+        ratios = np.asarray(ratios, dtype=np.float64)
+        self._check_ratios(ratios)
+        tuples = self._to_reachable(self._intervals_of(ratios), ratios)
+        cells = np.searchsorted(self.codes, self._code(tuples))
+        if not self.collision_bit:
+            return cells
+        if collided is None:
+            raise ValueError("collided must be given, got None: the cells of this robot have a collision bit")
+        return cells + len(self.tuples) * np.asarray(collided, dtype=bool)
+
+    def _check_ratios(self, ratios: NDArray[np.float64]) -> None:
+        if ratios.ndim != 2 or ratios.shape[1] != self.num_ratios:
+            raise ValueError(f"ratios must have shape (batch, {self.num_ratios}), got {ratios.shape}")
+        good = (ratios >= 0.0).all(axis=1) & (np.abs(ratios.sum(axis=1) - 1.0) < _SUM_TOLERANCE)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ValueError(f"ratios must not be negative and must sum to 1, got {ratios[row].tolist()} in row {row}")
+
+    def _intervals_of(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Interval of each ratio: [i / intervals, (i + 1) / intervals), with 1.0 in the last."""
+        # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
+        edges = np.arange(self.intervals + 1) / self.intervals
+        return np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
+
+    def _to_reachable(self, tuples: NDArray[np.int64], ratios: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Moves tuples that the plane only touches in a corner to a reachable neighbour."""
+        tuples = tuples.copy()
+        total = tuples.sum(axis=1)
+        rows = np.flatnonzero(total >= self.intervals)  # every ratio on its lower edge: .2, .2, .2, .2, .2
+        tuples[rows, ratios[rows].argmax(axis=1)] -= 1
+        # Every ratio rounded to just below its upper edge.
+        rows = np.flatnonzero(total + self.num_ratios <= self.intervals)
+        gap = (tuples[rows] + 1) / self.intervals - ratios[rows]
+        tuples[rows, gap.argmin(axis=1)] += 1
+        return tuples
+
+    def are_neighbours(self, first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
+        """Whether cells agree in their collision bits, and in their intervals up to 1, by their indices (batch,)."""
+        bit_a, tuple_a = np.divmod(np.asarray(first), len(self.tuples))
+        bit_b, tuple_b = np.divmod(np.asarray(second), len(self.tuples))
+        close = (np.abs(self.tuples[tuple_a] - self.tuples[tuple_b]) <= 1).all(axis=1)
+        return close & (bit_a == bit_b)
+
+    def describe(self, cell: int) -> str:
+        """A cell in words, e.g. ``.0-.1 .3-.4 .5-.6 collision``."""
+        bit, index = divmod(cell, len(self.tuples))
+        ranges = [f"{low / self.intervals:.3g}-{(low + 1) / self.intervals:.3g}" for low in self.tuples[index]]
+        return " ".join(ranges + (["with" if bit else "without", "collision"] if self.collision_bit else []))

@@ -1,0 +1,275 @@
+"""The directory of a search's run: where it is, what it was asked to do, how far it is, and what it found.
+
+The checkpoint is the one truth and is written first. Metrics and archive are made from it, and made again when a search
+goes on, so a run that was killed between any two writes goes on as if nothing had been.
+"""
+
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
+from qd.search.checkpoint import load_checkpoint, save_checkpoint
+from qd.search.settings import SearchCfg, as_settings, differences, from_settings
+from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
+from sim.files.records import check_identity
+from sim.robots.robot import RobotCfg
+from sim.terrains.spaces.registry import get_space, load_space
+
+RUNS = Path("runs")
+_OWN_RESULTS = Path(__file__).resolve().parents[2] / "results"
+RESULTS = Path("results") if Path("results").is_dir() or not _OWN_RESULTS.is_dir() else _OWN_RESULTS
+"""Where published archives, tables and panels lie, <robot>/archive and so on: results/ of the present folder, or of
+this checkout where that has none."""
+CONFIG_FILE = "config.json"
+CHECKPOINT_FILE = "checkpoint.bin"
+METRICS_FILE = "metrics.jsonl"
+SUMMARY_FILE = "archive.json"
+ROUNDS_FILE = "rounds.json"
+"""Rounds of search and training, in the directory that holds the runs of both."""
+_REMEDY = "put a copy of it back, or start a new run"
+
+Metrics = list[dict[str, Any]]
+"""One row an iteration."""
+
+
+def find_run(
+    robot: RobotCfg, named: Path | None = None, *, published: Literal["never", "last", "first"] = "last"
+) -> Path:
+    """The run to work on: the one that is named, else the run of a robot under runs/ whose archive changed last.
+
+    ``published`` says when the robot's published archive is taken: where there is no such run, before it, or never.
+    """
+    if named is not None:
+        if published == "never" and _is_published(named):
+            raise ValueError(
+                f"{named} is published and stays as it is: copy its directory below {RUNS}/, and name that"
+            )
+        return named
+    folder = RESULTS / robot.name / "archive"
+    runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
+    files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
+    newest = next((file.parent for file in files if _robot_of(file) == robot.name), None)
+    if newest is not None:
+        runs.insert(len(runs) if published == "first" else 0, newest)
+    if not runs:
+        places = f"{RUNS}/" if published == "never" else f"{RUNS}/ or in {folder} (a clone of the project has it)"
+        raise FileNotFoundError(
+            f"no archive of {robot.name} under {places}: search one with `faultline archive`, or name a run"
+        )
+    print(f"Run: {runs[0]}", flush=True)
+    return runs[0]
+
+
+def _is_published(path: Path) -> bool:
+    """Whether a run lies among those that are published."""
+    return RESULTS.resolve() in path.resolve().parents
+
+
+def _robot_of(file: Path) -> str | None:
+    """Robot of an archive; None, with a line, of one that cannot be read."""
+    try:
+        return read_archive(file).robot
+    except ValueError as error:
+        print(f"Passed over: {error}", flush=True)
+        return None
+
+
+def directory_of(run: Path) -> Path:
+    """The directory of a run that is given as such or as its archive file."""
+    return run if run.is_dir() else run.parent
+
+
+def search_seed(run: Path) -> int | None:
+    """Seed of the search that left an archive; None where no config lies beside it."""
+    folder = RunDirectory(directory_of(run))
+    return folder.read_cfg().seed if folder.exists() else None
+
+
+def read_archive_of(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
+    """An archive whose terrains a robot can cross; one of the robot's own must be of the robot as it is now.
+
+    ``space`` is the terrain space that the command line names, for one of a user's own.
+    """
+    archive = read_archive(run)
+    check_space(archive, space)
+    if archive.robot == robot.name:
+        check_identity(archive.named(), robot, run, "search again, or give another archive")
+    return archive
+
+
+def check_space(archive: Archive, named: str | None) -> None:
+    """Refuses an archive whose terrain space is not at hand, once the one that the command line names is loaded."""
+    if named is not None:
+        load_space(named)
+    expected, got = get_space(archive.space, archive.space_sha256).num_genes, archive.genes.shape[1]
+    if got != expected:
+        raise ValueError(
+            f"the archive must have {expected} genes a terrain of {archive.space}, got {got}: put a copy of it back"
+        )
+
+
+def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
+    """Refuses an archive that is not of the settings beside it."""
+    of_archive = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
+    if of_archive != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
+        raise ValueError(
+            f"{folder / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
+            f"{', '.join(map(str, of_archive))}: put back the one that is not this run's"
+        )
+
+
+def folder_for(run: Path, robot: str) -> Path:
+    """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
+
+    That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
+    """
+    folder = directory_of(run)
+    if not _is_published(folder):
+        return folder
+    name = folder.resolve().name
+    return RUNS / (f"{robot}-published" + ("" if name == "archive" else f"-{name}"))
+
+
+def free_path(name: str) -> Path:
+    """The first of runs/NAME, runs/NAME-2, runs/NAME-3 and so on that is not there."""
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(path for path in map(RUNS.joinpath, names) if not path.exists())
+
+
+@contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """Makes a run directory if need be and keeps other commands out of it; one that stays empty is removed again."""
+    if not str(path).isprintable():
+        raise ValueError(f"run directory {str(path)!a} must have a name of printable characters: rename it")
+    is_new = not os.path.exists(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another one") from None
+    check_writable(path)
+    with locked(path, f"another command works in {path}: let it end, or name another folder"):
+        try:
+            yield
+        finally:
+            if is_new and not any(path.iterdir()):
+                path.rmdir()
+
+
+class RunDirectory:
+    """Files of one run in its directory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def exists(self) -> bool:
+        """Whether there is a run."""
+        return os.path.lexists(self.path / CONFIG_FILE)
+
+    def read_config(self) -> dict[str, Any]:
+        """What the run was asked to do: ``settings``, ``iterations``, ``sessions``, and provenance of its beginning."""
+        file = self.path / CONFIG_FILE
+        if not self.exists():
+            raise FileNotFoundError(f"no run at {self.path}: it has no {CONFIG_FILE}; give the directory of a run")
+        config = read_json(file)
+        kinds = {"settings": dict, "iterations": int, "device": str, "sessions": list}
+        if any(type(config.get(name)) is not kind for name, kind in kinds.items()):
+            raise ValueError(f"{file} must hold {', '.join(kinds)}, got {', '.join(config)}; {_REMEDY}")
+        return config
+
+    def read_cfg(self) -> SearchCfg:
+        """The search as its config has it."""
+        config = self.read_config()
+        try:
+            return from_settings(config["settings"], config["iterations"])
+        except ValueError as error:
+            of = f"{self.path / CONFIG_FILE}: {error}"
+            raise ValueError(f"{of}: another version wrote it, or it is damaged; {_REMEDY}") from None
+
+    def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
+        """Writes what the run is asked to do from now on, after ``done`` iterations.
+
+        ``origin`` is the provenance of this session; of the first one it is the run's.
+        """
+        config = self.read_config() if self.exists() else {**origin, "sessions": []}
+        session = {name: origin[name] for name in ("command", "commit", "device")} | {"from_iteration": done}
+        config |= {"settings": as_settings(cfg), "iterations": cfg.iterations}
+        config["sessions"] = [*config["sessions"], session]
+        write_atomically(self.path / CONFIG_FILE, to_json(config))
+
+    def save(self, cfg: SearchCfg, scheduler: Any, metrics: Metrics, archive: Archive) -> None:
+        """Saves an iteration; killed anywhere in here, the run is either before or after it.
+
+        The settings let a checkpoint that strayed here be noticed.
+        """
+        state = {"settings": as_settings(cfg), "metrics": metrics, "scheduler": scheduler}
+        save_checkpoint(self.path / CHECKPOINT_FILE, state)
+        self.write_derived(metrics, archive)
+
+    def write_derived(self, metrics: Metrics, archive: Archive) -> None:
+        """Writes the files that follow from a checkpoint: metrics and archive."""
+        rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
+        write_atomically(self.path / METRICS_FILE, rows.encode())
+        write_archive(self.path / ARCHIVE_FILE, archive)
+
+    def load(self, cfg: SearchCfg) -> tuple[Any, Metrics] | None:
+        """Scheduler and metrics of the search that is to go on, as its checkpoint has them.
+
+        None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
+        something else in the directory, is a ValueError.
+        """
+        if not self.exists():
+            if not all(map(is_leftover, self.path.iterdir())):
+                raise ValueError(f"{self.path} is not empty and holds no run: give another --run-dir")
+            return None
+        self._check_settings(self.path, as_settings(self.read_cfg()), cfg)
+        file = self.path / CHECKPOINT_FILE
+        if not file.exists():
+            if (self.path / ARCHIVE_FILE).exists():
+                raise ValueError(f"{file} is lost: expected it beside {ARCHIVE_FILE}; {_REMEDY}")
+            return None
+        state = load_checkpoint(file)
+        settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
+        if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
+            raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {_REMEDY}")
+        self._check_settings(file, settings, cfg)
+        if len(metrics) > cfg.iterations:
+            raise ValueError(
+                f"iterations must be at least {len(metrics)}, as many as {self.path} has done, got {cfg.iterations}"
+            )
+        return scheduler, metrics
+
+    def read_finished(self, cfg: SearchCfg) -> Archive | None:
+        """What a search found that has done its iterations, and whose checkpoint was taken away; None of any other."""
+        if not (self.path / ARCHIVE_FILE).exists() or (self.path / CHECKPOINT_FILE).exists() or not self.exists():
+            return None
+        self._check_settings(self.path, as_settings(self.read_cfg()), cfg)
+        archive = read_archive(self.path)
+        return archive if archive.iterations == self.read_summary().get("iterations") == cfg.iterations else None
+
+    @staticmethod
+    def _check_settings(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
+        if different := differences(settings, as_settings(cfg)):
+            raise ValueError(f"{file} is of other settings: {', '.join(different)}: start a new run for those")
+
+    def read_summary(self) -> dict[str, Any]:
+        """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
+        try:
+            return read_json(self.path / SUMMARY_FILE)
+        except (OSError, ValueError):
+            return {}
+
+    def read_metrics(self) -> Metrics:
+        """Rows of the metrics file, without reading the checkpoint."""
+        file = self.path / METRICS_FILE
+        try:
+            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        except ValueError as error:
+            raise ValueError(f"{file} is damaged: {error}; {_REMEDY}") from None
+        if not rows or not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {_REMEDY}")
+        return rows

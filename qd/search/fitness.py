@@ -1,0 +1,214 @@
+"""Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kernels.episode import Outcome
+from qd.search.descriptors import Cells, terrain_ratios
+from sim.files.settings import PositiveFloat, check
+from sim.rates import MAX_INVALID_SHARE, typical_outcome
+from sim.rollout import RolloutResult
+
+FITNESS_FLOOR = -20.0
+"""Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
+BIT_EPISODES = 20
+"""Episodes over which the collision bit is "any collision", as in the paper; more episodes would bias it."""
+USUAL_SPREAD = 0.4
+"""Standard deviation of a penalty over its mean, where nothing else is known."""
+FAILING_GOAL_RATE = 0.5
+"""A controller fails a terrain on which it reaches the goal less often."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitnessCfg:
+    """Weights of the fitness, and the penalties that count."""
+
+    penalties: tuple[str, ...]
+    """Names of the penalties, in the order of the ratios."""
+    scales: tuple[PositiveFloat, ...]
+    """Scale of each penalty: raw sums are divided by it."""
+    alpha: float = 1.0
+    """Weight of the standard deviations."""
+    lam: float = 2.0
+    """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
+
+    def __post_init__(self) -> None:
+        check(self)
+        if len(self.scales) != len(self.penalties):
+            raise ValueError(f"scales must be one for each of {', '.join(self.penalties)}, got {self.scales}")
+
+    def of_penalties(self, names: Sequence[str]) -> "FitnessCfg":
+        """The same of some of the penalties alone, which must be at least 2: a single ratio is always 1."""
+        scales = dict(zip(self.penalties, self.scales, strict=True))
+        if not scales.keys() >= {*names} or len(names) < 2:
+            raise ValueError(f"penalties must be at least 2 of {', '.join(self.penalties)}, got {', '.join(names)}")
+        return replace(self, penalties=tuple(names), scales=tuple(scales[name] for name in names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What a search knows of T evaluated terrains; statistics are over valid episodes, penalties are scaled."""
+
+    fitness: NDArray[np.float64]
+    """Shape (T,)."""
+    ratios: NDArray[np.float64]
+    """Shape (T, P); each row sums to 1."""
+    cell: NDArray[np.int64]
+    """Reachable cell of the ratios, shape (T,)."""
+    penalty_mean: NDArray[np.float64]
+    """Shape (T, P)."""
+    penalty_std: NDArray[np.float64]
+    """Shape (T, P), ddof 0."""
+    collision_rate: NDArray[np.float64]
+    """Share of episodes with a base collision, shape (T,)."""
+    goal_rate: NDArray[np.float64]
+    """Share of episodes that reached the goal, shape (T,)."""
+    fallen_rate: NDArray[np.float64]
+    """Share of episodes that ended tilted by more than 60 degrees, shape (T,)."""
+    end_position: NDArray[np.float32]
+    """Where the typical episode ended (:func:`typical_ends`), world-local x and y [m], shape (T, 2)."""
+    invalid_episodes: NDArray[np.int64]
+    """Episodes left out, shape (T,)."""
+    episodes: NDArray[np.int64]
+    """Episodes run, the invalid ones included, shape (T,)."""
+
+    @property
+    def counted(self) -> NDArray[np.int64]:
+        """Valid episodes, shape (T,)."""
+        return self.episodes - self.invalid_episodes
+
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """Standard deviations as many episodes would show them, shape (T, P): a few show too little.
+
+        One episode of the usual spread is added.
+        """
+        few = (USUAL_SPREAD * self.penalty_mean) ** 2 / np.maximum(self.counted, 1)[:, None]
+        return np.sqrt(self.penalty_std**2 + few)
+
+    @property
+    def collides(self) -> NDArray[np.bool_]:
+        """The collision bit, shape (T,): whether 20 episodes sooner have a base collision than not.
+
+        Of up to 29 episodes that were crossed, it is whether any has one.
+        """
+        return self.collision_rate > 1.0 - 0.5 ** (1.0 / BIT_EPISODES)
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether a terrain's numbers mean anything, shape (T,)."""
+        return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
+
+
+def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """Evaluations of terrains one after the other."""
+    names = [field.name for field in fields(Evaluation)]
+    return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
+
+
+def rows_of(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
+    """Some rows of an evaluation, copied."""
+    return Evaluation(**{name: np.array(values[rows]) for name, values in vars(terrains).items()})
+
+
+def evaluation_of(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evaluation:
+    """Fitness, ratios, cells and rates of the terrains of a rollout; ``cells`` have one ratio a penalty of ``cfg``.
+
+    The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
+    episodes without a base collision, and 0 where no episode has one. An invalid terrain has fitness -20, and the
+    statistics of its valid episodes: it may turn out to be valid when it is crossed again. Without a valid episode
+    there are equal ratios, no end position (NaN) and otherwise zeros.
+    """
+    penalties = _scaled_penalties(result, cfg)
+    invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
+    counted = ~invalid
+    mean = _mean(penalties, counted)
+    return _with_fitness(
+        cells,
+        cfg,
+        ratios=terrain_ratios(penalties, counted),
+        penalty_mean=mean,
+        penalty_std=np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted)),
+        collision_rate=_rate(result.base_collision, counted),
+        goal_rate=_rate(result.reached_goal, counted),
+        fallen_rate=_rate(result.fallen, counted),
+        end_position=typical_ends(result, counted),
+        invalid_episodes=invalid.sum(axis=1),
+        episodes=np.full(len(invalid), invalid.shape[1]),
+    )
+
+
+def merged(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
+    """The evaluation by all episodes of two evaluations of the same terrains; ends are the second's, if it has any."""
+    share = second.counted / np.maximum(first.counted + second.counted, 1)
+
+    def mean_of(values: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+        shares = share if values.ndim == 1 else share[:, None]
+        return (1.0 - shares) * values + shares * others
+
+    def mean(name: str) -> NDArray[np.float64]:
+        return mean_of(getattr(first, name), getattr(second, name))
+
+    apart = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
+    ended = np.isfinite(second.end_position)
+    return _with_fitness(
+        cells,
+        cfg,
+        ratios=mean("ratios"),
+        penalty_mean=mean("penalty_mean"),
+        penalty_std=np.sqrt(mean_of(first.penalty_std**2, second.penalty_std**2) + apart),
+        collision_rate=mean("collision_rate"),
+        goal_rate=mean("goal_rate"),
+        fallen_rate=mean("fallen_rate"),
+        end_position=np.where(ended, second.end_position, first.end_position),
+        invalid_episodes=first.invalid_episodes + second.invalid_episodes,
+        episodes=first.episodes + second.episodes,
+    )
+
+
+def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> Evaluation:
+    """Adds what follows from the statistics, fitness and cell."""
+    some = Evaluation(fitness=np.zeros(0), cell=np.zeros(0, np.int64), **statistics)
+    inconsistency = np.where(some.collision_rate > 0.0, 1.0 - some.collision_rate, 0.0)
+    fitness = some.penalty_mean.sum(axis=1) - cfg.alpha * some.penalty_std.sum(axis=1) - cfg.lam * inconsistency
+    return replace(
+        some,
+        fitness=np.where(some.valid, fitness, FITNESS_FLOOR),
+        cell=cells.cell_of(some.ratios, some.collides),
+    )
+
+
+def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Where the typical episode of each terrain ended: the median, by coordinate, of those that ended alike.
+
+    Those are the episodes at the goal where at least half reach it. Else they are those that ended in the commonest of
+    the other ways, which are a base collision, the end of the time, and leaving the terrain. ``counted`` says which
+    episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
+    """
+    outcome = np.where(counted, result.outcome, Outcome.INVALID)
+    alike = counted & (outcome == typical_outcome(outcome)[:, None])
+    places = np.sort(np.where(alike[..., None], result.final_position[..., :2], np.inf), axis=1)
+    count, rows = alike.sum(axis=1), np.arange(len(alike))
+    ends = (places[rows, np.maximum(count - 1, 0) // 2] + places[rows, count // 2]) / 2
+    return np.where(count[:, None] > 0, ends, np.nan).astype(np.float32)
+
+
+def _scaled_penalties(result: RolloutResult, cfg: FitnessCfg) -> NDArray[np.float64]:
+    """Penalties of ``cfg`` divided by their scales, shape (T, R, P)."""
+    columns = [result.penalty_names.index(name) for name in cfg.penalties]
+    return np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
+
+
+def _mean(values: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean over the valid episodes of values of shape (T, R, P); zeros where there are none."""
+    counted = np.where(valid[:, :, None], values, 0.0)
+    return counted.sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
+
+
+def _rate(flags: NDArray[np.bool_], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Share of the valid episodes, shape (T, R), that have a flag; zeros where there are none."""
+    return (np.asarray(flags, dtype=bool) & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)

@@ -1,0 +1,194 @@
+"""The surrogate's networks, and steps of their training: on CUDA each is one launch of a captured graph."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from sim.device import recording
+from sim.terrains.corridor import SHAPE
+
+MEMBERS = 4
+"""Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
+_CONVOLUTIONS = ((5, (3, 3), 12), (3, (2, 2), 24), (3, (2, 1), 32))  # size, strides across and along the way, channels
+_FEATURES = 64  # of each place along the way
+_WAVES = 4  # cosines by which a place is known
+_EAGER_STEPS = 3  # before the capture: they allocate the optimiser's state and choose the convolutions' kernels
+_LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
+
+Moments = list[dict[str, Tensor]]
+"""What Adam remembers of each tensor of weights: `step`, `exp_avg` and `exp_avg_sq`; nothing before its first step."""
+_Layers = tuple[tuple[Tensor, Tensor], ...]
+
+
+class Networks(nn.Module):
+    """Small convolutional networks side by side, as groups of channels.
+
+    They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
+    depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
+    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does. Of
+    ``num_maps`` maps of a terrain each network says ``num_out`` numbers.
+
+    Parameters are weights and biases of each layer in turn, all zero, of shapes (MEMBERS * out, in, *size) and
+    (MEMBERS * out,). Weights lie in memory as convolutions are fastest, on the CPU and on CUDA.
+    """
+
+    def __init__(self, num_maps: int, num_out: int) -> None:
+        super().__init__()
+        (rows, cols), channels = SHAPE, num_maps
+        layers, self._weights = [], nn.ParameterList()
+        for size, strides, channels_out in _CONVOLUTIONS:
+            layers.append((channels_out, channels, size, size))
+            rows, cols, channels = -(-rows // strides[0]), -(-cols // strides[1]), channels_out
+        for out, *shape in (*layers, (_FEATURES, channels + _WAVES, rows, 3), (num_out, 2 * _FEATURES, 1, 1)):
+            weights = torch.zeros(MEMBERS * out, *shape).contiguous(memory_format=torch.channels_last)
+            self._weights.extend([weights, torch.zeros(MEMBERS * out)])
+        waves = math.pi * torch.arange(1, _WAVES + 1)[:, None] * torch.linspace(0.0, 1.0, cols)  # from start to goal
+        places = nn.functional.unfold(waves.cos()[None, :, None].repeat(1, 1, rows, 1), (rows, 3), padding=(0, 1))
+        self.register_buffer("_places", places[0], persistent=False)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """What each network says of the maps that it sees, (MEMBERS, batch, *SHAPE, num_maps).
+
+        Shape (batch, MEMBERS, num_out).
+        """
+        if maps.is_cuda:
+            return self._through(maps.movedim(0, 3).flatten(3), *self._layers(MEMBERS))
+        # One by one, since channels that no weight joins cost time on the CPU.
+        return torch.cat([*map(self._through, maps, self._layers(1))], dim=1)
+
+    def judge(self, maps: Tensor) -> Tensor:
+        """What each network says of the same maps, (batch, *SHAPE, num_maps); on CUDA half precision is enough.
+
+        Float32, shape (batch, MEMBERS, num_out).
+        """
+        if not maps.is_cuda:
+            return self(maps.expand(MEMBERS, -1, -1, -1, -1))
+        return self._through(maps.half(), *self._layers(MEMBERS))
+
+    def _layers(self, count: int) -> list[_Layers]:
+        """Weights and biases of each layer, of ``count`` networks after the other."""
+        parts = [part.unflatten(0, (MEMBERS, -1)).split(count) for part in self._weights]
+        return [tuple(zip(tensors[::2], tensors[1::2], strict=True)) for tensors in zip(*parts, strict=True)]
+
+    def _through(self, maps: Tensor, layers: _Layers) -> Tensor:
+        """What networks of some layers say of maps for each of them or for all, shape (batch, networks, num_out)."""
+        rows = maps.movedim(-1, 1)
+        for (size, strides, _), (weight, bias) in zip(_CONVOLUTIONS, layers, strict=False):
+            alike = rows.shape[1] == weight.shape[2]  # all networks see the same
+            weight = weight.flatten(0, 1) if alike else _block_diagonal(weight)
+            rows = _activated(rows, weight.to(rows.dtype), bias.flatten().to(rows.dtype), strides, size // 2)
+        (weight, bias), (last_weight, last_bias) = layers[-2:]
+        weight, of_places = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
+        places = of_places.flatten(2) @ self.get_buffer("_places") + bias[..., None]  # the same in every row
+        rows = nn.functional.conv2d(rows, _block_diagonal(weight).to(rows.dtype), padding=(0, 1))
+        rows = (rows.reshape(len(rows), *places.shape) + places.to(rows.dtype)).relu()
+        pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2).float()
+        return torch.einsum("bni,noi->bno", pooled, last_weight.flatten(2)) + last_bias
+
+
+def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, int], padding: int) -> Tensor:
+    """A convolution and what is positive of it; in half precision one kernel of cuDNN does both, and nothing learns."""
+    if rows.dtype != torch.half:
+        return nn.functional.conv2d(rows, weight, bias, strides, padding).relu()
+    if missing := -rows.shape[1] % 8:  # Tensor Cores take eight channels at once
+        rows, weight = (nn.functional.pad(part.movedim(1, -1), (0, missing)).movedim(-1, 1) for part in (rows, weight))
+    return torch.cudnn_convolution_relu(rows, weight, bias, strides, (padding, padding), (1, 1), 1)
+
+
+def _block_diagonal(weight: Tensor) -> Tensor:
+    """Weights of networks, (networks, out, in, *size), as those of one convolution, whose groups would be slower.
+
+    Shape (networks * out, networks * in, *size).
+    """
+    count = len(weight)
+    if count == 1:
+        return weight[0]
+    apart = torch.eye(count, device=weight.device)[:, None, :, None, None, None] * weight[:, :, None]
+    return apart.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+
+
+class Training:
+    """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
+
+    The graph holds the memory of weights and moments. So networks that are moved need a new training, which captures
+    anew. On CUDA all steps must be taken on one stream, other than the default one. ``loss`` is of what the networks
+    say and what they should, both of shape (batch, MEMBERS, num_out). ``moments`` are what Adam remembers from before,
+    of each tensor of weights.
+    """
+
+    def __init__(
+        self, networks: Networks, loss: Callable[[Tensor, Tensor], Tensor], device: str, moments: Moments | None = None
+    ) -> None:
+        self._networks, self._loss, self._on_cuda = networks, loss, device.startswith("cuda")
+        weights = list(networks.parameters())
+        for tensor in weights:
+            tensor.grad = None
+        self._optimiser = torch.optim.AdamW(
+            weights, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, capturable=self._on_cuda, fused=True
+        )
+        for tensor, remembered in zip(weights, moments or [{} for _ in weights], strict=True):
+            if remembered:  # Adam begins anew where there is nothing
+                likes = tensor.new_zeros(()), tensor, tensor  # a moment's memory is laid out as that of its weights
+                self._optimiser.state[tensor] = {
+                    name: torch.empty_like(like).copy_(remembered[name])
+                    for name, like in zip(_MOMENTS, likes, strict=True)
+                }
+        self._batch: tuple[Tensor, Tensor] | None = None  # maps and targets
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._eager_steps = 0
+
+    @property
+    def moments(self) -> Moments:
+        """What Adam remembers of each tensor of weights."""
+        state = self._optimiser.state
+        return [
+            {name: state[tensor][name] for name in _MOMENTS} if tensor in state else {}
+            for tensor in self._networks.parameters()
+        ]
+
+    def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
+        """Takes a step for each batch that was drawn. All tensors are on the device.
+
+        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets are what the networks should
+        say of them, (N, num_out). ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it
+        sees them mirrored, both (steps, batch, MEMBERS).
+        """
+        terrains, turned = drawn.transpose(1, 2), turned.transpose(1, 2)
+        if self._batch is None:  # memory of a batch, the same in every step
+            shape = terrains.shape[1:]
+            self._batch = maps.new_empty(*shape, *maps.shape[1:]), targets.new_empty(*shape, targets.shape[1])
+        batch_maps, batch_targets = self._batch
+        # A mirrored terrain has the lines along the way in the opposite order.
+        lines = torch.arange(SHAPE[0], device=maps.device)
+        rows = torch.where(turned[..., None], lines.flip(0), lines) + len(lines) * terrains[..., None]
+        for step_rows, step_terrains in zip(rows.int().flatten(1), terrains.flatten(1), strict=True):
+            # Outside of the graph, since they are drawn from ever more terrains.
+            torch.index_select(maps.flatten(0, 1), 0, step_rows, out=batch_maps.flatten(0, 2))
+            torch.index_select(targets, 0, step_terrains, out=batch_targets.flatten(0, 1))
+            self._take_step()
+
+    def _take_step(self) -> None:
+        if not self._on_cuda or self._eager_steps < _EAGER_STEPS:
+            self._learn_batch()
+            self._eager_steps += 1
+            return
+        if self._graph is None:
+            self._optimiser.zero_grad(set_to_none=True)  # so that the graph has gradients of its own
+            graph = torch.cuda.CUDAGraph()
+            # Other threads may use the device meanwhile.
+            stream = torch.cuda.current_stream()
+            with recording(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+                self._learn_batch()  # is recorded, not done
+            self._graph = graph
+        self._graph.replay()
+
+    def _learn_batch(self) -> None:
+        """A step on the batch that lies in fixed memory."""
+        assert self._batch is not None
+        maps, targets = self._batch
+        self._optimiser.zero_grad(set_to_none=True)
+        self._loss(self._networks(maps.float()), targets.transpose(0, 1)).backward()
+        self._optimiser.step()

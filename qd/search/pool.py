@@ -1,0 +1,145 @@
+"""Which terrain holds a cell while all that is known of a terrain is noisy.
+
+A search that keeps the best draw keeps the luckiest. Here each cell has a few terrains, which are crossed again as the
+search goes on, and the one that is expected to add most to the QD score of fresh episodes holds it. Both parts are of
+Flageat and Cully 2023, "Uncertain Quality-Diversity": cells that are deep, and elites that are sampled again.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from qd.faults.numbers import FRESH_EPISODES
+from qd.search.descriptors import Cells
+from qd.search.fitness import BIT_EPISODES, FITNESS_FLOOR, Evaluation, FitnessCfg, join_evaluations, merged, rows_of
+
+DEPTH = 3
+"""Terrains that each cell has at most."""
+_RATIO_SPREAD = 0.22
+"""Standard deviation of a ratio r over episodes, divided by sqrt(r (1 - r)); it differs little between terrains."""
+_LEAST_VARIANCE = 1e-3  # of r (1 - r), where all episodes so far have a ratio of 0
+
+
+def chance_to_stay(terrains: Evaluation, cells: Cells) -> NDArray[np.float64]:
+    """The chance that 40 fresh episodes put a terrain into the cell that it has now, shape (T,).
+
+    Its own episodes and the fresh ones spread ratios about the true ones, each by itself and normally.
+    """
+    counted = np.maximum(terrains.counted, 1)
+    variance = _RATIO_SPREAD**2 * (terrains.ratios * (1.0 - terrains.ratios) + _LEAST_VARIANCE)
+    std = np.sqrt(variance * (1.0 / counted + 1.0 / FRESH_EPISODES)[:, None])
+    collides, index = np.divmod(terrains.cell, len(cells.tuples))
+    intervals = cells.tuples[index]
+    lower = np.where(intervals > 0, intervals / cells.intervals, -np.inf)
+    upper = np.where(intervals + 1 < cells.intervals, (intervals + 1) / cells.intervals, np.inf)
+    chance = np.prod(ndtr((upper - terrains.ratios) / std) - ndtr((lower - terrains.ratios) / std), axis=1)
+    if cells.collision_bit:
+        rate = (terrains.collision_rate * counted + 0.5) / (counted + 1.0)
+        none_collides = (1.0 - rate) ** BIT_EPISODES
+        chance *= np.where(collides == 1, 1.0 - none_collides, none_collides)
+    return chance
+
+
+def expected_score(terrains: Evaluation, cells: Cells, cfg: FitnessCfg) -> NDArray[np.float64]:
+    """What each terrain is expected to add to the QD score of fresh episodes, shape (T,); 0 of an invalid one.
+
+    It is the chance to stay, times the fitness above the floor: as many episodes would show it, less a standard error.
+    """
+    spread = terrains.spread.sum(axis=1)
+    fitness = terrains.fitness + cfg.alpha * (terrains.penalty_std.sum(axis=1) - spread)
+    lower_bound = fitness - spread / np.sqrt(np.maximum(terrains.counted, 1))
+    above = np.maximum(lower_bound - FITNESS_FLOOR, 0.0)
+    return np.where(terrains.valid, chance_to_stay(terrains, cells) * above, 0.0)
+
+
+class Pool:
+    """The terrains that hold a cell, or may come to.
+
+    Attributes:
+        terrains: What is known of N terrains, by all of their episodes.
+        solutions: Their unclipped genes, shape (N, num_genes).
+        iteration: When each was found, shape (N,).
+        number: By which each is known, ascending, shape (N,).
+    """
+
+    def __init__(self, num_genes: int, cells: Cells, fitness: FitnessCfg) -> None:
+        self.cells, self.fitness = cells, fitness
+        self.terrains: Evaluation | None = None
+        self.solutions = np.zeros((0, num_genes), np.float32)
+        self.iteration, self.number = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._next = 0
+        self._crossings = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def solutions_of(self, number: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Unclipped genes of terrains by their numbers."""
+        return self.solutions[np.searchsorted(self.number, number)]
+
+    def tell(
+        self, solutions: NDArray[np.float32], number: NDArray[np.int64], told: Evaluation, iteration: int
+    ) -> Evaluation:
+        """Takes in crossings of T terrains, and returns what is known of these now.
+
+        Args:
+            solutions: Unclipped genes, shape (T, num_genes).
+            number: Of those that were crossed again, perhaps several times; -1 of new ones, shape (T,).
+            told: What the crossings showed.
+            iteration: In which they were, from 1.
+        """
+        known = rows_of(told, np.arange(len(number)))
+        new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
+        time = _rank(number[again], again)
+        for k in range(time.max(initial=-1) + 1):
+            assert self.terrains is not None
+            now = again[time == k]
+            rows = np.searchsorted(self.number, number[now])
+            joined = merged(rows_of(self.terrains, rows), rows_of(told, now), self.cells, self.fitness)
+            for name, values in vars(joined).items():
+                getattr(self.terrains, name)[rows] = getattr(known, name)[now] = values
+            self._crossings[rows] += 1
+        before = () if self.terrains is None else (self.terrains,)
+        self.terrains = join_evaluations([*before, rows_of(told, new)])
+        self.solutions = np.concatenate([self.solutions, solutions[new]])
+        self.iteration = np.append(self.iteration, np.full(len(new), iteration))
+        self.number = np.append(self.number, self._next + np.arange(len(new)))
+        self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
+        self._next += len(new)
+        return known
+
+    def least_known(self, count: int, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers of ``count`` terrains to cross again, those with the fewest crossings; none while there is none.
+
+        Crossings that are ``under_way`` count already, by the numbers of their terrains. If there are few terrains,
+        some come several times.
+        """
+        if self.terrains is None or not len(self):
+            return self.number[:0]
+        best_first = np.argsort(-expected_score(self.terrains, self.cells, self.fitness), kind="stable")
+        rows, times = np.unique(np.searchsorted(self.number, under_way), return_counts=True)
+        crossings = self._crossings.copy()
+        crossings[rows] += times
+        further = np.arange(-(-count // len(self)) + crossings.max() - crossings.min())
+        order = np.argsort((crossings[best_first, None] + further).ravel(), kind="stable")[:count]
+        return self.number[best_first[order // len(further)]]
+
+    def settle(self, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Leaves each cell its best terrains, and those ``under_way``; rows of the ones that hold a cell."""
+        assert self.terrains is not None
+        score = expected_score(self.terrains, self.cells, self.fitness)
+        rank = _rank(self.terrains.cell, -score)
+        holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
+        stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, under_way)
+        self.terrains = rows_of(self.terrains, stays)
+        for name in ("solutions", "iteration", "number", "_crossings"):
+            setattr(self, name, getattr(self, name)[stays])
+        return np.flatnonzero(holds[stays])
+
+
+def _rank(group: NDArray[np.int64], key: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many of the same group have a smaller key, shape (N,); among equals the first is the smaller."""
+    order = np.lexsort((key, group))
+    rank = np.empty(len(group), np.int64)
+    rank[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
+    return rank

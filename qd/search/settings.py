@@ -1,0 +1,146 @@
+"""Settings of a search: what is searched, with what, and how; and how a run remembers them."""
+
+import json
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from qd.search.descriptors import Cells
+from qd.search.fitness import FitnessCfg
+from qd.search.presets import SchedulerCfg, preset_of
+from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
+from sim.files.records import robot_identity
+from sim.files.settings import NonNegativeInt, PositiveInt, check, from_builtins
+from sim.robots.find import read_penalty_scales
+from sim.robots.robot import RobotCfg
+
+_MOST_EPISODES = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchCfg:
+    """What is searched, with what, and how; runs that agree in all but ``iterations`` are the same run."""
+
+    robot: str
+    robot_sha256: str
+    """Hash of its settings, model and meshes."""
+    penalty_definition: str
+    """How the penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
+    preset: str
+    policy: str
+    """Controller: ``shipped``, or as :func:`sim.controllers.loaders.load_policy` takes it."""
+    policy_sha256: str | None
+    """Hash of the controller's files, None where there are none."""
+    space: str = "super_gaussian"
+    """Terrain space, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
+    space_sha256: str | None = None
+    """Hash of its code if it is a user's own."""
+    seed: NonNegativeInt = 0
+    iterations: PositiveInt
+    """Iterations to reach; may be raised later."""
+    replicas: PositiveInt
+    """Episodes a terrain."""
+    intervals: PositiveInt = 10
+    """Intervals of each ratio."""
+    collision_bit: bool
+    """Whether base collision is a descriptor of its own."""
+    fitness: FitnessCfg
+    scheduler: SchedulerCfg
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.episodes_per_iteration > _MOST_EPISODES:
+            raise ValueError(
+                f"an iteration must have at most {_MOST_EPISODES:,} episodes, got {self.episodes_per_iteration:,}: "
+                "give fewer replicas or terrains"
+            )
+        Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
+        self.scheduler.check_iterations(self.iterations)
+
+    @property
+    def cells(self) -> Cells:
+        """The archive's cells."""
+        return Cells(len(self.fitness.penalties), self.intervals, collision_bit=self.collision_bit)
+
+    @property
+    def episodes_per_iteration(self) -> int:
+        """Episodes of one iteration."""
+        return self.scheduler.num_terrains * self.replicas
+
+
+def preset(
+    name: str,
+    robot: RobotCfg,
+    policy: str | None = None,
+    *,
+    space: str = "super_gaussian",
+    space_sha256: str | None = None,
+) -> SearchCfg:
+    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller."""
+    return SearchCfg(
+        robot=robot.name,
+        **robot_identity(robot),
+        preset=name,
+        policy=policy or SHIPPED,
+        policy_sha256=controller_hash(spec_of(policy or SHIPPED, robot)),
+        space=space,
+        space_sha256=space_sha256,
+        collision_bit=robot.collision_bit,
+        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy)),
+        **preset_of(name),
+    )
+
+
+def as_settings(cfg: SearchCfg) -> dict[str, Any]:
+    """What makes a run what it is: all fields but ``iterations``, as JSON values."""
+    settings = json.loads(json.dumps(asdict(cfg)))
+    del settings["iterations"]
+    return settings
+
+
+def from_settings(settings: dict[str, Any], iterations: int) -> SearchCfg:
+    """The search that :func:`as_settings` was of; other settings are a ValueError."""
+    return from_builtins(SearchCfg, {**settings, "iterations": iterations}, "a search")
+
+
+def differences(stored: dict[str, Any], settings: dict[str, Any], prefix: str = "") -> list[str]:
+    """Settings that differ, each as ``scheduler.sigma0 (0.5 there, 0.2 wanted)``."""
+    lines = []
+    for name in sorted(stored.keys() | settings.keys()):
+        before, after = stored.get(name), settings.get(name)
+        if isinstance(before, dict) and isinstance(after, dict):
+            lines += differences(before, after, f"{prefix}{name}.")
+        elif before != after:
+            texts = (json.dumps(value) for value in (before, after))
+            shown, asked = (text if len(text) <= 40 else f"{text[:37]}..." for text in texts)
+            lines.append(f"{prefix}{name} ({shown} there, {asked} wanted)")
+    return lines
+
+
+def is_searched(cfg: SearchCfg, policy: str, robot: RobotCfg) -> bool:
+    """Whether a controller is that of a search: by its hash, or by its name where it has none."""
+    if cfg.policy_sha256 is None:
+        return policy == spec_of(cfg.policy, robot)
+    return controller_hash(policy) == cfg.policy_sha256
+
+
+def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
+    """The controller that a run was searched with, which must be what it was.
+
+    Code runs only if the command line names it, so a controller that is code is refused here.
+    """
+    if ControllerSpec.parse(cfg.policy).runs_code:
+        raise ValueError(
+            f"{path} was searched with the controller {cfg.policy}, which is code: name it again "
+            f"(--policy {shlex.quote(cfg.policy)}), since no code runs that the command line does not name"
+        )
+    policy = spec_of(cfg.policy, robot)
+    if not is_searched(cfg, policy, robot):
+        digest = controller_hash(policy)
+        state = "lost" if digest is None else "another one now"
+        raise ValueError(
+            f"{path} was searched with the controller in {policy}, which is {state} (expected SHA-256 "
+            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy where it is"
+        )
+    return policy

@@ -1,0 +1,183 @@
+"""A controller in the loop: from the observation buffer to that of the actions, every control step."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+import warp as wp
+
+from sim.controllers.spec import in_one_line
+from sim.device import recording
+
+_LEAST_ROWS = 32
+"""Torch sums matrix products in another order for fewer than 4 or 16 rows, by processor (measured: batches of 16 to
+4,096 rows give each row the same bits, with AVX2 and AVX-512)."""
+
+
+def with_rows_of_zeros(rows: torch.Tensor) -> torch.Tensor:
+    """Rows on the CPU with zeros after them where they are few: a module gives each the same bits in any batch."""
+    missing = 0 if rows.is_cuda else max(_LEAST_ROWS - len(rows), 0)
+    return torch.nn.functional.pad(rows, (0, 0, 0, missing)) if missing else rows
+
+
+def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
+    """What a controller returned instead of floats of that shape, if anything; waits for no device."""
+    if not isinstance(action, torch.Tensor):
+        return f"got {type(action).__name__}"
+    if tuple(action.shape) != shape:
+        return f"got {tuple(action.shape)}"
+    if not action.is_floating_point() or action.is_meta or action.layout != torch.strided:
+        return f"as plain floats, got {action.dtype}, {action.layout}, on {action.device}"
+    return None
+
+
+Memory = Literal["none", "reset(rows)", "reset()"]
+"""How a policy forgets: it has no memory, forgets single robots, or all.
+
+``reset(rows)`` is called before every step with a bool tensor of shape (num_envs,): True where a robot begins a new
+episode. ``reset()`` is called when all robots begin together, which leaves robots idle that have ended.
+"""
+
+
+def memory_of(policy: Any) -> Memory:
+    """What a policy remembers from one step to the next, by its ``reset``."""
+    reset = getattr(policy, "reset", None)
+    if not callable(reset):
+        return "none"
+    try:
+        inspect.signature(reset).bind(None)
+    except (TypeError, ValueError):  # a ValueError of what has no signature
+        return "reset()"
+    return "reset(rows)"
+
+
+def forget_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
+    """Let a policy that remembers forget all its robots; returns whether it is one."""
+    memory = memory_of(policy)
+    if memory == "reset(rows)":
+        policy.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
+    elif memory == "reset()":
+        policy.reset()
+    return memory != "none"
+
+
+class Recurrent(torch.nn.Module):
+    """A network that remembers a state of each robot, of any number of robots, at fixed places of the device."""
+
+    graph_safe = True
+    """Whether steps, and a reset, may be captured as a CUDA graph."""
+
+    def __init__(self, initial: Sequence[torch.Tensor], axis: int) -> None:
+        """States at the start of an episode, with one robot along ``axis``."""
+        super().__init__()
+        self._axis = axis
+        self._states: dict[int, list[torch.Tensor]] = {}  # by the number of robots: a graph keeps their addresses
+        copies = [torch.nn.Parameter(state.detach().clone(), requires_grad=False) for state in initial]
+        self._initial = torch.nn.ParameterList(copies)
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Actions of the rows, shape (num_rows, size), and the state after them; it may change the state in place."""
+        raise NotImplementedError
+
+    def _state_of(self, count: int) -> list[torch.Tensor]:
+        if count not in self._states:
+            rows = count if self._initial[0].is_cuda else max(count, _LEAST_ROWS)
+            self._states[count] = [state.repeat_interleave(rows, dim=self._axis) for state in self._initial]
+        return self._states[count]
+
+    @torch.inference_mode()
+    def reset(self, rows: torch.Tensor) -> None:
+        """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
+        for initial, state in zip(self._initial, self._state_of(len(rows)), strict=True):
+            own = state.narrow(self._axis, 0, len(rows))
+            where = rows.reshape([-1 if axis == self._axis else 1 for axis in range(state.ndim)])
+            own.copy_(torch.where(where, initial, own))
+
+    @torch.inference_mode()
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints)."""
+        state = self._state_of(len(rows))
+        # cuDNN's recurrent kernels are made for sequences: a step of many robots takes them far longer than products.
+        with torch.backends.cudnn.flags(enabled=False):
+            action, after = self.step(with_rows_of_zeros(rows), state)
+        for old, new in zip(state, after, strict=True):
+            old.copy_(new)
+        return action[: len(rows)]
+
+
+def is_graph_safe(policy: Any) -> bool:
+    """Whether a policy may be captured as a CUDA graph: a module without memory, or what says that it is."""
+    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and memory_of(policy) == "none")
+
+
+class PolicyRunner:
+    """Runs a policy between two Warp buffers.
+
+    A torch module without memory is captured as a CUDA graph, and so is what says that it is ``graph_safe``: of fixed
+    shapes, with a ``reset(rows)`` that writes in place.
+    """
+
+    def __init__(
+        self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
+    ) -> None:
+        """Bind it to Warp arrays of shapes (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
+
+        ``begins`` is not 0 where an episode begins with the coming step.
+        """
+        self._policy: Any = policy
+        self.memory = memory_of(policy)
+        self._begins = wp.to_torch(begins)
+        self._observation = wp.to_torch(observation)
+        self._action = wp.to_torch(action)
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._plain = isinstance(policy, torch.nn.Module) and self.memory == "none"
+        if self._observation.is_cuda and is_graph_safe(policy):
+            self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
+
+    def reset(self) -> None:
+        """Let a policy forget all robots, of one that can forget no single one."""
+        self._policy.reset()
+
+    def _call(self) -> None:
+        """Calls the controller with a copy of the rows, which it may keep or change, and checks its actions."""
+        observation = self._observation.clone()
+        if self._plain:  # what remembers, or looks at its rows, gets one a robot
+            observation = with_rows_of_zeros(observation)
+        sizes = tuple(observation.shape)
+        try:
+            if self.memory == "reset(rows)":
+                self._policy.reset(self._begins != 0)
+            action = self._policy(observation)
+        except (Exception, SystemExit) as error:  # a controller can fail with anything
+            raise ValueError(
+                f"controller {getattr(self._policy, '__qualname__', type(self._policy).__qualname__)} failed in the "
+                f"middle of a crossing, on observations of shape {sizes}: {in_one_line(error)}"
+            ) from error
+        shape = (sizes[0], self._action.shape[1])
+        problem = action_problem(action, shape)
+        if problem is not None:
+            raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")
+        self._action.copy_(action[: len(self._action)])
+
+    @torch.inference_mode()
+    def _capture(self) -> torch.cuda.CUDAGraph:
+        for _ in range(3):
+            self._call()
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        # Other threads may use the device meanwhile.
+        with (
+            recording(),
+            torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"),
+        ):
+            self._call()
+        return graph
+
+    @torch.inference_mode()
+    def __call__(self) -> None:
+        """Write the actions of the present observations."""
+        if self._graph is not None:
+            self._graph.replay()
+        else:
+            self._call()

@@ -1,0 +1,144 @@
+"""The terrains of a simulation, on the device."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels.conditions import Condition
+from kernels.ground import FIRM, Ground, make_ground
+from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from sim.device import host_device
+from sim.terrains.conditions import NOMINAL
+from sim.terrains.ground import GroundMaps
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+
+_ALL = slice(None)
+
+
+class TerrainBank:
+    """Height grids on the device; an environment stands on the grid its terrain index names.
+
+    Terrains are replaced in place, so that captured graphs go on reading them.
+
+    Attributes:
+        heights: Node heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
+        terrain: The same with their ceilings, as contacts take them.
+        ground: Friction and softness; None where no terrain has any.
+        conditions: Under which each is crossed, shape (num_terrains, 12) (:class:`kernels.conditions.Condition`); None
+            where all are nominal.
+    """
+
+    def __init__(
+        self, num_terrains: int, *, device: str, with_ground: bool = False, with_conditions: bool = False
+    ) -> None:
+        """Make flat terrains; with ``with_ground`` they have maps of friction and softness, which contacts pay for.
+
+        With ``with_conditions`` they have these maps too, since friction is one of them.
+        """
+        if num_terrains < 1:
+            raise ValueError(f"a bank needs at least 1 terrain, got {num_terrains}")
+        shape = num_terrains, NUM_ROWS, NUM_COLS
+        self.terrain = Terrain()
+        self.terrain.heights = self.heights = wp.zeros(shape, dtype=float, device=device)
+        self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
+        self.terrain.spacing = SPACING
+        with_ground |= with_conditions
+        self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
+        nominal = np.tile(NOMINAL, (num_terrains, 1))
+        self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None
+        self.device, self.num_terrains = device, num_terrains
+
+    def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
+        """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol).
+
+        Without ``ground`` their friction and softness change nothing.
+        """
+        replaced = self.heights[slots]
+        expected = tuple(replaced.shape)
+        if heights.shape != expected:
+            raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
+        if not np.isfinite(heights).all():
+            raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
+        if ground is not None and len(ground) != len(heights):
+            raise ValueError(f"ground must be of {len(heights)} terrains, got {len(ground)}")
+        self._check_room(ground=ground is not None, conditions=ground is not None and ground.conditions is not None)
+        ground = ground or GroundMaps.plain(len(heights))
+        replaced.assign(heights.astype(np.float32))
+        max_blocks(replaced, self.terrain.ceilings[slots])
+        if self.ground is not None:
+            self.ground.friction[slots].assign(np.float32(ground.friction))
+            self.ground.time_constant[slots].assign(np.float32(ground.time_constant_s))
+        self._set_conditions(ground.rows, slots)
+
+    def _check_room(self, *, ground: bool, conditions: bool) -> None:
+        if ground and self.ground is None:
+            raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
+        if conditions and self.conditions is None:
+            raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
+
+    def _set_conditions(self, rows: np.ndarray, slots: slice) -> None:
+        """Replace the conditions of some slots, (number of slots, 12), if the bank has any."""
+        if self.conditions is not None:
+            assert self.ground is not None
+            self.conditions[slots].assign(np.float32(rows))
+            self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
+
+    def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
+        """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
+        valid, replaced = space.validate(genes), self.heights[slots]
+        if len(valid) != len(replaced):
+            raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
+        self._check_room(ground=bool(space.ground), conditions=bool(space.conditions))
+        on_device = wp.array(valid, dtype=float, device=self.device)
+        space.rasterise(on_device, SPACING, replaced)
+        max_blocks(replaced, self.terrain.ceilings[slots])
+        if self.ground is not None:
+            maps = Ground()
+            maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
+            maps.friction.fill_(1.0)
+            maps.time_constant.fill_(FIRM)
+            space.lay_ground(on_device, maps)
+        self._set_conditions(space.conditions_of(valid), slots)
+
+    def ground_maps(self) -> GroundMaps | None:
+        """The maps of all terrains on the host; None of a bank without any."""
+        if self.ground is None:
+            return None
+        friction, time_constant_s = self.ground.friction.numpy(), self.ground.time_constant.numpy()
+        conditions = None if self.conditions is None else self.conditions.numpy().copy()
+        return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy(), conditions=conditions)
+
+
+def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
+    """Height grids [m] of genes, shape (num_terrains, num_genes), as a simulation has them, on the host.
+
+    Float32, shape (num_terrains, NUM_ROWS, NUM_COLS); of rows and columns only ``every`` so many from the first on, a
+    divisor of the cells of both.
+    """
+    if every == 1 or not space.any_spacing:
+        return terrains_of(genes, space)[0][:, ::every, ::every]
+    shape = len(genes), (NUM_ROWS - 1) // every + 1, (NUM_COLS - 1) // every + 1
+    with wp.ScopedDevice(host_device()):  # the nodes in between are not worked out
+        heights: Any = wp.empty(shape, dtype=float)
+        space.rasterise(wp.array(space.validate(genes), dtype=float), every * SPACING, heights)
+        return np.array(heights.numpy())
+
+
+def terrains_of(
+    genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None
+) -> tuple[np.ndarray, GroundMaps | None]:
+    """Height grids [m] of genes, shape (num_terrains, num_genes), and their ground, if the space has any.
+
+    Grids are float32, shape (num_terrains, NUM_ROWS, NUM_COLS); ``device`` is a Warp device, :func:`host_device` if
+    None.
+    """
+    device = device or host_device()
+    bank = TerrainBank(
+        len(genes), device=device, with_ground=bool(space.ground), with_conditions=bool(space.conditions)
+    )
+    with wp.ScopedDevice(device):
+        bank.set_genes(genes, space)
+        return np.array(bank.heights.numpy()), bank.ground_maps()

@@ -1,0 +1,110 @@
+"""Friction and softness of the ground on the host: maps of patches, and the names of spaces that have them.
+
+The conditions of a crossing go with them.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
+from sim.terrains.conditions import KINDS as CONDITION_KINDS
+from sim.terrains.conditions import NOMINAL, check_conditions
+
+GROUND_KINDS = ("friction", "softness")
+"""What the ground may have maps of."""
+_KINDS = (*GROUND_KINDS, *CONDITION_KINDS)
+_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(_KINDS)}))+)$")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GroundMaps:
+    """Friction and softness of the patches of T terrains, and the conditions under which each is crossed.
+
+    docs/terrains.md says what the numbers do.
+    """
+
+    friction: NDArray[np.float32]
+    """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
+    time_constant_s: NDArray[np.float32]
+    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
+    conditions: NDArray[np.float32] | None = None
+    """Under which each is crossed (:class:`kernels.conditions.Condition`), shape (T, 12); nominal ones if None."""
+
+    def __post_init__(self) -> None:
+        check_map("friction", self.friction)
+        check_map("softness", self.time_constant_s)
+        if len(self.friction) != len(self.time_constant_s):
+            raise ValueError(
+                f"maps must be of as many terrains, got {len(self.friction)} of friction and "
+                f"{len(self.time_constant_s)} of softness"
+            )
+        if self.conditions is not None:
+            check_conditions(self.conditions, len(self))
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """Conditions of all, shape (T, 12)."""
+        return np.tile(NOMINAL, (len(self), 1)) if self.conditions is None else self.conditions
+
+    def __len__(self) -> int:
+        return len(self.friction)
+
+    def __getitem__(self, rows: slice) -> "GroundMaps":
+        conditions = None if self.conditions is None else self.conditions[rows]
+        return GroundMaps(
+            friction=self.friction[rows], time_constant_s=self.time_constant_s[rows], conditions=conditions
+        )
+
+    @classmethod
+    def plain(cls, num_terrains: int) -> "GroundMaps":
+        """Maps of ground that changes nothing."""
+        whole = num_terrains, *PATCHES
+        return cls(friction=np.ones(whole, np.float32), time_constant_s=np.full(whole, FIRM, np.float32))
+
+    def joined(self, other: "GroundMaps") -> "GroundMaps":
+        """These terrains, and others behind them."""
+        nominal = self.conditions is None and other.conditions is None
+        return GroundMaps(
+            friction=np.concatenate([self.friction, other.friction]),
+            time_constant_s=np.concatenate([self.time_constant_s, other.time_constant_s]),
+            conditions=None if nominal else np.concatenate([self.rows, other.rows]),
+        )
+
+
+def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
+    """Row or column of the patch at each place along an axis, which ``count`` patches divide evenly.
+
+    Places and length are in nodes or metres, from the beginning of the axis. Patches at the edge go on beyond it.
+    """
+    return np.clip(np.asarray(places) * count // length, 0, count - 1).astype(np.int64)
+
+
+def check_map(kind: str, values: NDArray[np.floating]) -> None:
+    """That values are frictions or, of ``softness``, contact time constants [s] of the patches of terrains."""
+    if values.ndim != 3 or values.shape[1:] != PATCHES:
+        raise ValueError(f"a map of {kind} must have shape (terrains, {PATCHES[0]}, {PATCHES[1]}), got {values.shape}")
+    if kind == "friction":
+        allowed, words = (values >= LEAST_FRICTION - 1e-6) & (values <= 1.0), f"{LEAST_FRICTION} to 1"
+    else:
+        soft = (values >= LEAST_TIME_CONSTANT_S - 1e-6) & (values <= MOST_TIME_CONSTANT_S + 1e-6)
+        allowed = soft | (values == FIRM)
+        words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"
+    if not allowed.all():
+        raise ValueError(f"{kind} must be {words}, got {values[~allowed][0]:g} in one of the patches")
+
+
+def split_name(name: str) -> tuple[str, tuple[str, ...]]:
+    """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
+    suffix = _SUFFIX.search(name)
+    if suffix is None or suffix.start() == 0:
+        return name, ()
+    return name[: suffix.start()], tuple(kind for kind in _KINDS if f"+{kind}" in suffix[1])
+
+
+def joined_name(name: str, kinds: Sequence[str]) -> str:
+    """The name of a space with ground or conditions of some kinds."""
+    return "+".join((name, *kinds))

@@ -1,0 +1,170 @@
+"""What every terrain space has."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels.ground import Ground
+from sim.terrains.conditions import NOMINAL
+from sim.terrains.ground import joined_name
+from sim.terrains.hand_crafted import Seed
+
+MOST_HEIGHT = 0.25
+"""Heights of the shipped spaces are for robots half a metre high: Table I's w [m]."""
+
+
+class TerrainSpace:
+    """What a search needs of its terrains; what a space does not say itself, it has as it stands here."""
+
+    name: str
+    """What files and command lines call the space."""
+    num_genes: int
+    """Length of one row of genes."""
+    sha256: str | None = None
+    """Hash of the code of a space of a user's own, which records name beside it; None of a shipped one."""
+    sigma0: float = 2.0
+    """First step size of a search whose command line names none. So wide a start asks for terrains at the genes'
+    limits, which are the hard ones of most spaces."""
+    any_spacing: bool = False
+    """Whether it can be rasterised on nodes of any distance and number, and not only on those of a simulation."""
+    genes_per_part: int | None = None
+    """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
+    ground: tuple[str, ...] = ()
+    """What its terrains have maps of beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
+    conditions: tuple[str, ...] = ()
+    """Conditions that it has genes of, some of :data:`sim.terrains.conditions.KINDS`."""
+    height_share: float = 1.0
+    """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
+        """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
+
+        Heights [m] have shape (num_terrains, nrow, ncol), row along y, column along x, at nodes ``spacing`` [m] apart.
+        ``origin`` is x and y of the first node [m] where they are not 0, in spaces of any spacing alone.
+        """
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
+
+    def conditions_of(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Rows of conditions (:class:`kernels.conditions.Condition`), shape (num_terrains, 12)."""
+        return np.tile(NOMINAL, (len(np.asarray(genes)), 1))
+
+    def condition_words(self, genes: ArrayLike) -> str:
+        """The conditions of one row of genes (num_genes,) in words; empty of a space without any."""
+        return ""
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
+        ...
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """The parts of a terrain that can be taken away, each in words, of one row of genes (num_genes,)."""
+        ...
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes (num_terrains, num_genes) of the same terrains without the parts of these indices in :meth:`parts`."""
+        ...
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes (num_terrains, num_genes) of the same terrains with all heights times ``scale``, which is in (0, 1].
+
+        None where the space cannot scale heights together.
+        """
+        return None
+
+    def describe(self, genes: ArrayLike) -> str:
+        """A terrain in words, one part a line, of one row of genes (num_genes,)."""
+        return "\n".join(self.parts(genes))
+
+    def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
+        """What lies across the whole way, in words, with the x at which it begins and ends [m]; none of most spaces."""
+        return ()
+
+    def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Genes drawn uniformly from [-1, 1], shape (count, num_genes)."""
+        if count < 1:
+            raise ValueError(f"count must be at least 1, got {count}")
+        return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, self.num_genes)).astype(np.float32)
+
+    def validate(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Genes as float32, shape (num_terrains, num_genes), not clipped."""
+        array = np.asarray(genes, dtype=np.float32)
+        if array.ndim != 2 or array.shape[1] != self.num_genes:
+            raise ValueError(
+                f"genes must have shape (num_terrains, {self.num_genes}), got {array.shape}: the space is {self.name}"
+            )
+        finite = np.isfinite(array).all(axis=1)
+        if not finite.all():
+            raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")
+        return array
+
+
+class WiderSpace(TerrainSpace):
+    """The terrains of another space, whose genes come first, with genes of its own behind them.
+
+    Attributes:
+        inner: The other space.
+        kinds: What its own genes are of.
+    """
+
+    def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
+        """``kinds`` are what its own genes are of, in their order; a class sets :attr:`num_genes`."""
+        self.inner, self.kinds, self.name = inner, kinds, joined_name(inner.name, kinds)
+        for name in ("sha256", "sigma0", "any_spacing", "height_share"):
+            setattr(self, name, getattr(inner, name))
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
+        """Turns genes into heights on the device, by the other space."""
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
+
+    def absent(self, part: int) -> tuple[slice, Any]:
+        """Columns of a part of its own, by its number among these, and genes of it that change nothing."""
+        raise NotImplementedError
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes without some parts, those of the other space first; one of its own becomes :meth:`absent`."""
+        changed = self.validate(genes).copy()
+        first = self.inner.num_genes
+        if len(changed):
+            count = len(self.inner.parts(changed[0, :first]))
+            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
+            for part in parts:
+                if part >= count:
+                    columns, values = self.absent(part - count)
+                    changed[:, columns] = values
+        return changed
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes with heights scaled by the other space; its own stay as they are."""
+        rows, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(rows[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShippedSpace(TerrainSpace):
+    """A space whose heights are for robots half a metre high, and can be lowered for others."""
+
+    base_name: ClassVar[str]
+    """Its name at its usual height."""
+    height: float = MOST_HEIGHT
+    """Largest height [m]: a smaller one lowers all terrains alike."""
+
+    @property
+    def name(self) -> str:
+        """``course``, with another height ``course@0.06``."""
+        return self.base_name if self.height == MOST_HEIGHT else f"{self.base_name}@{self.height:g}"
+
+    @property
+    def height_share(self) -> float:
+        """Heights over the usual ones."""
+        return self.height / MOST_HEIGHT
+
+
+def clipped(genes: ArrayLike) -> NDArray[np.float32]:
+    """Genes as every space has them: a copy clipped to [-1, 1]; the search itself is unbounded."""
+    return np.clip(np.asarray(genes, dtype=np.float32), -1.0, 1.0)

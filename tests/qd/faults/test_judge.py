@@ -1,0 +1,281 @@
+"""Judging a run of the stand-in: fresh episodes, contact resolved, other controllers, and what a stop leaves."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kernels.conditions import Condition
+from qd.faults import judge as judging
+from qd.faults.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
+from qd.search.archive import read_archive, write_archive
+from qd.search.fitness import FitnessCfg
+from qd.search.progress import Bar
+from sim.controllers.spec import controller_hash
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
+from sim.terrains.spaces.registry import get_space
+from tests.builders import judged_archive, small_archive
+from tests.qd import stand_in
+from tests.qd.robots import OTHER, Robots
+from tests.qd.stand_in import compute_by, make_result
+
+SHIPPED = str(get_robot("anymal").policy_file)
+
+
+def archive_of(ratios, *, collided=None):
+    """An archive whose elites have given first ratios of two, found with or without a collision."""
+    archive = small_archive(len(ratios))
+    columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
+    archive = dataclasses.replace(archive, ratios=columns, scales=(1.0, 1.0), collision_bit=collided is not None)
+    return dataclasses.replace(archive, cell=archive.cells.cell_of(columns, collided))
+
+
+def fresh_at(archive, ratios, **kwargs):
+    """Fresh values of 40 episodes of each elite, all at its ratio."""
+    columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
+    result = make_result(np.repeat(columns[:, None], 40, axis=1), **kwargs)
+    return fresh_values(archive, result, FitnessCfg(penalties=archive.penalties, scales=archive.scales))
+
+
+def test_an_elite_is_reproduced_in_its_cell_and_in_neighbours_if_it_is_valid():
+    invalid = np.zeros((5, 40), bool)
+    invalid[4, :11] = True  # 11 of 40 is more than a quarter
+    # cells of two ratios: [.3, .4) x [.6, .7) has index 3; .45 is one interval further, .55 two
+    fresh = fresh_at(archive_of([0.35] * 5), [0.38, 0.45, 0.55, 0.25, 0.35], invalid=invalid)
+    assert fresh.reproduced.tolist() == [True, True, False, True, False]
+
+
+def test_the_collision_bit_is_taken_over_the_first_twenty():
+    collides = np.zeros((3, 40), bool)
+    collides[1, 19] = collides[2, 20] = True
+    for collided, expected in ((False, [True, False, True]), (True, [False, True, False])):
+        archive = archive_of([0.35] * 3, collided=[collided] * 3)
+        assert fresh_at(archive, [0.35] * 3, base_collision=collides).reproduced.tolist() == expected
+
+
+def test_seeds_follow_from_what_names_an_elite():
+    archive = small_archive(4)
+    seeds = elite_seeds(archive, 3, stream=5)
+    assert np.array_equal(elite_seeds(archive.rows(np.array([2, 0])), 3, stream=5), seeds[[2, 0]])
+    others = [elite_seeds(archive, 4, stream=5), elite_seeds(archive, 3, 2, stream=6)]
+    assert len({*seeds.tolist(), *np.concatenate(others).tolist()}) == 16
+    # Stored crossings and published numbers are of these.
+    assert elite_seeds(archive, 3, stream=1)[0] == np.random.SeedSequence([3, 1, 0], spawn_key=(1,)).generate_state(1)
+
+
+def test_outcomes_are_counted_by_hand():
+    collided, invalid, late = np.zeros((3, 1, 10), bool)
+    collided[0, :2], invalid[0, 2:5], late[0, 5:9] = True, True, True
+    result = make_result(np.ones((1, 10, 6)), base_collision=collided, invalid=invalid, late=late)
+    assert outcome_counts(result).tolist() == [[1, 2, 4, 3]]
+
+
+def crosses(policy, resolved, genes):
+    """Whether all robots arrive: a gene decides, another one for each controller and setting."""
+    gene, above = {
+        ("searched", False): (9, 2.0),
+        ("searched", True): (9, 0.3),
+        ("C-G", False): (10, -0.2),
+        ("C-G", True): (11, -0.4),
+    }[("C-G" if "C-G" in policy else "searched", resolved)]
+    return genes[:, gene] > above
+
+
+def result_of(cfg, genes, seeds):
+    if cfg.num_replicas == 40:
+        return stand_in.evaluate(genes, seeds, 40)
+    return ~crosses(cfg.policy, cfg.resolved, genes)
+
+
+def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
+    compute = compute_by(robots or Robots(result_of))
+    return judge(path, compute=compute, stages=stages, certifiers=certifiers, **changes)
+
+
+def numbers_in(path):
+    return json.loads((path / "archive.json").read_text())
+
+
+def test_bars_say_how_many_are_to_come(path, monkeypatch):
+    bars = []
+    monkeypatch.setattr("qd.workers.cross.Bar", lambda text: bars.append(text) or Bar(text))
+    judged(path)
+    assert bars == ["1 of 3: contact resolved", "2 of 3: C-G", "3 of 3: C-G, contact resolved"]
+
+
+def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):
+    path, robots = Path(shutil.copytree(made / "found", tmp_path / "run")), Robots(result_of)
+    searched = read_archive(path)
+    archive = judged(path, robots, stages=("fresh",))
+    assert archive.fresh.episodes.tolist() == [40] * len(searched) == [40] * len(robots.crossed)
+    assert sorted(archive.cell.tolist()) == sorted(searched.cell.tolist())
+    assert (np.diff(archive.fresh.fitness) <= 0).all() and (np.diff(archive.fitness) > 0).any()
+    assert np.array_equal(read_archive(path).fresh.fitness, archive.fresh.fitness)
+    numbers = numbers_in(path)
+    # The stand-in's noise of 10 % moves a mean of 40 episodes by under 2 %: all land in their cell or beside it.
+    assert numbers["elites_reproduced"] == numbers["reevaluated"] == len(archive)
+    assert numbers["qd_score"] == pytest.approx(searched.qd_score) and numbers["judged_by"]["fresh"]["seed"] == 3
+    assert 1 <= numbers["families"] <= len(archive) and numbers["faults"] is None
+
+
+def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
+    before, robots = read_archive(path), Robots(result_of)
+    archive = judged(path, robots)
+    failing, again = before.failing, ~crosses("searched", True, before.genes)
+    once = crosses("C-G", False, before.genes)
+    other = once & crosses("C-G", True, before.genes)
+    assert archive.confirmed.tolist() == (failing & again).tolist()
+    assert archive.certified.tolist() == (failing & other).tolist()
+    faults = int((failing & again & other).sum())
+    assert 0 < faults < (failing & again).sum() < failing.sum() < len(archive)
+    # A controller that does not cross at the search's settings is not asked with contact resolved.
+    asked = [[cfg.resolved for cfg, _ in robots.crossed if cfg.policy == policy] for policy in (SHIPPED, OTHER["C-G"])]
+    assert asked[0] == [True] * failing.sum()
+    assert (asked[1].count(False), asked[1].count(True)) == (failing.sum(), (failing & once).sum())
+    assert len(set(robots.seeds)) == len(robots.seeds)
+    numbers, stored = numbers_in(path), read_archive(path)
+    assert (numbers["failing"], numbers["confirmed"]) == (failing.sum(), (failing & again).sum())
+    assert (numbers["certified"], numbers["faults_panel"]) == ((failing & other).sum(), faults)
+    assert 1 <= numbers["fault_families"] <= faults and numbers["certifiers"] == ["C-G"]
+    assert numbers["certificates"][0]["policy_sha256"] == controller_hash(OTHER["C-G"])
+    assert numbers["elites"] == len(before) and set(numbers["judged_by"]) == {"fresh", "resolved", "others"}
+    assert stored.confirmed.tolist() == archive.confirmed.tolist()
+    assert stored.certified.tolist() == archive.certified.tolist()
+    assert (stored.cause != "").tolist() == failing.tolist() and len(stored.family) == len(archive)
+    content = (path / "archive.npz").read_bytes()
+    judged(path, Robots(result_of, stop_after=0))  # nothing is crossed twice, and nothing adds up
+    assert (path / "archive.npz").read_bytes() == content
+
+
+def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
+    before, crossed = judged(path), {SHIPPED: [], OTHER["C-G"]: []}
+    rows = np.flatnonzero(before.is_fault)
+    fragile = before.genes[rows[0]]  # the controller crosses it under most conditions
+
+    def rule(cfg, genes, seeds):
+        crossed[cfg.policy] += [*genes]
+        weak = space.conditions_of(genes)[:, Condition.STRENGTH] < 0.92
+        return (weak | (genes[:, :64] != fragile).any(axis=1)) & (cfg.policy == SHIPPED)
+
+    space, robots = get_space("super_gaussian+payload+motors+delay+noise+grip"), Robots(rule)
+    archive = judged(path, robots, stages=("varied",))
+    assert archive.faults.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
+    assert 0 < archive.faults.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
+    assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
+    assert numbers_in(path)["robust"] == numbers_in(path)["crossed_varied"] - 1 == len(rows) - 1 > 0
+    assert np.array_equal(read_archive(path).robust, archive.robust)
+    half = archive.faults.varied_outcomes.copy()
+    half[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
+    assert not dataclasses.replace(archive, faults=dataclasses.replace(archive.faults, varied_outcomes=half)).robust[
+        rows[-1]
+    ]
+    # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
+    assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
+    assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)
+    # Whoever certified is asked, and nobody else.
+    for wrong in ({}, {"C-G": str(ROBOTS["anymal"].panel / "S.pt")}):
+        with pytest.raises(ValueError, match="got none or another file for C-G"):
+            judged(path, Robots(result_of, stop_after=0), stages=("varied",), certifiers=wrong)
+    # With other certificates nobody knows any more.
+    weak = str(ROBOTS["anymal"].panel / "S.pt")
+    assert not judged(path, stages=("others",), certifiers={"C-G": weak}).robust.any()
+    assert not {"robust", "crossed_varied"} & numbers_in(path).keys()
+
+
+def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):
+    monkeypatch.setattr("sim.solver.fits", lambda *_: False)
+    nobody = Robots(result_of, stop_after=0)
+    with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
+        judged(path, nobody, stages=("fresh", "resolved", "others", "varied"))
+    with pytest.raises(ValueError, match="begin with the stages resolved, others"):
+        judged(path, nobody, stages=("varied",))
+
+
+def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
+    first = judged(path)
+    copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), str(ROBOTS["anymal"].panel / "S.pt")
+    both = judged(path, stages=("others",), certifiers={"specialist": str(copy)})
+    assert both.faults.certifiers == ("C-G", "specialist")
+    for column in (0, 1):
+        assert np.array_equal(both.faults.certifier_outcomes[:, column], first.faults.certifier_outcomes[:, 0])
+    assert numbers_in(path)["faults"] == numbers_in(path)["faults_panel"] > 0
+    # Another controller of that name crosses nothing. What it was not asked, nobody knows: elites that fail no more
+    archive = read_archive(path)
+    goal_rate = archive.fresh.goal_rate.copy()
+    goal_rate[np.flatnonzero(archive.failing)[1:]] = 1.0
+    write_archive(
+        path / "archive.npz",
+        dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=goal_rate)),
+    )
+    last = judged(path, stages=("others",), certifiers={"specialist": weak})
+    assert last.faults.certifiers == ("C-G", "specialist")
+    assert last.faults.certifier_sha256[1] == controller_hash(weak)
+    assert not last.faults.certificates()[:, 1].any() and last.faults.certificates()[:, 0].any()
+    rows = np.flatnonzero(last.faults.certifier_outcomes[:, 1].any(axis=1))
+    assert rows.tolist() == np.flatnonzero(archive.failing)[:1].tolist()
+
+
+def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_controller(path, tmp_path, monkeypatch):
+    panel, of_run = tmp_path / "panel", path / "certifiers"
+    for folder, file in ((panel, ROBOTS["anymal"].panel / "S.pt"), (of_run, OTHER["C-G"])):
+        folder.mkdir()
+        shutil.copy(SHIPPED, folder / "base.pt")
+        shutil.copy(file, folder)
+    monkeypatch.setattr(RobotCfg, "panel", panel)
+    assert judged(path, certifiers=None).faults.certifiers == ("S", "C-G")
+
+
+def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
+    archive = judged_archive()  # certified by C-G and S
+    trained_on = {"a.pt": {judging.marks_of(archive.genes)[1], "of another archive"}, "b.pt": set()}
+    monkeypatch.setattr(judging, "recorded_marks", lambda policy: trained_on[Path(policy).name])
+    certifiers = {"C-G": str(tmp_path / "a.pt"), "S": str(tmp_path / "b.pt")}
+    families = np.array([0, 1, 1, 2, 0])
+    assert seen_by(archive, families, certifiers) is None  # nobody knows what S was trained on
+    (tmp_path / "b.train.json").write_text("{}")
+    assert seen_by(archive, families, certifiers).tolist() == [[row in (1, 2), False] for row in range(5)]
+    assert seen_by(archive, families, {"C-G": certifiers["C-G"]}) is None
+
+
+@pytest.mark.parametrize(
+    ("named", "changes"),
+    [
+        ("policy", {"policy": OTHER["C-G"]}),
+        ("certifier me", {"certifiers": {"me": SHIPPED}}),
+        ("certifier C-G", {"certifiers": {"C-G": str(ROBOTS["cassie"].panel / "C-G.pt")}}),
+        ("certifier S", {"certifiers": {"S": "sys:exit"}}),
+        ("robot", {"robot": "cassie"}),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_before_anything_is_crossed(path, named, changes):
+    with pytest.raises(ValueError, match=named):
+        judged(path, Robots(result_of, stop_after=0), **changes)
+
+
+def test_a_run_that_is_not_whole_is_refused_and_stays(path, made, tmp_path):
+    nobody = Robots(result_of, stop_after=0)
+    with pytest.raises(FileNotFoundError):
+        judged(tmp_path / "gone", nobody)
+    with pytest.raises(ValueError, match="fresh"):
+        judged(made / "found", nobody)
+    (path / "archive.json").write_bytes(b"[]")
+    with pytest.raises(ValueError, match=r"archive\.json"):
+        judged(path)
+    assert (path / "archive.json").read_bytes() == b"[]"
+    archive = read_archive(path)
+    write_archive(path / "archive.npz", dataclasses.replace(archive, scales=(1.0,) * 6))
+    with pytest.raises(ValueError, match="scales"):
+        judged(path, nobody)
+
+
+def test_where_nothing_fails_nothing_is_crossed(path):
+    archive = read_archive(path)
+    fine = dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(len(archive))))
+    write_archive(path / "archive.npz", fine)
+    judged(path, Robots(result_of, stop_after=0))
+    assert numbers_in(path)["faults"] == 0 and numbers_in(path)["certifiers"] == ["C-G"]

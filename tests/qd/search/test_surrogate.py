@@ -1,0 +1,306 @@
+"""The surrogate over a stand-in whose penalties follow from heights, as a robot's do."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from qd.search import surrogate as module
+from qd.search.descriptors import Cells
+from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of, rows_of
+from qd.search.networks import MEMBERS, Networks, Training
+from qd.search.presets import SchedulerCfg
+from qd.search.surrogate import Surrogate, vary_elites
+from sim.terrains.corridor import SHAPE, corridor_heights
+from sim.terrains.spaces.base import clipped
+from sim.terrains.spaces.registry import get_space, load_space
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.qd import stand_in
+from tests.sim.terrains.spaces.spaces import write_ridges
+
+CELLS = Cells(6, 5)
+FITNESS = FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES)
+CFG = SchedulerCfg(emitters=2, batch_size=16, method="surrogate", training_steps=20, candidates=8, generations=2)
+
+
+def crossed(genes, seed: int, space=SUPER_GAUSSIAN) -> Evaluation:
+    """Six penalties that follow from slopes and heights of six parts of the way; the same mirrored."""
+    heights = corridor_heights(torch.from_numpy(clipped(genes)), space).numpy().astype(float)
+    parts = np.array_split(heights[:, 10:31, 30:91], 6, axis=2)
+    steep = np.stack([np.abs(np.diff(part, axis=2)).mean(axis=(1, 2)) for part in parts], axis=1)
+    high = np.stack([np.abs(part).mean(axis=(1, 2)) for part in parts], axis=1)
+    noise = np.random.default_rng(seed).uniform(0.9, 1.1, (len(genes), 4, 6))
+    result = stand_in.make_result((0.0005 + 0.1 * (30.0 * steep + 4.0 * high) ** 2)[:, None] * noise * stand_in.SCALES)
+    return evaluation_of(result, CELLS, FITNESS)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_steps():
+    """Steps of training that take a quarter of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "BATCH", 16)
+        yield
+
+
+def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
+    """What each network says, on the host in double precision."""
+    prediction = search.predict(torch.from_numpy(genes).to(search.device))
+    names = ("ratios", "fitness", "collided")
+    return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in names}
+
+
+def make_surrogate(cfg: SchedulerCfg = CFG) -> Surrogate:
+    return Surrogate(cfg, CELLS, SUPER_GAUSSIAN, np.random.SeedSequence(0))
+
+
+@pytest.fixture(scope="module")
+def learned() -> Surrogate:
+    """A surrogate that knows 400 random terrains."""
+    surrogate = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=6))
+    for seed in range(4):
+        genes = SUPER_GAUSSIAN.hard_random(100, seed)
+        evaluation = crossed(genes, seed)
+        surrogate.learn(genes, evaluation)
+    return surrogate
+
+
+def test_what_it_learned_holds_for_other_terrains(learned):
+    genes = SUPER_GAUSSIAN.hard_random(150, 100)
+    truth = crossed(genes, 100)
+    prediction = predicted(learned, genes)
+    assert len(learned) == 400
+    mean = prediction["ratios"].mean(axis=0)
+    assert np.abs(mean.sum(axis=1) - 1.0).max() < 1e-6
+    # Against the mean ratios of all, which is what it would say that has learned nothing of heights.
+    error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
+    assert error < 0.7 * spread
+    assert np.corrcoef(np.arcsinh(prediction["fitness"]).mean(axis=0), np.arcsinh(truth.fitness))[0, 1] > 0.6
+    assert prediction["collided"].mean() < 0.1  # none of the stand-in's robots collides
+
+
+def test_it_learns_from_a_payload_alone():
+    """On one terrain for all, penalties follow from the payload."""
+    space = get_space("super_gaussian+payload")
+    search = Surrogate(CFG, CELLS, space, np.random.SeedSequence(0))
+
+    def loaded(count, seed):
+        genes = np.tile(space.hard_random(1, 0), (count, 1))
+        genes[:, 64] = np.random.default_rng(seed).uniform(-1.0, 1.0, count)
+        shares = np.full((count, 4, 6), 1.0)
+        shares[..., 0] += 4.0 * (1.0 + genes[:, 64, None])
+        return genes, evaluation_of(stand_in.make_result(shares * stand_in.SCALES), CELLS, FITNESS)
+
+    for seed in range(6):
+        search.learn(*loaded(64, seed))
+    genes, truth = loaded(100, 9)
+    ratios = predicted(search, genes)["ratios"].mean(axis=0)[:, 0]
+    assert np.corrcoef(ratios, truth.ratios[:, 0])[0, 1] > 0.9
+
+
+def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
+    """Weights of networks after a step on given maps, all or none of them mirrored."""
+    torch.manual_seed(0)
+    networks = Networks(1, 5)
+    for weights in networks.parameters():
+        torch.nn.init.normal_(weights, std=0.1)
+    targets = torch.rand(len(maps), 5)
+    drawn = torch.arange(16 * MEMBERS).reshape(1, 16, MEMBERS) % len(maps)
+    training = Training(networks, lambda outputs, targets: ((outputs - targets) ** 2).sum(), "cpu")
+    training.run(maps, targets, drawn, torch.full_like(drawn, turned, dtype=torch.bool))
+    return list(networks.parameters())
+
+
+def test_mirrored_terrains_are_seen_as_if_they_lay_so():
+    maps = torch.randn(20, *SHAPE, 1).half()
+    plain, mirrored, laid_so = trained(maps, False), trained(maps, True), trained(maps.flip(1), False)
+    assert all(torch.equal(weights, expected) for weights, expected in zip(mirrored, laid_so, strict=True))
+    assert not torch.equal(mirrored[0], plain[0])
+
+
+def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeypatch):
+    """On CUDA: steps before the capture, its repetition, and what was saved after it; back on the CPU at last.
+
+    Rounding grows with every step, so there are few, in single precision, and on the same maps.
+    """
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    same = lambda genes, space: corridor_heights(genes.cpu(), space).to(genes.device)  # noqa: E731
+    monkeypatch.setattr(module, "corridor_heights", same)
+    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2)
+    straight, moved = make_surrogate(cfg), make_surrogate(cfg)
+    moved.compute_on(device)
+    for seed in range(3):
+        genes = SUPER_GAUSSIAN.hard_random(100, seed)
+        evaluation = crossed(genes, seed)
+        straight.learn(genes, evaluation)
+        moved.learn(genes, evaluation)
+        moved = pickle.loads(pickle.dumps(moved))  # on the CPU
+        moved.compute_on("cpu" if seed == 1 else device)
+    genes = SUPER_GAUSSIAN.hard_random(50, 9)
+    expected, values = predicted(straight, genes), predicted(moved, genes)
+    tolerance = 0.005 if moved.device.startswith("cuda") else 0.0
+    np.testing.assert_allclose(values["ratios"], expected["ratios"], rtol=0.0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness+push+delay"])
+def test_it_learns_and_proposes_on_every_device(device, name, tmp_path):
+    space = load_space(name.format(own=write_ridges(tmp_path)))
+    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2, candidates=8, generations=2)
+    search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))
+    search.compute_on(device)
+    elites = space.hard_random(80, 0)
+    evaluation = crossed(elites, 0, space)
+    search.learn(elites, evaluation)
+    genes = search.propose(16, elites, evaluation.cell, evaluation.fitness, elites[:4])
+    assert genes.shape == (16, space.num_genes) and genes.dtype == np.float32 and np.abs(genes).max() <= 1.0
+    assert len(np.unique(genes, axis=0)) == 16
+    copied = pickle.loads(pickle.dumps(search))  # on the CPU
+    apart = np.abs(predicted(search, genes)["ratios"] - predicted(copied, genes)["ratios"]).max(axis=(0, 2))
+    assert np.median(apart) < 0.005  # devices may round an element of a course to another node
+
+
+def archive_cells(ratios: torch.Tensor) -> np.ndarray:
+    """By the archive's own rule, in double precision."""
+    ratios = ratios.double().numpy()
+    return CELLS.cell_of(ratios / ratios.sum(axis=-1, keepdims=True))
+
+
+def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
+    cfg = SchedulerCfg(emitters=2, batch_size=16, explore_share=0.0, disagree_share=0.0, candidates=20, generations=2)
+    learned.cfg = cfg
+    elites = SUPER_GAUSSIAN.hard_random(60, 0)
+    evaluation = crossed(elites, 0)
+    under_way = SUPER_GAUSSIAN.hard_random(8, 9)
+    genes = learned.propose(6, elites, evaluation.cell, evaluation.fitness, under_way)
+    assert genes.shape == (6, 64) and np.abs(genes).max() <= 1.0
+
+    def predict(genes):
+        prediction = learned.predict(torch.from_numpy(genes))
+        return prediction, prediction.fitness.numpy(), archive_cells(prediction.ratios.mean(0))
+
+    def gains(genes):
+        """The fitness above the best of the cell where a terrain may fall; the mean over 50 draws of ratios."""
+        prediction, fitness, _ = predict(genes)
+        error = np.sqrt(learned.squared_error)
+        noise = error * np.random.default_rng(0).normal(size=(50, len(genes), 6))
+        drawn = np.maximum(prediction.ratios.mean(0).numpy() + noise, 1e-6)
+        cells = [archive_cells(torch.from_numpy(ratios)) for ratios in drawn]
+        return np.mean([np.maximum(fitness.mean(axis=0) - best[cell], 0.0) for cell in cells], axis=0)
+
+    assert len(set(predict(genes)[2])) == 6
+    best = np.full(CELLS.num_cells, -20.0, np.float32)
+    np.maximum.at(best, evaluation.cell, evaluation.fitness.astype(np.float32))
+    _, expected_fitness, cells = predict(under_way)
+    np.maximum.at(best, cells, expected_fitness.mean(axis=0))
+    assert (gains(genes) > 0.0).all()
+    chance = vary_elites(torch.from_numpy(elites), 60, cfg, 8, torch.Generator().manual_seed(0))
+    assert gains(genes).mean() > gains(chance.numpy()).mean()
+
+
+def test_it_knows_how_far_its_ratios_are_off(learned):
+    search = pickle.loads(pickle.dumps(learned))
+    genes = SUPER_GAUSSIAN.hard_random(50, 7)
+    evaluation = crossed(genes, 7)
+    off = ((predicted(search, genes)["ratios"].mean(axis=0) - evaluation.ratios) ** 2).mean(axis=0)
+    search.learn(genes, evaluation)  # by what it said before it learned
+    assert learned.squared_error is not None
+    np.testing.assert_allclose(search.squared_error, 0.9 * learned.squared_error + 0.1 * off, rtol=1e-4)
+
+
+@pytest.mark.parametrize("cells", [Cells(6, 10), Cells(5, 10, collision_bit=True)])
+def test_cells_are_the_archives(cells):
+    search = Surrogate(CFG, cells, SUPER_GAUSSIAN, np.random.SeedSequence(0))
+    rng = np.random.default_rng(1)
+    ratios, collided = rng.dirichlet(np.full(cells.num_ratios, 0.5), 3000), rng.random(3000) < 0.5
+    numbers = search.cells_of(torch.from_numpy(ratios), torch.from_numpy(collided)).numpy()
+    assert np.array_equal(numbers, cells.cell_of(ratios, collided))
+    edge = torch.zeros(1, cells.num_ratios)
+    edge[0, :2] = 0.5  # 5 + 5 intervals leave nothing for the others: a single point, in no cell
+    assert search.cells_of(edge, torch.tensor([False])).tolist() == [-1]
+
+
+def test_before_it_knows_enough_it_draws_and_varies():
+    search = make_surrogate()
+    none = np.zeros((0, 64), np.float32)
+    first = search.propose(8, none, np.zeros(0, int), np.zeros(0), none)
+    assert (np.abs(first[:, 7::8]) == 1.0).all()  # hard-random
+    evaluation = crossed(first, 0)
+    search.learn(first, evaluation)
+    later = search.propose(8, first[:1], evaluation.cell[:1], evaluation.fitness[:1], none)
+    assert 0.0 < np.abs(later - first[0]).max() < 0.2  # one elite, varied by .02
+
+
+@pytest.mark.parametrize(("name", "value"), [("MOST", 70), ("MOST_BYTES", 70 * 41 * 121 * 2 + 1)])
+def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name, value):
+    monkeypatch.setattr(module, name, value)
+    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=1))
+    for seed, length in ((0, 38), (1, 70)):
+        genes = SUPER_GAUSSIAN.hard_random(40, seed)
+        invalid = np.zeros((40, 4), bool)
+        invalid[1:3] = True
+        result = stand_in.make_result(np.ones((40, 4, 6)), invalid=invalid)
+        search.learn(genes, evaluation_of(result, CELLS, FITNESS))
+        assert len(search) == length
+
+
+def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(monkeypatch):
+    """By what training is given: 60 terrains at a time up to 300, and then in place of the oldest."""
+    monkeypatch.setattr(module, "MOST", 300)
+    given = []
+
+    def run(self, maps, targets, drawn, turned):
+        given.append((maps.clone(), targets, drawn))
+
+    monkeypatch.setattr(Training, "run", run)
+    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=60))
+    genes = SUPER_GAUSSIAN.hard_random(420, 0)
+    evaluation = crossed(genes, 0)
+    ratios = torch.from_numpy(evaluation.ratios)
+    heights = (corridor_heights(torch.from_numpy(genes), SUPER_GAUSSIAN) / 0.25).flatten(1)
+    for first in range(0, 420, 60):
+        part = slice(first, first + 60)
+        search.learn(genes[part], rows_of(evaluation, part))
+    assert [len(maps) for maps, _, _ in given] == [128, 256, 256, 300, 300, 300]
+    for told, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
+        places = drawn.unique()
+        terrain = torch.cdist(maps[places].float().flatten(1), heights).argmin(1)  # genes of 16 bits move maps a little
+        assert sorted(terrain.tolist()) == [*range(max(0, told - 300), told)]
+        torch.testing.assert_close(targets[places, :6].double(), ratios[terrain], rtol=0.0, atol=1e-3)
+
+
+PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
+LINE = (PAIR[1] - PAIR[0]).numpy()
+
+
+def children(pool: torch.Tensor, genes_per_part: int | None = 8, **steps: float) -> np.ndarray:
+    cfg = SchedulerCfg(**{"iso_sigma": 0.0, "line_sigma": 0.0, "crossover_share": 0.0, **steps})
+    return vary_elites(pool, 400, cfg, genes_per_part, torch.Generator().manual_seed(0)).numpy()
+
+
+def test_of_a_share_of_the_children_half_of_the_bumps_are_another_elites():
+    varied = children(PAIR, crossover_share=0.4).reshape(-1, 8, 8)
+    first, second = ((varied == elite.reshape(8, 8).numpy()).all(axis=2) for elite in PAIR)
+    assert (first ^ second).all()
+    mixed = first.any(axis=1) & second.any(axis=1)
+    # 0.4 are crossed, half of them with the other of the two, which takes 1 to 7 bumps in 254 of 256 cases.
+    assert mixed.mean() == pytest.approx(0.4 * 0.5 * 254 / 256, abs=0.06)
+    assert 0.4 < first[mixed].mean() < 0.6
+    without_parts = children(PAIR, crossover_share=1.0, genes_per_part=None)
+    assert all((row == PAIR.numpy()).all(axis=1).any() for row in without_parts)
+    assert np.abs(children(PAIR, iso_sigma=5.0)).max() == 1.0  # clipped
+    # Genes behind the last whole part, such as of conditions, stay with those of the first elite.
+    longer = children(torch.cat([PAIR, PAIR[:, :3]], dim=1), crossover_share=1.0)
+    ends = (longer[:, None, 64:] == PAIR[:, :3].numpy()).all(axis=2)
+    assert (ends.sum(axis=1) == 1).all() and (longer[:, :8] != PAIR[0, :8].numpy()).any(axis=1).mean() > 0.4
+
+
+def test_steps_along_lines_stay_on_them():
+    varied = children(PAIR, line_sigma=0.1)
+    steps = np.stack([varied - elite.numpy() for elite in PAIR])
+    nearest = np.abs(steps).sum(axis=2).argmin(axis=0)
+    step = steps[nearest, np.arange(len(varied))]
+    share = (step @ LINE) / (LINE @ LINE)
+    np.testing.assert_allclose(step, share[:, None] * LINE, atol=1e-6)
+    moved = share[np.abs(share) > 1e-6]
+    assert 0.4 < len(moved) / len(varied) < 0.6  # half of them meet the other elite
+    assert moved.std() == pytest.approx(0.1, rel=0.2)

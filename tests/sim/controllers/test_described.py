@@ -1,0 +1,247 @@
+"""Controllers as data: what the network of a description sees, what its actions mean, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from rsl_rl.models import RNNModel
+from tensordict import TensorDict
+
+from sim.controllers.described import Described, read_controller
+from sim.controllers.loaders import load_policy, prepare_torch
+from sim.controllers.runner import PolicyRunner
+from sim.controllers.spec import ControllerSpec, controller_hash
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
+
+OURS = """{term = "lin_vel", scale = 2.0}, {term = "ang_vel", scale = 0.25}, {term = "gravity"},
+  {term = "command", scale = [2, 2, 0.25]}, {term = "joint_pos"}, {term = "joint_vel", scale = 0.05},
+  {term = "last_action"}, {term = "scan", order = "y fastest", offset = 0.5, scale = 5}"""
+
+
+@pytest.fixture
+def describe(tmp_path):
+    """Writes a description of these terms and further lines."""
+
+    def write(terms, *lines, policy="weights.pt"):
+        head = "" if any(line.startswith("action_scale") for line in lines) else "action_scale = 0.5\n"
+        text = "\n".join(lines)
+        (tmp_path / "controller.toml").write_text(f'policy = "{policy}"\n{head}{text}\nobservation = [{terms}]\n')
+        return tmp_path / "controller.toml"
+
+    return write
+
+
+@pytest.fixture
+def seen_by(describe, anymal):
+    """What a network sees of rows, step after step, that answers with ``output`` of each; robots begin at the first."""
+
+    def run(steps, terms, *lines, output=lambda seen, n: torch.zeros(len(seen), n)):
+        policy, seen = Described(read_controller(describe(terms, *lines)), anymal, "it"), []
+        policy.use(lambda rows: seen.append(rows) or output(rows, policy.num_actions), torch.device("cpu"))
+        policy.reset(torch.ones(len(steps[0]), dtype=torch.bool))
+        actions = [policy(step) for step in steps]
+        return torch.stack(seen), torch.stack(actions)
+
+    return run
+
+
+def test_the_shipped_controller_is_the_same_described(anymal, describe):
+    policy = load_policy(describe(OURS, policy=anymal.policy_file), anymal, "cpu")
+    shipped, rows = load_policy(anymal.policy_file, anymal, "cpu"), rows_of(9)
+    rows[:, 36:48] = 0.0  # it has its own last action, which begins with 0
+    with torch.inference_mode():
+        for _ in range(3):
+            # Columns are divided by their scale and multiplied again: some ulps, through four layers.
+            torch.testing.assert_close(policy(rows), shipped(rows), rtol=1e-4, atol=1e-4)
+            rows[:, 36:48] = shipped(rows)
+
+
+def test_terms_in_numbers(anymal, seen_by):
+    row = torch.zeros(1, OBSERVATIONS)
+    row[0, :12] = torch.tensor([2.0, 0, 0, 0, 0, 0.25, 0, 0, -1, 2.0, -4.0, 0.5])  # 1 m/s ahead, turning 1 rad/s
+    row[0, 12:24], row[0, 24:36] = torch.arange(12) / 10, 0.05 * torch.arange(12)
+    row[0, 48:] = 5 * torch.linspace(-0.5, 0.5, 187)
+    joints = 'joints = ["RF_HAA", "LF_KFE"]'
+    seen, _ = seen_by(
+        [row, row],
+        '{term = "lin_vel", at = [0.5, 0.2, 0.0]}, {term = "command", limit = [0.75, 1.5, 1.0], scale = [1, 2, 3]},'
+        '{term = "joint_pos", scale = 10.0, clip = [-1.0, 0.4]}, {term = "joint_vel", joints = ["RH_KFE"]},'
+        '{term = "clock", period_s = 0.08},'
+        '{term = "scan", order = "x fastest", x = [0.8, -0.8], y = [0.5], offset = 0.25, clip = 0.5, scale = 0.1}',
+        joints, "default = [0.1, -0.5]",
+    )  # fmt: skip
+    pose = anymal.default_joint_pos
+    expected = [
+        1.0 - 0.2, 0.5, 0.0,  # at (.5, .2) a turn of 1 rad/s adds (-.2, .5)
+        0.75, 2 * -1.5, 3 * 1.0,
+        10 * min(pose[3] + 0.3 - 0.1, 0.4), 10 * max(min(pose[2] + 0.2 + 0.5, 0.4), -1.0),
+        11.0,
+        0.0, 1.0,
+        # Height is column / 5 + 0.5: 1.0 at the last point (.8, .5), and (0, 10) is the eleventh of 187.
+        0.1 * 0.5, 0.1 * (-0.5 + 10 / 186 + 0.5 - 0.25),
+    ]  # fmt: skip
+    np.testing.assert_allclose(seen[0, 0], expected, atol=1e-6)
+    np.testing.assert_allclose(seen[1, 0, 9:11], [math.sin(math.pi / 2), math.cos(math.pi / 2)], atol=1e-6)  # 20 ms on
+
+
+def test_actions_in_numbers(anymal, seen_by):
+    outputs = iter(torch.tensor([[1.0, 9.0], [2.0, -9.0], [3.0, 1.0]]))
+    seen, actions = seen_by(
+        [torch.zeros(1, OBSERVATIONS)] * 3, '{term = "last_action"}',
+        'joints = ["RF_HAA", "LF_KFE"]', "default = [0.1, -0.5]", "action_scale = [0.25, 2.0]",
+        "action_clip = [[-100, 100], [-4, 4]]", "action_delay_steps = 1",
+        output=lambda rows, n: next(outputs).expand(len(rows), n),
+    )  # fmt: skip
+    np.testing.assert_array_equal(seen[:, 0], [[0, 0], [1, 4], [2, -4]])  # within its limits, not delayed
+    targets = actions[:, 0] * anymal.action_scale + torch.tensor(anymal.default_joint_pos)
+    expected = np.tile(anymal.default_joint_pos, (3, 1))
+    expected[:, 3], expected[:, 2] = [0.1, 0.1 + 0.25, 0.1 + 0.5], [-0.5, -0.5 + 8.0, -0.5 - 8.0]  # of a step before
+    np.testing.assert_allclose(targets, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("layout", "expected"),
+    [  # gravity and angular velocity of steps 1 and 2: 1 2 and 10 20, each in three columns
+        ('newest = "first", by = "row", fill = "zeros"', [2, 20, 1, 10, 0, 0]),
+        ('newest = "last", by = "row", fill = "zeros"', [0, 0, 1, 10, 2, 20]),
+        ('newest = "first", by = "term", fill = "first"', [2, 1, 1, 20, 10, 10]),
+        ('newest = "last", by = "term", fill = "first"', [1, 1, 2, 10, 10, 20]),
+    ],
+)
+def test_the_past_is_laid_out_as_described(seen_by, layout, expected):
+    steps = [torch.zeros(1, OBSERVATIONS) for _ in range(2)]
+    for k, row in enumerate(steps):
+        row[0, 6:9], row[0, 3:6] = k + 1.0, 0.25 * 10 * (k + 1.0)
+    terms = '{term = "gravity"}, {term = "ang_vel"}'
+    seen, _ = seen_by(steps, terms, f"history = {{length = 3, {layout}}}")
+    np.testing.assert_array_equal(seen[1, 0], np.repeat(expected, 3))
+
+
+def test_a_term_may_have_a_past_of_its_own(seen_by):
+    seen, _ = seen_by(
+        [torch.full((1, OBSERVATIONS), 1.0), torch.full((1, OBSERVATIONS), 2.0)],
+        '{term = "gravity", history = 2}, {term = "lin_vel", scale = 2.0}',
+        'history = {length = 1, newest = "last", by = "term", fill = "zeros"}',
+    )
+    np.testing.assert_array_equal(seen[1, 0], [1, 1, 1, 2, 2, 2, 2, 2, 2])
+
+
+@pytest.fixture
+def remembering(tmp_path, describe):
+    """A description with all that a controller can remember."""
+    terms = '{term = "gravity"}, {term = "joint_vel"}, {term = "last_action"}, {term = "clock", period_s = 0.5}'
+    save_checkpoint(tmp_path / "weights.pt", rsl_rl_actor(3 * 29, ACTIONS).state_dict())
+    return describe(terms, 'history = {length = 3, newest = "last", by = "term", fill = "first"}',
+                    "action_delay_steps = 1")  # fmt: skip
+
+
+@pytest.fixture(params=["perceptron", "lstm", "script"])
+def network(request, tmp_path, remembering):
+    """Its weights: a perceptron, an LSTM, or an LSTM exported for one robot."""
+    if request.param == "perceptron":
+        return
+    torch.manual_seed(1)
+    row = TensorDict({"policy": torch.zeros(1, 3 * 29)}, batch_size=1)
+    actor = RNNModel(row, {"a": ["policy"]}, "a", ACTIONS, (16,), rnn_hidden_dim=8).eval()
+    if request.param == "lstm":
+        save_checkpoint(tmp_path / "weights.pt", actor.state_dict())
+    else:
+        torch.jit.script(actor.as_jit().eval()).save(str(tmp_path / "weights.pt"))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+@pytest.mark.usefixtures("network")
+def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
+    """Robots that begin at different times, through the runner: on a GPU it captures the controller with its reset."""
+    prepare_torch(device)
+    policy = load_policy(remembering, anymal, device)
+    assert policy.graph_safe
+    count, steps = 5, torch.randn((12, 5, OBSERVATIONS), generator=torch.Generator().manual_seed(2))
+    observation, action = (wp.zeros((count, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
+    begins = wp.zeros(count, dtype=int, device=device)
+    runner, together = PolicyRunner(policy, observation, action, begins), []
+    for k, rows in enumerate(steps):
+        observation.assign(rows.numpy())
+        begins.assign([k == 0 or k % (robot + 3) == 0 for robot in range(count)])
+        runner()
+        together.append(action.numpy().copy())
+    alone = load_policy(remembering, anymal, "cpu")
+    for robot in range(count):
+        for k, rows in enumerate(steps):
+            if k == 0 or k % (robot + 3) == 0:
+                alone.reset(torch.ones(1, dtype=torch.bool))
+            own = alone(rows[robot : robot + 1])[0].numpy()
+            if device == "cpu":
+                np.testing.assert_array_equal(together[k][robot], own)
+            else:
+                np.testing.assert_allclose(together[k][robot], own, rtol=2e-3, atol=5e-3)  # TF32
+
+
+def test_an_activation_is_of_a_checkpoint(tmp_path, anymal, describe):
+    torch.jit.script(torch.nn.Linear(3, ACTIONS)).save(str(tmp_path / "weights.pt"))
+    with pytest.raises(ValueError, match=r"controller\.toml: activation .*weights\.pt says its own"):
+        load_policy(describe('{term = "gravity"}', 'activation = "elu"'), anymal, "cpu")
+
+
+def test_a_script_of_other_columns_is_told_both_numbers(tmp_path, anymal, describe):
+    layers = torch.nn.Sequential(torch.nn.Linear(6, 16), torch.nn.ELU(), torch.nn.Linear(16, ACTIONS))
+    torch.jit.script(layers).save(str(tmp_path / "weights.pt"))
+    with pytest.raises(ValueError, match=r"weights\.pt' .*6 columns.*controller\.toml \(gravity 3\) .* 3"):
+        load_policy(describe('{term = "gravity"}'), anymal, "cpu")
+
+
+def test_weights_that_are_not_there_are_named(anymal, describe):
+    with pytest.raises(ValueError, match=r"controller\.toml: policy .*gone\.pt"):
+        load_policy(describe('{term = "gravity"}', policy="gone.pt"), anymal, "cpu")
+
+
+def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
+    weights = tmp_path / "weights.pt"
+    assert ControllerSpec.parse(remembering).files == (remembering, weights)
+    assert not ControllerSpec.parse(remembering).runs_code  # a run goes on without its name
+    digest = controller_hash(remembering)
+    pytest.importorskip("ray")
+    from qd.workers.ray_workers import PackedCode
+
+    elsewhere = PackedCode.of(str(remembering)).unpacked(tmp_path / "elsewhere")
+    rows, policies = rows_of(4), [load_policy(path, anymal, "cpu") for path in (remembering, elsewhere)]
+    assert controller_hash(elsewhere) == digest
+    assert torch.equal(policies[0](rows), policies[1](rows))
+    remembering.write_text(remembering.read_text().replace("0.5}", "0.4}"))
+    assert controller_hash(remembering) not in (None, digest)
+    weights.unlink()
+    assert controller_hash(remembering) is None
+
+
+@pytest.mark.parametrize(
+    ("terms", "line", "named"),
+    [
+        ('{term = "height"}', "", r"observation\[0\]\.term .*scan.* height"),
+        ('{term = "gravity", scal = 1}', "", r"observation\[0\] \(gravity\).* scal.* scale"),
+        ('{term = "gravity"}, {term = "clock"}', "", r"observation\[1\] \(clock\).*period_s"),
+        ('{term = "command", scale = [1, 2]}', "", r"observation\[0\]\.scale .*3.* 2"),
+        ('{term = "gravity", scale = "a"}', "", r"observation\[0\] \(gravity\): scale"),
+        ('{term = "gravity"}', "crossing = {speed = 0.5}", "crossing.* action_clip"),
+        ('{term = "gravity"}', 'model_file = "dog.xml"', "robot"),
+        ('{term = "gravity"}', 'history = {length = 2, newest = "new"}', r"history\.newest .*first, last.*'new'"),
+        ('{term = "gravity"}', 'joints = ["LF_HAA", "LF_TOE"]', "joints.*LF_TOE"),
+        ('{term = "gravity"}', "action_scale = [1, 2]", "action_scale .*12.* 2"),
+        ('{term = "gravity"}', "action_scale = nan", "action_scale"),
+        ('{term = "gravity"}', "history = {length = 2}", "newest|by|fill"),
+        ('{term = "gravity", history = 2}', "", "history"),
+        ('{term = "scan", order = "x fastest", x = [0.05], y = [0, 0.1]}', "",
+         r"scan_x = \[0\.05\] and scan_y = \[0\.0, 0\.1\]"),
+        ('{term = "gravity"}', "", r"87 observations.*\(gravity 3\) has 3 observations"),
+        ('{term = "gravity", clip = [1, 0]}', "", r"observation\[0\]\.clip"),
+        ('{term = "gravity"}', "action_clip = -1", "action_clip"),
+        ('{term = "command", limit = [1, -1, 1]}', "", r"observation\[0\]\.limit"),
+        ("", "", "observation"),
+        ("[" * 5000, "", "TOML"),
+        ('{term = "gravity"', "", "TOML"),
+    ],
+)  # fmt: skip
+def test_what_is_not_understood_is_named(anymal, remembering, describe, terms, line, named):
+    with pytest.raises(ValueError, match=rf"(?s)controller\.toml.*{named}|{named}"):
+        load_policy(describe(terms, line), anymal, "cpu")

@@ -1,0 +1,266 @@
+"""What trainings and vendors leave becomes a robot and a controller, which load and mean the same."""
+
+import re
+
+import onnx
+import pytest
+import torch
+import yaml
+
+from sim.controllers.described import read_controller
+from sim.controllers.imports import import_controller
+from sim.controllers.loaders import load_policy
+from sim.robots.find import get_robot
+from tests.sim.controllers.test_onnx import linear
+from tests.sim.dogs import JOINTS, mjcf
+
+RIGHT_FIRST = ["FR_hip", "FR_knee", "FL_hip", "FL_knee", "HR_hip", "HR_knee", "HL_hip", "HL_knee"]
+POSE = [0.6, -1.2, 0.5, -1.1] * 2  # of the right and the left legs
+IN_FILE = (0.5, -1.1, 0.6, -1.2) * 2
+HIPS_FIRST = tuple(f"{leg}_{joint}" for joint in ("hip", "knee") for leg in ("FL", "FR", "HL", "HR"))
+RL_SAR = {
+    "model_name": "policy.pt", "observations": ["ang_vel", "gravity_vec", "commands", "dof_pos", "dof_vel", "actions"],
+    "observations_history": [0, 1], "observations_history_priority": "time", "clip_obs": 100.0,
+    "clip_actions_lower": [-9.0] * 8, "clip_actions_upper": [9.0] * 8, "rl_kp": [20, 30] * 4, "rl_kd": [0.5] * 8,
+    "fixed_kp": [80.0] * 8, "action_scale": [0.125, 0.25] * 4, "wheel_indices": [], "ang_vel_scale": 0.25,
+    "dof_pos_scale": 1.0, "commands_scale": [2.0, 2.0, 0.25], "torque_limits": [23.5] * 8, "default_dof_pos": POSE,
+    "joint_mapping": [2, 3, 0, 1, 6, 7, 4, 5],
+}  # fmt: skip
+DEPLOYMENT = {
+    "policy_path": "{LEGGED_GYM_ROOT_DIR}/pre_train/policy.pt", "simulation_dt": 0.002, "control_decimation": 10,
+    "kps": [100, 150] * 4, "kds": [2] * 8, "default_angles": [0.6, -1.2] * 4, "ang_vel_scale": 0.25,
+    "dof_pos_scale": 1.0, "dof_vel_scale": 0.05, "action_scale": 0.25, "cmd_scale": [2.0, 2.0, 0.25], "num_actions": 8,
+    "num_obs": 35, "cmd_init": [0.5, 0, 0],
+}  # fmt: skip
+MJLAB = {
+    "joint_names": ",".join(JOINTS), "joint_stiffness": ",".join(["20.000"] * 8),
+    "joint_damping": ",".join(["1.0"] * 8),
+    "default_joint_pos": ",".join(["0.600", "-1.200"] * 4), "action_scale": ",".join(["0.373", "0.249"] * 4),
+    "observation_names": "base_lin_vel,base_ang_vel,projected_gravity,command,joint_pos,joint_vel,actions",
+    "observation_terms_scale": "1.0,0.2,1.0,1.0,1.0,1.0,1.0", "observation_terms_history_length": "0,3,0,0,0,0,0",
+    "observation_terms_clip": "-5.0;5.0,-inf;inf,-inf;inf,-inf;inf,-inf;inf,-inf;inf,-inf;inf", "run_path": "local",
+    "command_names": "twist",
+}  # fmt: skip
+ISAAC = """
+sim: {dt: 0.005, gravity: !!python/tuple [0.0, 0.0, -9.81]}
+decimation: 4
+scene:
+  robot:
+    init_state:
+      pos: !!python/tuple [0.0, 0.0, 0.4]
+      joint_pos: {.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}
+    actuators:
+      hips: {class_type: 'isaaclab.actuators.actuator_pd:DCMotor', joint_names_expr: [.*_hip], effort_limit: 20.0,
+             velocity_limit: 30.0, stiffness: {.*: 25.0}, damping: 0.5}
+      knees: {class_type: 'isaaclab.actuators:ImplicitActuator', joint_names_expr: [.*_knee], effort_limit: null,
+              effort_limit_sim: 30.0, velocity_limit_sim: 21.0, stiffness: 35.0, damping: 0.5}
+  height_scanner:
+    ray_alignment: yaw
+    offset: {pos: !!python/tuple [0.1, 0.0, 20.0]}
+    pattern_cfg: {func: 'isaaclab:grid_pattern', resolution: 0.2, size: [0.4, 0.2], ordering: xy}
+actions:
+  joint_pos: {class_type: 'isaaclab:JointPositionAction', joint_names: [.*], scale: {.*_hip: 0.125, .*_knee: 0.25},
+              preserve_order: false, use_default_offset: true, clip: null}
+commands:
+  base_velocity: {ranges: {lin_vel_x: !!python/tuple [-0.5, 0.5]}}
+observations:
+  policy:
+    concatenate_terms: true
+    history_length: null
+    base_ang_vel: {func: 'isaaclab.envs.mdp.observations:base_ang_vel', scale: 0.25, clip: null, history_length: 0}
+    velocity_commands: {func: 'isaaclab.envs.mdp.observations:generated_commands', params: {command_name: it}}
+    joint_pos:
+      func: isaaclab.envs.mdp.observations:joint_pos_rel
+      params: {asset_cfg: {joint_names: null, joint_ids: !!python/object/apply:builtins.slice [null, null, null]}}
+    actions: {func: 'isaaclab.envs.mdp.observations:last_action'}
+    height_scan: {func: 'isaaclab.envs.mdp.observations:height_scan', clip: !!python/tuple [-1.0, 1.0],
+                  params: {sensor_cfg: {name: height_scanner}, offset: 0.4}}
+"""
+
+
+def write_yaml(file, content):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def write_weights(file, width):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    torch.jit.script(torch.nn.Linear(width, 8)).save(str(file))
+
+
+def rl_sar(folder, width=2 * 33, **changes):
+    base = {"dt": 0.005, "decimation": 4, "joint_names": list(JOINTS), "rl_kp": [1.0] * 8, "num_of_dofs": 8}
+    write_yaml(folder / "base.yaml", {"dog": base})
+    write_yaml(folder / "lab" / "config.yaml", {"dog/lab": RL_SAR | changes})
+    write_weights(folder / "lab" / "policy.pt", width)
+    return folder / "lab"
+
+
+def deployment(folder, **changes):
+    write_weights(folder / "policy.pt", 35)
+    return write_yaml(folder / "dog.yaml", DEPLOYMENT | changes)
+
+
+def mjlab(folder, apart=False, **changes):
+    model = linear(42, 8, batch=1)
+    onnx.helper.set_model_props(model, MJLAB | changes)
+    onnx.save(model, folder / "run.onnx", save_as_external_data=apart, location="run.data", size_threshold=0)
+    return folder / "run.onnx"
+
+
+def isaac_lab(folder, old="", new=""):
+    assert old in ISAAC
+    (folder / "params").mkdir(parents=True)
+    (folder / "params" / "env.yaml").write_text(ISAAC.replace(old, new))
+    (folder / "params" / "agent.yaml").write_text("clip_actions: 5.0\npolicy: {activation: relu}\n")
+    write_weights(folder / "exported" / "policy.pt", 3 + 3 + 8 + 8 + 6)
+    return folder
+
+
+def imported(source, tmp_path):
+    """The robot and the description that are written of a source, as they load."""
+    model = tmp_path / "model" / "dog.xml"
+    model.parent.mkdir(exist_ok=True)
+    text = mjcf(drive='<motor joint="{0}"/>')
+    model.write_text(text.replace("<freejoint", '<site name="imu" pos="0.1 0 0"/><freejoint', 1))
+    out = tmp_path / "mine" / "dog"
+    import_controller(source, model, out)
+    robot = get_robot(str(out / "robot.toml"))
+    load_policy(robot.policy_file, robot, "cpu")
+    return robot, read_controller(out / "controller.toml")
+
+
+def tags(controller):
+    return [term.term for term in controller.observation]
+
+
+def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):
+    source = rl_sar(tmp_path / "policy", 2 * 35, observations=[*RL_SAR["observations"], "g1_phase"])
+    robot, controller = imported(source, tmp_path)
+    assert (robot.name, robot.default_joint_pos, robot.stiffness) == ("dog", IN_FILE, (20, 30) * 4)
+    assert (robot.damping, robot.effort_limit, robot.control_dt) == ((0.5,) * 8, (23.5,) * 8, 0.02)
+    assert (controller.joints, controller.action_scale) == (tuple(RIGHT_FIRST), (0.125, 0.25) * 4)
+    assert (controller.action_clip, controller.observation_clip) == (9.0, 100.0)
+    assert vars(controller.history) == {"length": 2, "newest": "first", "by": "row", "fill": "zeros"}
+    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
+    assert [term.scale for term in controller.observation] == [0.25, 1.0, (2.0, 2.0, 0.25), 1.0, 1.0, 1.0, 1.0]
+    assert controller.observation[-1].period_s == 0.8
+
+
+def test_a_deployment_of_unitree_has_its_scripts_observation(tmp_path):
+    robot, controller = imported(deployment(tmp_path), tmp_path)
+    assert (robot.physics_dt, robot.decimation, robot.stiffness) == (0.002, 10, (100, 150) * 4)
+    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
+    assert (controller.joints, controller.observation[-1].period_s) == (None, 0.8)
+    with pytest.raises(ValueError, match="--out"):  # which is not written over
+        imported(tmp_path / "dog.yaml", tmp_path)
+
+
+def test_the_metadata_of_mjlab_are_read(tmp_path):
+    robot, controller = imported(mjlab(tmp_path), tmp_path)
+    assert (robot.stiffness, robot.default_joint_pos) == ((20.0,) * 8, (0.6, -1.2) * 4)
+    assert controller.action_scale == (0.373, 0.249) * 4
+    first, second, *_ = controller.observation
+    assert (first.at, first.clip, first.history, second.scale, second.history) == ((0.1, 0, 0), (-5, 5), 1, 0.2, 3)
+    assert vars(controller.history) == {"length": 3, "newest": "last", "by": "term", "fill": "first"}
+
+
+def test_a_run_of_isaac_lab_is_read(tmp_path):
+    robot, controller = imported(isaac_lab(tmp_path / "run"), tmp_path)
+    assert (robot.default_joint_pos, robot.stiffness) == ((0.6, -1.2) * 2 + (0.6, -1.1) * 2, (25.0, 35.0) * 4)
+    assert (robot.effort_limit, robot.speed, robot.max_duration_s) == ((20.0, 30.0) * 4, 0.5, 30.0)
+    assert robot.saturation_effort is None and robot.velocity_limit is None  # which without a motor mean nothing here
+    assert (controller.joints, controller.action_scale) == (HIPS_FIRST, (0.125,) * 4 + (0.25,) * 4)
+    assert tags(controller) == ["ang_vel", "command", "joint_pos", "last_action", "scan"]
+    # 0.4 m by 0.2 m in steps of 0.2 m about a point 0.1 m ahead.
+    assert (robot.scan_x, robot.scan_y) == ((-0.1, 0.1, 0.3), (-0.1, 0.1))
+    scan = controller.observation[-1]
+    assert (scan.order, scan.offset, scan.clip, controller.action_clip) == ("x fastest", 0.4, (-1.0, 1.0), 5.0)
+    assert "a guess: breadth first" in robot.policy_file.read_text() and "DCMotor" in robot.settings_file.read_text()
+
+
+def test_motors_and_delays_of_isaac_lab_are_kept(tmp_path, capsys):
+    more = "saturation_effort: 25.0, min_delay: 1, max_delay: 6, armature: .01, friction: 1, damping: 0.5}\n      knees"
+    robot, _ = imported(isaac_lab(tmp_path / "run", "damping: 0.5}\n      knees", more), tmp_path)
+    # 1e6 N m at a speed limit of 1e6 rad/s are the knees' ideal drives.
+    assert (robot.saturation_effort, robot.velocity_limit) == ((25.0, 1e6) * 4, (30.0, 1e6) * 4)
+    assert robot.drive_delay_steps == 2  # (1 + 6 + 0 + 0) / 4 = 1.75
+    lines = capsys.readouterr().out
+    assert "a guess: the mean of the delays of hips (1 to 6)" in lines and "simulated as PD gains" not in lines
+    assert "# armature = ...  # fill in: a value of each joint: FL_hip 0.01" in lines  # of the knees nobody says it
+    assert "the friction of hips is left out" in lines
+
+
+def test_descriptors_say_the_order_of_joints(tmp_path):
+    run = isaac_lab(tmp_path / "run", ":base_ang_vel", ":base_lin_vel")
+    articulations = {"robot": {"joint_names": RIGHT_FIRST}}
+    write_yaml(run / "exported" / "x_IO_descriptors.yaml", {"articulations": articulations})
+    _, controller = imported(run, tmp_path)
+    assert controller.joints == tuple(RIGHT_FIRST)
+    assert controller.observation[0].at == (0.0, 0.0, 0.0)  # the trunk's centre of mass
+
+
+def test_other_weights_are_never_taken_and_a_training_says_what_is_between_layers(tmp_path):
+    state = {"actor.0.weight": torch.zeros(8, 36), "actor.0.bias": torch.zeros(8)}
+    torch.save({"model_state_dict": state}, tmp_path / "model_9.pt")
+    (tmp_path / "agent.yaml").write_text("policy: {activation: tanh}")
+    folder = tmp_path / "mine" / "dog"
+    with pytest.raises(ValueError, match="no gains"):  # which are to be filled in
+        imported(tmp_path / "model_9.pt", tmp_path)
+    assert 'activation = "tanh"' in (folder / "controller.toml").read_text()
+    for name in ("robot", "controller"):
+        (folder / f"{name}.toml").unlink()
+    (folder / "model_9.pt").write_bytes(b"older")
+    with pytest.raises(ValueError, match=r"dog/model_9\.pt must be a copy"):
+        imported(tmp_path / "model_9.pt", tmp_path)
+
+
+def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
+    torch.jit.script(torch.nn.Linear(36, 8)).save(str(tmp_path / "policy.pt"))
+    with pytest.raises(ValueError, match=r"no gains for FL_hip"):
+        imported(tmp_path / "policy.pt", tmp_path)
+    assert "Fill in default_joint_pos, stiffness, damping, action_scale, observation" in capsys.readouterr().out
+    folder = tmp_path / "mine" / "dog"
+    lines = [line for name in ("robot", "controller") for line in (folder / f"{name}.toml").read_text().splitlines()]
+    assert len(lines) <= 12 and any("its 36 columns" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("write", "change", "named"),
+    [
+        (rl_sar, {"gait": 3}, "gait"),
+        (rl_sar, {"wheel_indices": [3]}, "wheel_indices"),
+        (rl_sar, {"observations": ["ang_vel", "ang_vel_world"]}, "ang_vel_world"),
+        (rl_sar, {"observations_history": [0, 2]}, "observations_history"),
+        (rl_sar, {"observations_history_priority": "step"}, "observations_history_priority must be time or term"),
+        (rl_sar, {"model_name": "other.pt"}, "other.pt"),
+        (rl_sar, {"rl_kp": [1.0]}, "rl_kp"),
+        (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
+        (deployment, {"num_obs": 40}, "num_obs"),
+        (deployment, {"num_actions": 7}, "num_actions"),
+        (mjlab, {"apart": True}, "run.onnx' is no ONNX file of this robot: it keeps 2 of its tensors"),
+        (mjlab, {"joint_damping": "much"}, "run.onnx must be a controller of mjlab"),
+        (deployment, {"leg_joint2motor_idx": []}, "leg_joint2motor_idx"),
+        (mjlab, {"observation_names": "base_lin_vel,height_scan"}, "height_scan"),
+        (mjlab, {"joint_names": MJLAB["joint_names"].replace("HR_knee", "tail")}, "tail"),
+        (isaac_lab, {"old": "joint_pos_rel", "new": "joint_pos"}, "joint_pos,"),
+        (isaac_lab, {"old": "JointPositionAction", "new": "JointVelocityAction"}, "JointVelocityAction"),
+        (isaac_lab, {"old": "{.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}", "new": "{.*_toe: 1}"}, ".*_toe matches"),
+        (isaac_lab, {"old": "decimation: 4", "new": ""}, "it has no 'decimation'"),
+        (isaac_lab, {"old": "clip: null}", "new": "clip: [-1, 1]}"}, "clip"),
+        (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
+    ],
+)
+def test_what_is_not_understood_is_refused_by_its_name(tmp_path, write, change, named):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    source = write(folder / "run" if write is isaac_lab else folder, **change)
+    with pytest.raises(ValueError, match=re.escape(named)):
+        imported(source, tmp_path)
+    assert not (tmp_path / "mine").exists()
+
+
+def test_a_folder_of_no_known_kind_is_told_which_there_are(tmp_path):
+    with pytest.raises(ValueError, match=r"config\.yaml.*params/env\.yaml"):
+        imported(tmp_path, tmp_path)

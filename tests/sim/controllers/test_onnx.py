@@ -1,0 +1,181 @@
+"""Controllers in ONNX files: they act as their weights say, and what does not fit is refused; and their export."""
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+import warp as wp
+from onnx import TensorProto, helper, numpy_helper
+
+from sim.controllers.loaders import load_checkpoint, load_policy
+from sim.controllers.mlp import MlpPolicy
+from sim.controllers.onnx import export_onnx, load_onnx
+from sim.controllers.runner import PolicyRunner, is_graph_safe
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
+
+FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
+
+
+def port(name, shape, kind=FLOAT):
+    return helper.make_tensor_value_info(name, kind, shape)
+
+
+def graph_model(nodes, inputs, outputs, weights=()):
+    graph = helper.make_graph(list(nodes), "policy", inputs, outputs, initializer=list(weights))
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
+    """One layer, as a foreign exporter would write it: other names than ours."""
+    weight = np.random.default_rng(3).normal(size=(actions, observations)).astype(np.float32) / 10
+    offset = np.linspace(-1, 1, actions, dtype="f4")
+    weights = [numpy_helper.from_array(weight, "w"), numpy_helper.from_array(offset if bias is None else bias, "b")]
+    node = helper.make_node("Gemm", ["obs", "w", "b"], ["actions"], transB=1)
+    ports = [port("obs", [batch, columns or observations])], [port("actions", [batch, columns or actions])]
+    return graph_model([node], *ports, weights)
+
+
+def chain(last, bound=False):
+    """As mujoco_playground's exporter: normalised, a layer with swish, one with mean and spread, for one robot.
+
+    With ``bound`` a node of it knows that there is one.
+    """
+    rng = np.random.default_rng(5)
+    width = OBSERVATIONS
+    shapes = {"mean": width, "factor": width, "w0": (width, 16), "b0": 16, "w1": (16, 24), "b1": 24}
+    weights = {name: rng.normal(size=shape).astype(np.float32) / 5 for name, shape in shapes.items()}
+    weights["size"] = np.array([1, width])
+    steps = (
+        "Reshape obs size > raw" if bound else "Identity obs > raw", "Sub raw mean > centred",
+        "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
+        "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
+    )  # fmt: skip
+    words = [(before.split(), after.split()) for before, after in (step.split(" > ") for step in steps)]
+    nodes = [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in words]
+    nodes[-2].attribute.append(helper.make_attribute("axis", -1))
+    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
+    return graph_model(nodes, [port("obs", [1, width])], [port("actions", [1, ACTIONS])], tensors), weights
+
+
+def save(path, model):
+    path.write_bytes(model if isinstance(model, bytes) else model.SerializeToString())
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:policy.*runs on the CPU")
+@pytest.mark.parametrize(
+    ("last", "function"), [("Tanh", np.tanh), ("Softsign", lambda value: value / (1.0 + np.abs(value)))]
+)
+def test_it_acts_as_its_weights_say_captured_if_its_operators_are_known(tmp_path, anymal, device, last, function):
+    model, weights = chain(last)
+    policy = load_policy(str(save(tmp_path / "policy.onnx", model)), anymal, device)
+    assert is_graph_safe(policy) == (last == "Tanh")
+    observation, action = (wp.zeros((33, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
+    runner = PolicyRunner(policy, observation, action, wp.zeros(33, dtype=int, device=device))
+    for rows in (rows_of(33).numpy(), -rows_of(33).numpy()):
+        observation.assign(rows)
+        runner()
+        hidden = (rows - weights["mean"]) * weights["factor"] @ weights["w0"].astype(float) + weights["b0"]
+        out = hidden / (1.0 + np.exp(-hidden)) @ weights["w1"] + weights["b1"]
+        # Sums of 235 float32 products of order 0.1; on a GPU perhaps of TF32.
+        near = {"rtol": 2e-3, "atol": 5e-3} if device.startswith("cuda") else {"rtol": 1e-5, "atol": 1e-5}
+        np.testing.assert_allclose(action.numpy(), function(out[:, :ACTIONS]), **near)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_path, anymal, known):
+    model = linear(columns="columns") if known else chain("Softsign")[0]
+    policy = load_policy(save(tmp_path / "policy.onnx", model), anymal, "cpu")
+    together = policy(rows_of(60))
+    for size in (1, 4, 7, 20):
+        assert torch.equal(torch.cat([policy(part) for part in rows_of(60).split(size)]), together), size
+
+
+def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
+    with pytest.warns(UserWarning, match=r"bound\.onnx.*one robot after the other"):
+        bound = load_policy(save(tmp_path / "bound.onnx", chain("Tanh", bound=True)[0]), anymal, "cpu")
+    known = load_policy(save(tmp_path / "free.onnx", chain("Tanh")[0]), anymal, "cpu")
+    torch.testing.assert_close(bound(rows_of(7)), known(rows_of(7)), rtol=1e-4, atol=1e-4)
+
+
+MODELS = {
+    "another robot's rows": linear(48),
+    "another robot's rows, of unknown width": linear(48, columns="columns"),
+    "a batch of four": linear(batch=4),
+    "NaN": linear(bias=np.full(ACTIONS, np.nan, np.float32)),
+    "no batch": graph_model([helper.make_node("Identity", ["obs"], ["a"])], [port("obs", [12])], [port("a", [12])]),
+    "doubles": graph_model(
+        [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
+    ),
+    "no state that comes out": graph_model(
+        [helper.make_node("Identity", [name], [name + "_x"]) for name in ("obs", "h_in")],
+        [port("obs", ["n", OBSERVATIONS]), port("h_in", [1, "n", 3])],
+        [port("obs_x", ["n", OBSERVATIONS]), port("h_in_x", [1, "n", 3])],
+    ),
+    "rows that are mixed": graph_model(
+        [
+            helper.make_node("Slice", ["obs", "first", "last", "columns"], ["some"]),
+            helper.make_node("Softmax", ["some"], ["a"], axis=0),
+        ],
+        [port("obs", ["n", OBSERVATIONS])],
+        [port("a", ["n", ACTIONS])],
+        [numpy_helper.from_array(np.array([k]), name) for name, k in (("first", 0), ("last", ACTIONS), ("columns", 1))],
+    ),
+    "no graph": graph_model([], [], []),
+    "half a file": linear().SerializeToString()[:-9],
+}
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_a_model_that_does_not_fit_is_refused(tmp_path, anymal, model, capfd):
+    with pytest.raises(ValueError, match=r"theirs\.onnx"):
+        load_policy(save(tmp_path / "theirs.onnx", model), anymal, "cpu")
+    assert capfd.readouterr() == ("", ""), "onnxruntime says it a second time"
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_weights_in_another_file_are_refused(tmp_path, anymal, deep):
+    path = tmp_path / "split.onnx"
+    onnx.save(linear(), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
+    if deep:
+        tensor, model = onnx.load(path, load_external_data=False).graph.initializer[1], linear()
+        branch = helper.make_graph(
+            [helper.make_node("Constant", [], ["c"], value=tensor)], "branch", [], [port("c", [ACTIONS])]
+        )
+        model.graph.node.append(helper.make_node("If", ["yes"], ["unused"], then_branch=branch, else_branch=branch))
+        save(path, model)
+    with pytest.raises(ValueError, match="2 of its tensors"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="this one can use a GPU")
+def test_without_cuda_in_onnxruntime_it_computes_on_the_cpu_and_says_so(tmp_path):
+    path = save(tmp_path / "policy.onnx", chain("Softsign")[0])
+    with pytest.warns(UserWarning, match="onnxruntime-gpu"):
+        policy = load_onnx(path, (OBSERVATIONS, ACTIONS), "cuda:0")
+    assert policy(torch.zeros(3, OBSERVATIONS)).shape == (3, ACTIONS)
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_an_exported_file_is_the_controller(tmp_path, normalised):
+    policy, path = MlpPolicy(rsl_rl_actor(48, 3, normalised).state_dict()), tmp_path / "new" / "policy.onnx"
+    export_onnx(policy, path)
+    assert [file.name for file in path.parent.iterdir()] == ["policy.onnx"]
+    rows = rows_of(7)[:, :48] * 3
+    with torch.inference_mode():
+        expected, actions = policy(rows), load_onnx(path, policy.sizes, "cpu")(rows)
+    # Both round sums of up to 48 float32 products, each in its own order: a part of the largest of them.
+    assert (actions - expected).abs().max() <= 1e-5 * max(1.0, expected.abs().max())
+    session = onnxruntime.InferenceSession(path)
+    shapes = [(port.name, port.shape) for port in (*session.get_inputs(), *session.get_outputs())]
+    assert shapes == [("observation", ["batch", 48]), ("action", ["batch", 3])]
+
+
+def test_only_a_checkpoint_can_be_exported_and_to_an_onnx_file(tmp_path, anymal):
+    with pytest.raises(ValueError, match=r"policy\.pt"):
+        export_onnx(MlpPolicy(rsl_rl_actor(48, 3).state_dict()), tmp_path / "policy.pt")
+    assert not list(tmp_path.iterdir())
+    export_onnx(load_checkpoint(anymal.policy_file, anymal), tmp_path / "a.onnx")
+    with pytest.raises(ValueError, match=r"a\.onnx"):
+        load_checkpoint(tmp_path / "a.onnx", anymal)

@@ -1,0 +1,140 @@
+"""A user's own heightmap: where it comes to lie, and every mistake named before any work."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.maps.heightmap import Heightmap, as_terrain, fitted, read_heightmap
+
+X = SPACING * np.arange(NUM_COLS)
+Y = SPACING * np.arange(NUM_ROWS)
+
+
+def sampled(function, size, nodes):
+    """A map of a function of x and y, its middle in the middle of the terrain; nodes along x and along y."""
+    x = 8.0 + np.linspace(-0.5, 0.5, nodes[0]) * size[0]
+    y = 4.0 + np.linspace(-0.5, 0.5, nodes[1]) * size[1]
+    return Heightmap(heights=function(x[None, :], y[:, None]) + np.zeros((nodes[1], nodes[0])), size_m=size)
+
+
+@pytest.mark.parametrize("nodes", [(2, 2), (17, 33), (321, 161), (97, 401), (801, 1601)])
+def test_a_slope_stays_the_slope_whatever_the_nodes_of_the_map(nodes):
+    # Linear interpolation and any symmetric mean keep a plane; at the rim a finer map's mean is one-sided, by a cell.
+    terrain = as_terrain(sampled(lambda x, y: 0.1 * x - 0.05 * y, (16.0, 8.0), nodes))
+    expected = 0.1 * X[None, :] - 0.05 * Y[:, None]
+    np.testing.assert_allclose(terrain[1:-1, 1:-1], expected[1:-1, 1:-1], atol=1e-6)
+    np.testing.assert_allclose(terrain, expected, atol=0.002)
+
+
+def test_a_small_map_is_continued_by_its_edge_and_a_large_one_is_cut_to_its_middle():
+    ramp = sampled(lambda x, y: x - 8.0, (4.0, 8.0), (81, 161))
+    expected = np.broadcast_to(np.clip(X - 8.0, -2.0, 2.0), (NUM_ROWS, NUM_COLS))
+    np.testing.assert_allclose(as_terrain(ramp), expected, atol=1e-6)
+    assert "81 x 161 nodes over 4 x 8 m, heights -2.00 to 2.00 m" in fitted(ramp) and "cut" not in fitted(ramp)
+    wide = sampled(lambda x, y: 0.1 * (x - 8.0) + 0.2 * (y - 4.0), (40.0, 10.0), (401, 101))
+    np.testing.assert_allclose(as_terrain(wide), 0.1 * (X[None, :] - 8) + 0.2 * (Y[:, None] - 4), atol=1e-6)
+    assert "16 m along x" in fitted(wide) and "8 m along y" in fitted(wide)
+
+
+def test_a_finer_map_is_averaged_not_picked_from():
+    # Ridges 5 mm apart, every second 1 m high: a node sees their mean, not whichever it happens to lie on.
+    comb = np.zeros((161, 3201))
+    comb[:, ::2] = 1.0
+    terrain = as_terrain(Heightmap(heights=comb, size_m=(16.0, 8.0)))
+    np.testing.assert_allclose(terrain[:, 1:-1], 0.5, atol=0.02)
+
+
+def write_png(path, gray, **meaning):
+    Image.fromarray(gray).save(path)
+    if meaning:
+        path.with_suffix(".json").write_text(json.dumps(meaning))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_an_image_with_its_scale_beside_it_or_given(tmp_path, dtype):
+    gray = np.zeros((9, 17), dtype)
+    gray[0, 3] = 200  # the topmost row: y = 8 m
+    path = tmp_path / "hill.png"
+    write_png(path, gray)
+    given = read_heightmap(path, size_m=(16, 8), scale_m=0.01, offset_m=-0.5)
+    write_png(path, gray, size_m=[16, 8], scale_m=0.02, offset_m=-1.0, colour="of no interest")
+    beside = read_heightmap(path)
+    mixed = read_heightmap(path, scale_m=0.01)
+    for heightmap, scale, offset in ((given, 0.01, -0.5), (beside, 0.02, -1.0), (mixed, 0.01, -1.0)):
+        expected = np.full((9, 17), offset)
+        expected[8, 3] += 200 * scale
+        np.testing.assert_allclose(heightmap.heights, expected)
+        assert heightmap.size_m == (16.0, 8.0)
+    assert as_terrain(beside)[160, 60] == pytest.approx(3.0)
+
+
+def test_an_npz_with_its_size_in_it_or_given(tmp_path):
+    path, heights = tmp_path / "hill.npz", np.float32([[0, 1, 2], [3, 4, 5]])
+    np.savez(path, heights=heights, size_m=[16.0, 8.0])
+    assert read_heightmap(path).size_m == (16.0, 8.0)
+    np.testing.assert_array_equal(read_heightmap(path).heights, heights)
+    assert read_heightmap(path, size_m=(10, 5)).size_m == (10.0, 5.0)
+    np.testing.assert_array_equal(read_heightmap(path, scale_m=0.5, offset_m=-1).heights, 0.5 * heights - 1)
+    # A JSON beside it belongs to an image of the same name: it must not scale metres.
+    (tmp_path / "hill.json").write_text(json.dumps({"scale_m": 0.001, "size_m": [8, 8]}))
+    np.testing.assert_array_equal(read_heightmap(path).heights, heights)
+    assert read_heightmap(path).size_m == (16.0, 8.0)
+
+
+GOOD = {"heights": np.zeros((5, 9)), "size_m": np.array([16.0, 8.0])}
+NPZ_MISTAKES = {
+    "no heights": ({"heights": None}, "heights"),
+    "no size": ({"size_m": None}, "size_m"),
+    "complex": ({"heights": np.zeros((5, 9), complex)}, "heights"),
+    "objects": ({"heights": np.array([[{}]], dtype=object)}, "npz"),
+    "three axes": ({"heights": np.zeros((1, 5, 9))}, "heights"),
+    "a line": ({"heights": np.zeros((1, 9))}, "nodes"),
+    "NaN": ({"heights": np.array([[0.0, np.nan], [0.0, np.inf]])}, "2 of 4 heights"),
+    "too deep": ({"heights": np.full((5, 9), -10.5)}, "-10.5"),
+    "too small": ({"size_m": np.array([16.0, 0.5])}, "size_m"),
+    "x and y swapped": ({"heights": np.zeros((9, 5))}, "swapped"),
+    "friction of a part": ({"friction": np.ones((4, 8)), "size_m": np.array([8.0, 8.0])}, "friction"),
+}
+
+
+GRAY, SIZE = np.zeros((5, 9), np.uint16), {"size_m": [16, 8]}
+PNG_MISTAKES = {
+    "no scale": (GRAY, SIZE, "scale_m"),
+    "a scale in words": (GRAY, SIZE | {"scale_m": "1 cm"}, "scale_m"),
+    "colours": (np.zeros((5, 9, 3), np.uint8), SIZE | {"scale_m": 0.1}, "RGB"),
+}
+
+
+@pytest.mark.parametrize("mistake", [*NPZ_MISTAKES, *PNG_MISTAKES])
+def test_a_mistake_in_a_map_is_named(tmp_path, mistake):
+    if mistake in NPZ_MISTAKES:
+        path, (changes, words) = tmp_path / "hill.npz", NPZ_MISTAKES[mistake]
+        np.savez(path, **{name: value for name, value in (GOOD | changes).items() if value is not None})
+    else:
+        path, (gray, meaning, words) = tmp_path / "hill.png", PNG_MISTAKES[mistake]
+        write_png(path, gray, **meaning)
+    with pytest.raises(ValueError, match=rf"hill.*{words}"):
+        read_heightmap(path)
+
+
+def test_damaged_and_foreign_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.npz"):
+        read_heightmap(tmp_path / "none.npz")
+    (tmp_path / "a.tif").write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"a\.tif"):
+        read_heightmap(tmp_path / "a.tif")
+    np.savez(tmp_path / "a.npz", **GOOD)
+    gray = np.random.default_rng(0).integers(0, 9000, (50, 90), np.uint16)
+    write_png(tmp_path / "a.png", gray, size_m=[16, 8], scale_m=1e-3)
+    for name in ("a.npz", "a.png"):
+        read_heightmap(tmp_path / name)
+        whole = (tmp_path / name).read_bytes()
+        flipped = bytearray(whole)
+        flipped[len(whole) // 3] ^= 8
+        for content in (whole[: len(whole) // 2], b"hello", b"", bytes(flipped)):
+            (tmp_path / name).write_bytes(content)
+            with pytest.raises(ValueError, match=name):
+                read_heightmap(tmp_path / name)
