@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal, Self
 import tyro
 from msgspec import Meta
 
-from qd.evaluate.labels import COMPARED, SetsCfg
+from qd.evaluate.labels import SetsCfg
 from qd.search.presets import PRESETS, SchedulerCfg, preset_of
 from sim.controllers.spec import controllers_of
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_words
-from sim.files.settings import NonNegativeInt, PositiveInt
+from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
 from sim.robots.find import get_robot, robot_of
 
 
@@ -289,27 +289,16 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
         """Evaluates; returns 1 if a controller is too bad."""
         from qd.check import made_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
-        from qd.evaluate.pack import PACK_FILE, evaluate_pack, pack_folder, passes, read_pack
         from qd.evaluate.tables import is_regression
 
-        compute = _compute(self)
-        size = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
-        makes_tables = self.policies or self.sets or self.archive or self.independent
         if self.pack is not None:
-            if makes_tables or self.space is not None:
-                raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
-            folder = pack_folder(self.pack)
-            pack = read_pack(folder)
-            robot = robot_of(pack.content, self.robot, folder / PACK_FILE, kind="pack")
-            policy = self.policy or str(robot.policy_file)
-            report = evaluate_pack(pack, robot, policy, compute=compute, out=self.out, **size)
-            return int(self.fail_under is not None and not passes(report, self.fail_under))
+            return self._evaluate_pack(self.pack)
         if self.fail_under is not None:
             raise ValueError("--fail-under goes with --pack: give the pack too")
-        robot = get_robot(self.robot)
-        if not makes_tables:
+        robot, compute = get_robot(self.robot), _compute(self)
+        if not self._makes_tables():
             policy = self.policy or str(robot.policy_file)
-            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
+            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **self._size())
             return 0
         if self.policy is not None:
             raise ValueError(
@@ -317,15 +306,25 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
             )
         controllers = controllers_of(self.policies, robot)
         robot = made_ready(robot, next(iter(controllers.values())), compute)
-        names, compared = tuple(split_words(self.sets)), {*controllers} == {"old", "new"}
-        if compared:
-            if self.archive is None:
-                raise ValueError("old and new are compared on elites: give --archive RUN, or other names for tables")
-            if names or self.independent:
-                raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
-            names, controllers = (COMPARED,), {name: controllers[name] for name in ("old", "new")}
-        report = evaluate_tables(robot, controllers, replace(self, sets=names), compute=compute, out=self.out)
-        return int(compared and is_regression(report))
+        cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_words(self.sets)))
+        return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
+
+    def _makes_tables(self) -> bool:
+        return bool(self.policies or self.sets or self.archive or self.independent)
+
+    def _size(self) -> dict[str, Any]:
+        return {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
+
+    def _evaluate_pack(self, name: str) -> int:
+        from qd.evaluate.pack import PACK_FILE, evaluate_pack, find_pack, passes, read_pack
+
+        if self._makes_tables() or self.space is not None:
+            raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
+        pack = read_pack(find_pack(name))
+        robot = robot_of(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
+        policy = self.policy or str(robot.policy_file)
+        report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **self._size())
+        return int(self.fail_under is not None and not passes(report, self.fail_under))
 
 
 @dataclass(frozen=True, kw_only=True)

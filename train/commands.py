@@ -4,10 +4,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 from sim.files.command import WorkerFlags, peek
-from sim.files.settings import from_builtins
+from sim.files.settings import from_builtins, select_settings
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from train.cfg import FinetuneCfg, HardenCfg, RunCfg, TrainCfg
@@ -48,7 +48,8 @@ class Train(_OfTraining, TrainCfg):
         from train.base import train
 
         robot = get_robot(self.robot)
-        train(robot, _part(TrainCfg, self), _run_dir(self, f"{robot.name}-base"), _part(RunCfg, self))
+        run_dir = _run_dir(self, f"{robot.name}-base")
+        train(robot, select_settings(TrainCfg, self), run_dir, select_settings(RunCfg, self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,9 @@ class Finetune(_OfTraining, FinetuneCfg):
         """Fine-tunes."""
         from train.finetune import finetune, train_specialist
 
-        robot, cfg, run = get_robot(self.robot), _part(FinetuneCfg, self), _part(RunCfg, self)
+        robot = get_robot(self.robot)
+        cfg = select_settings(FinetuneCfg, self)
+        run = select_settings(RunCfg, self)
         if self.specialist is None:
             finetune(robot, cfg, _run_dir(self, f"{robot.name}-{self.mix}"), run)
             return
@@ -116,7 +119,7 @@ class Harden(HardenCfg, WorkerFlags):
 
         robot, compute = get_robot(self.robot), Compute.resolve(self.device, self.workers, self.num_envs)
         run_dir = self.run_dir or Path("runs") / f"{robot.name}-harden-{self.seed}"
-        harden(robot, _part(HardenCfg, self), run_dir, compute)
+        harden(robot, select_settings(HardenCfg, self), run_dir, compute)
 
 
 def _peek(argv: Sequence[str]) -> tuple[RobotCfg, Path | None]:
@@ -144,7 +147,3 @@ def _run_dir(flags: _OfTraining, name: str) -> Path:
     if flags.resume is not None and flags.run_dir is not None:
         raise ValueError("--resume goes on where it is, got --run-dir too: leave it out")
     return flags.run_dir or flags.resume or free_path(f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
-
-
-def _part(kind: type[_Cfg], flags: Any) -> _Cfg:
-    return kind(**{setting.name: getattr(flags, setting.name) for setting in fields(kind)})  # pyright: ignore[reportArgumentType]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.marks import TRAINED_ON, marks_of, recorded_marks
-from qd.evaluate.sets import elites_sha256, read_elites, space_of, split_elites
+from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
+from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elites
 from qd.faults.judge import CERTIFIERS_FOLDER
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.search.directory import RunDirectory, directory_of, find_run
@@ -135,7 +135,7 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
     splits = [split_elites(archive, held_out=cfg.recipe.held_out) for archive in archives]
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
-        held_out.update(marks_of(archive.genes[np.concatenate([split.test, split.validation])]))
+        held_out.update(hash_elites(archive.genes[np.concatenate([split.test, split.validation])]))
     chosen = []
     for archive, split, path in zip(archives, splits, paths, strict=True):
         rows = split.train
@@ -146,14 +146,14 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
                 judge = command_line("judge", robot=own, run=directory_of(path), space=space)
                 raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: run `{judge}`")
             rows = rows[archive.failing[rows]]
-        is_free = [mark not in held_out for mark in marks_of(archive.genes[rows])]
+        is_free = [mark not in held_out for mark in hash_elites(archive.genes[rows])]
         chosen.append((archive, rows[np.array(is_free, bool)], split))
     if not any(len(rows) for _, rows, _ in chosen):
         places = ", ".join(map(str, paths))
         raise ValueError(f"{places} must have elites to train on that are {cfg.recipe.only}, got none")
     return Elites(
         genes=tuple(archive.genes[rows] for archive, rows, _ in chosen),
-        spaces=tuple(map(space_of, archives)),
+        spaces=tuple(map(read_space, archives)),
         goal_rate=np.concatenate([(archive.fresh or archive).goal_rate[rows] for archive, rows, _ in chosen]),
         about=[
             {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation),
@@ -185,12 +185,12 @@ class FineTuning(Training):
             seed=cfg.seed, device=device, goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
         )  # fmt: skip
         if saved is None:
-            before = recorded_marks(str(cfg.policy or robot.policy_file))
+            before = read_trained_on(str(cfg.policy or robot.policy_file))
             alone = 0
             if start.critic is None:
                 most = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
                 alone = most if cfg.recipe.critic_iterations is None else cfg.recipe.critic_iterations
-            marks = sorted({*chain(*map(marks_of, elites.genes)), *before})
+            marks = sorted({*chain(*map(hash_elites, elites.genes)), *before})
             facts, tiles = {TRAINED_ON: marks, "critic_iterations": alone}, self.mix.next()
         else:
             facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}

@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.evaluate import EPISODES, cross_sets, evaluate, sizes_for
+from qd.evaluate.evaluate import cross_sets, evaluate, fill_sizes
 from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
 from qd.evaluate.show import show_table
 from qd.faults.judge import judge
+from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive
 from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.search.loop import search
@@ -95,7 +96,7 @@ class _Hardening:
         tune.check(robot)
         full = (paper_terrains(robot.name), EPISODES)
         terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
-        terrains, episodes = sizes_for(compute, terrains, episodes, full=full, small=(24, 4))
+        terrains, episodes = fill_sizes(compute, terrains, episodes, full=full, small=(24, 4))
         self.cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
         self.robot, self.path, self.compute, self.certifiers = robot, path, compute, certifiers
         self.space = space_at(load_space(cfg.space), None, robot)

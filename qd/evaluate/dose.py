@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.evaluate.evaluate import cross_sets, crossings_folder, sizes_for
+from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
 from qd.search.directory import RUNS
@@ -53,7 +53,7 @@ def measure_dose(
     the file lies under runs/. The figure is beside it. The report has a row for each value and controller under
     ``dose`` (:func:`rows_of`) and one for each dose and controller under ``half`` (:func:`half_of`).
     """
-    count, episodes = sizes_for(compute, terrains, episodes, full=_FULL, small=_SMALL)
+    count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
     out = out or RUNS / f"{robot.name}-dose" / ("dose-resolved.json" if resolved else "dose.json")

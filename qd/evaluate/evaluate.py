@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.labels import COMPARED, HELD_OUT, SetsCfg
-from qd.evaluate.marks import check_untrained, recorded_marks
+from qd.evaluate.marks import check_untrained, read_trained_on
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     TerrainSet,
@@ -22,6 +22,7 @@ from qd.evaluate.sets import (
 )
 from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Tables, check_seeds, make_tables
+from qd.faults.numbers import EPISODES
 from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
@@ -34,20 +35,18 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import load_space, space_at
 
-EPISODES = 20
-"""Episodes a terrain on a GPU."""
 _SMALL = (24, 4)  # terrains a set and episodes a terrain on a machine without a GPU
 
 
-def sizes_for(
+def fill_sizes(
     compute: Compute, terrains: int | None, episodes: int | None, *, full: tuple[int, int], small: tuple[int, int]
 ) -> tuple[int, int]:
-    """Terrains and episodes a terrain: those asked for, else ``full`` on a GPU; ``small`` without one, in a line."""
+    """Terrains and episodes a terrain: where they are None, ``full`` on a GPU, else ``small``, which it prints."""
     on_gpu = compute.device.startswith("cuda")
     if not on_gpu and terrains is None and episodes is None:
         print(f"No GPU: {small[0]} terrains x {small[1]} episodes each instead of {full[0]} x {full[1]}.")
-    suited = full if on_gpu else small
-    return terrains or suited[0], episodes or suited[1]
+    default_terrains, default_episodes = full if on_gpu else small
+    return terrains or default_terrains, episodes or default_episodes
 
 
 def crossings_folder(robot: RobotCfg) -> Path:
@@ -58,29 +57,29 @@ def crossings_folder(robot: RobotCfg) -> Path:
 def cross_sets(
     controllers: Mapping[str, str],
     sets: Mapping[str, TerrainSet],
-    *,
     robot: RobotCfg,
     compute: Compute,
     episodes: int,
+    *,
     how: How = "searched",
     reward: bool = False,
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
     note: str = "",
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them; prints its rates.
+    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them.
 
-    ``note`` stands behind the names of the sets there.
+    Prints the rates of each, with ``note`` behind the name of the set.
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
-    at_most = max(map(len, sets.values()))
+    largest = max(map(len, sets.values()))
     with Crossings(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crossings:
         for controller, policy in controllers.items():
             for name, terrains in sets.items():
                 label = f"{controller} on {name}{note}" + (f" ({how})" if how != "searched" else "")
                 result = crossings.cross(
                     policy, terrains.terrains, terrains.seeds, replicas=episodes, space=terrains.space, how=how,
-                    reward=reward, penalties_from_s=penalties_from_s, label=label, at_most=at_most,
+                    reward=reward, penalties_from_s=penalties_from_s, label=label, at_most=largest,
                 )  # fmt: skip
                 rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
                 print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)
@@ -104,50 +103,53 @@ def evaluate(
     robot may be a name or a settings file. Without ``compute`` the CPU crosses. ``seed`` is of bootstraps, ``cache`` a
     folder where crossings are stored and found again.
     """
-    robot, compute = get_robot(robot), compute or Compute()
+    robot = get_robot(robot)
     sets = sets or make_sets((), _SMALL[0], seed)
     controllers = {name: spec_of(policy, robot) for name, policy in controllers.items()}
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
     scales = read_penalty_scales(robot, others[0] if others else None)
-    results = cross_sets(
-        controllers, sets, robot=robot, compute=compute, episodes=episodes, reward=True, cache=cache,
-    )  # fmt: skip
-    crossed = {
+    results = cross_sets(controllers, sets, robot, compute or Compute(), episodes, reward=True, cache=cache)
+    performances = {
         name: {controller: measure(result, scales) for controller, result in row.items()}
         for name, row in results.items()
     }
     about = about_controllers(controllers, robot)
-    return make_tables(crossed, sets, robot, controllers=about, episodes=episodes, seed=seed)
+    return make_tables(performances, sets, robot, controllers=about, episodes=episodes, seed=seed)
 
 
 def evaluate_tables(
-    robot: RobotCfg,
-    controllers: Mapping[str, str],
-    cfg: SetsCfg,
-    *,
-    compute: Compute,
-    out: Path | None = None,
+    robot: RobotCfg, controllers: Mapping[str, str], cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
-    """The tables of controllers with where their terrains come from; prints and writes them, by default under runs/."""
-    terrains, episodes = sizes_for(
+    """The tables of controllers with where their terrains come from; prints and writes them, by default under runs/.
+
+    If the controllers are ``old`` and ``new``, they are compared on elites that neither was trained on.
+    """
+    compares = {*controllers} == {"old", "new"}
+    if compares:
+        if cfg.archive is None:
+            raise ValueError("old and new are compared on elites: give --archive RUN, or other names for tables")
+        if cfg.sets or cfg.independent:
+            raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
+        controllers = {name: controllers[name] for name in ("old", "new")}
+    check_seeds(controllers)
+    terrains, episodes = fill_sizes(
         compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL
     )
     archive = independent = None
-    about: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
+    origin: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
     if cfg.archive is not None:
         archive = read_elites(cfg.archive, robot, cfg.space)
-        split = split_elites(archive)
-        parts = {"train": len(split.train), "validation": len(split.validation), "test": len(split.test)}
-        about |= {"archive": _about(cfg.archive, archive) | parts, "archive_sha256": _file_sha256(cfg.archive)}
+        sizes = {name: len(rows) for name, rows in vars(split_elites(archive)).items()}
+        origin["archive"] = _describe_archive(cfg.archive, archive) | sizes
+        origin["archive_sha256"] = _hash_archive(cfg.archive)
     if cfg.independent is not None:
         independent = read_independent(cfg.independent, cfg.archive, robot, cfg.space)
-        search = {"search_seed": search_seed(cfg.independent), "sha256": _file_sha256(cfg.independent)}
-        about["independent"] = _about(cfg.independent, independent) | search
+        search = {"search_seed": search_seed(cfg.independent), "sha256": _hash_archive(cfg.independent)}
+        origin["independent"] = _describe_archive(cfg.independent, independent) | search
     space = space_at(load_space(cfg.space), None, robot)
-    check_seeds(controllers)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
-    if cfg.sets == (COMPARED,) and archive is not None:
+    if compares and archive is not None:
         sets = {COMPARED: _untrained_elites(archive, controllers, terrains, cfg)}
     else:
         sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent, space=space)
@@ -155,21 +157,21 @@ def evaluate_tables(
         check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for the test")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
         check_untrained(controllers, independent.genes, str(cfg.independent))
-    file, show = ("compared.json", show_comparison) if COMPARED in sets else ("tables.json", show_tables)
 
-    def make() -> dict[str, Any]:
+    def make_report() -> dict[str, Any]:
+        cache = crossings_folder(robot)
         tables = evaluate(
-            controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed,
-            cache=crossings_folder(robot),
-        )  # fmt: skip
-        return {**compute.origin(cfg.seed), **robot_identity(robot), "space": space.name, **about, **tables}
+            controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed, cache=cache
+        )
+        return {**compute.origin(cfg.seed), **robot_identity(robot), "space": space.name, **origin, **tables}
 
-    return publish(out or RUNS / f"{robot.name}-tables" / file, make, show)
+    file, show = ("compared.json", show_comparison) if compares else ("tables.json", show_tables)
+    return publish(out or RUNS / f"{robot.name}-tables" / file, make_report, show)
 
 
 def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: int, cfg: SetsCfg) -> TerrainSet:
     """Elites that no controller was trained on, of families enough to tell how far a difference may be chance."""
-    trained_on = set().union(*map(recorded_marks, controllers.values()))
+    trained_on = set().union(*map(read_trained_on, controllers.values()))
     elites = random_elites(COMPARED, archive, count, cfg.seed, trained_on)
     families = 0 if elites.families is None else len(np.unique(elites.families))
     if families < 2:
@@ -180,11 +182,11 @@ def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: i
     return elites
 
 
-def _about(path: Path, archive: Archive) -> dict[str, Any]:
+def _describe_archive(path: Path, archive: Archive) -> dict[str, Any]:
     return {"path": str(path), "elites": len(archive), "iterations": archive.iterations}
 
 
-def _file_sha256(run: Path) -> str:
+def _hash_archive(run: Path) -> str:
     return hashlib.sha256((run / ARCHIVE_FILE if run.is_dir() else run).read_bytes()).hexdigest()
 
 
@@ -204,15 +206,15 @@ def evaluate_rates(
     Without ``terrains`` (a set) and ``episodes`` (a terrain) there are as many as suit the device; without ``out`` the
     file lies under runs/. Returns what ``base.json`` has.
     """
-    count, episodes = sizes_for(compute, terrains, episodes, full=(300, EPISODES), small=_SMALL)
+    count, episodes = fill_sizes(compute, terrains, episodes, full=(300, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)
-    drawn_in = space_at(load_space(space), None, robot)
-    sets = {name: plain_set(name, count, seed, drawn_in) for name in ("hand_crafted", "hard_random", "flat")}
+    terrain_space = space_at(load_space(space), None, robot)
+    sets = {name: plain_set(name, count, seed, terrain_space) for name in ("hand_crafted", "hard_random", "flat")}
     controller = crosser_name(robot, policy)
 
-    def make() -> dict[str, Any]:
+    def make_report() -> dict[str, Any]:
         results = cross_sets(
-            {controller: policy}, sets, robot=robot, compute=compute, episodes=episodes,
+            {controller: policy}, sets, robot, compute, episodes,
             penalties_from_s=VELOCITY_FROM_S, cache=crossings_folder(robot),
         )  # fmt: skip
         hand_crafted, hard_random, flat = (results[name][controller] for name in sets)
@@ -220,10 +222,10 @@ def evaluate_rates(
         return {
             **compute.origin(seed),
             **identity(robot, policy),
-            "space": drawn_in.name,
+            "space": terrain_space.name,
             "hand_crafted": summarise(hand_crafted, seed, types=types, levels=levels),
             "hard_random": summarise(hard_random, seed),
             "flat": velocity_error(flat, seed),
         }
 
-    return publish(out or RUNS / f"{controller}-rates.json", make, show_rates)
+    return publish(out or RUNS / f"{controller}-rates.json", make_report, show_rates)

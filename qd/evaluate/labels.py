@@ -1,4 +1,4 @@
-"""Words for what an evaluation reports: sets of terrains, measures, and what became of a terrain; settings of sets."""
+"""Labels of what an evaluation reports: sets of terrains, measures, and what became of a terrain; settings of sets."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,18 +18,18 @@ SETS = {
     "generated_far": "generated, farthest third",
     INDEPENDENT: "generated, another search",
 }
-"""Sets of the tables, in words."""
+"""Label of each set of the tables."""
 MEASURES = {
     "goal": "goal reached",
     "success": "no base collision",
     "fallen": "fallen",
     "reward": "training reward",
 }
-"""Measures beside the penalties, in words: three rates as fractions, and the sum of the reward over 20 s. No base
+"""Label of each measure beside the penalties: three rates as fractions, and the sum of the reward over 20 s. No base
 collision is what the paper calls success."""
 CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}
 """Measures on the certified terrains of a set alone, by what they measure."""
-RATES = ("goal", "success", "fallen", *CERTIFIED)
+RATES = ("goal", "success", "fallen")
 """Measures that lie between 0 and 1, and so do their intervals."""
 FATES = {fate: fate.replace("_", " ") for fate in ("mended", "still_failing", "newly_broken", "fine")}
 """What may have become of a terrain from one controller to another: failed by the first, both, the second, neither."""

@@ -17,13 +17,13 @@ TRAINED_ON = "trained_on"
 _LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
 
 
-def marks_of(genes: NDArray[np.float32]) -> list[str]:
+def hash_elites(genes: NDArray[np.float32]) -> list[str]:
     """A short mark of each elite that depends on its genes, shape (E, num_genes), alone."""
     rows = np.ascontiguousarray(genes, np.float32)
     return [hashlib.sha256(row.tobytes()).hexdigest()[:_LENGTH] for row in rows]
 
 
-def recorded_marks(policy: str) -> set[str]:
+def read_trained_on(policy: str) -> set[str]:
     """Marks of the elites that a controller was trained on, by its file and the record beside it; none if none are."""
     marks: set[str] = set()
     for file in ControllerSpec.parse(policy).files:
@@ -47,9 +47,9 @@ def _content_of(file: Path) -> dict[str, Any]:
 
 def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:
     """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on."""
-    marks = marks_of(genes)
+    marks = hash_elites(genes)
     for name, policy in controllers.items():
-        count = len(recorded_marks(policy).intersection(marks))
+        count = len(read_trained_on(policy).intersection(marks))
         if count:
             raise ValueError(
                 f"{name} must not be tested on what it was trained on, got {count} of the {len(marks)} elites of "

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from kernels.episode import Outcome
+from qd.evaluate.labels import CERTIFIED
 from qd.evaluate.labels import RATES as RATE_MEASURES
 from sim.files.intervals import DIFFERENCES, RATES, bootstrap_interval
 from sim.rates import counted_episodes, terrain_means
@@ -20,7 +21,7 @@ VELOCITY_FROM_S = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measured:
+class Performance:
     """What one controller made of T terrains; NaN on an invalid terrain, of which over a quarter of the episodes are.
 
     Statistics are over the valid episodes of a terrain.
@@ -45,23 +46,23 @@ Families = NDArray[np.int64] | None
 """Number of each terrain's family of kin, shape (T,); None of independent terrains."""
 
 
-def mean_of(values: NDArray[np.float64]) -> float | None:
+def valid_mean(values: NDArray[np.float64]) -> float | None:
     """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if len(known) else None
 
 
-def interval_of(
+def valid_interval(
     values: NDArray[np.float64], seed: int, families: Families, bounds: tuple[float, float] | None
 ) -> list[float] | None:
-    """95 % interval of :func:`mean_of`: bootstrap over terrains, or over their families."""
+    """95 % interval of :func:`valid_mean`: bootstrap over terrains, or over their families."""
     known = ~np.isnan(values)
-    return bootstrap_interval(values[known], seed, families=of_terrains(families, known), bounds=bounds)
+    return bootstrap_interval(values[known], seed, families=select_families(families, known), bounds=bounds)
 
 
-def bounds_of(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
+def measure_bounds(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
     """Where a measure lies, or differences of it; None of one without bounds."""
-    return (DIFFERENCES if differences else RATES) if measure in RATE_MEASURES else None
+    return (DIFFERENCES if differences else RATES) if CERTIFIED.get(measure, measure) in RATE_MEASURES else None
 
 
 def kind_mean(
@@ -86,8 +87,8 @@ def kind_mean(
         return None
     of_seeds = [sign * kind[:, known] for sign, kind in zip((1.0, -1.0), values, strict=False)]
     on_terrains = np.sum([kind.mean(axis=0) for kind in of_seeds], axis=0)
-    bounds = bounds_of(measure, differences=len(of_seeds) > 1)
-    limits = interval_of(on_terrains, seed, of_terrains(families, known), bounds)
+    bounds = measure_bounds(measure, differences=len(of_seeds) > 1)
+    limits = valid_interval(on_terrains, seed, select_families(families, known), bounds)
     parts = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in of_seeds if len(kind) > 1]
     of_families = 0.0 if limits is None else ((limits[1] - limits[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2
     variance = of_families + sum(part for part, _ in parts)
@@ -102,7 +103,7 @@ def kind_mean(
     return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in of_seeds]}
 
 
-def of_terrains(families: Families, chosen: NDArray[np.bool_]) -> Families:
+def select_families(families: Families, chosen: NDArray[np.bool_]) -> Families:
     """Families of some of the terrains."""
     return None if families is None else families[chosen]
 
@@ -114,13 +115,13 @@ def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
     return {name: terrain_means(hit, counted) for name, hit in hits.items()}
 
 
-def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
+def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
     """Everything that the tables say of crossings with their reward; ``scales`` are of the penalties in order."""
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
     counted = counted_episodes(result.invalid)
     names = zip(result.penalty_names, scales, strict=True)
-    return Measured(
+    return Performance(
         values={**terrain_rates(result), "reward": terrain_means(result.reward, counted)},
         penalties={
             name: terrain_means(result.penalties[..., column] / scale, counted)
@@ -132,7 +133,7 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Measured:
 
 
 def _group(rates: dict[str, np.ndarray], members: np.ndarray) -> dict[str, Any]:
-    return {"terrains": int(members.sum())} | {name: mean_of(values[members]) for name, values in rates.items()}
+    return {"terrains": int(members.sum())} | {name: valid_mean(values[members]) for name, values in rates.items()}
 
 
 def summarise(
@@ -142,7 +143,7 @@ def summarise(
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
     everywhere = np.ones(len(result.outcome), bool)
     summary = _group(rates, everywhere)
-    summary |= {f"{name}_interval": interval_of(values, seed, None, RATES) for name, values in rates.items()}
+    summary |= {f"{name}_interval": valid_interval(values, seed, None, RATES) for name, values in rates.items()}
     summary["episodes"] = int(result.outcome.size)
     ends = [outcome for outcome in Outcome if outcome != Outcome.TILT]
     summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in ends}

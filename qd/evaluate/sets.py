@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
-from qd.evaluate.marks import marks_of
+from qd.evaluate.marks import hash_elites
 from qd.faults.families import families_of, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_archive_of, search_seed
@@ -151,7 +151,7 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
         raise ValueError(f"independent must be a search that found something, got {path} without elites")
     if archive_path is not None:
         archive, seed = read_elites(archive_path, robot, space), search_seed(path)
-        shared = len({*marks_of(independent.genes)} & {*marks_of(archive.genes)})
+        shared = len({*hash_elites(independent.genes)} & {*hash_elites(archive.genes)})
         other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)
         if other_space or shared or (seed is not None and seed == search_seed(archive_path)):
             raise ValueError(
@@ -201,20 +201,20 @@ def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on
     rng = set_rng(name, seed)
     rows = _in_order_of_genes(archive)[rng.permutation(len(archive))]
     seeds = _episode_seeds(rng, len(archive))
-    untrained = ~np.isin(marks_of(archive.genes[rows]), [*trained_on])
+    untrained = ~np.isin(hash_elites(archive.genes[rows]), [*trained_on])
     return _set_of_elites(archive, rows[untrained][:count], seeds[untrained][:count])
 
 
 def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
     """Their families are those in the whole archive, where it was judged: kin of kin may not be in the set."""
-    elites, space = archive.rows(rows), space_of(archive)
+    elites, space = archive.rows(rows), read_space(archive)
     families = families_of(elites.genes, space) if elites.family is None else elites.family
     return TerrainSet(
         terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families, elites=elites
     )
 
 
-def space_of(archive: Archive) -> TerrainSpace:
+def read_space(archive: Archive) -> TerrainSpace:
     """What an archive's genes mean."""
     return get_space(archive.space, archive.space_sha256)
 
@@ -270,7 +270,7 @@ def make_sets(
         sets["generated"] = whole = generated_set(archive, count, seed, part)
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
-            distance = nearest_distance(whole.terrains, training_genes, space_of(archive))
+            distance = nearest_distance(whole.terrains, training_genes, read_space(archive))
             sets["generated_far"] = far_third(whole, distance)
     if independent is not None and INDEPENDENT in names:
         sets[INDEPENDENT] = random_elites(INDEPENDENT, independent, count, seed)

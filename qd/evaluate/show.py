@@ -8,14 +8,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from qd.evaluate.labels import COMPARED, MEASURES, SETS
+from qd.evaluate.labels import COMPARED, MEASURES, RATES, SETS
 from qd.evaluate.tables import is_regression
 from sim.files.command import say
 from sim.files.intervals import value_words
 
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
-_RATES = ("goal", "success", "fallen")
 
 
 def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -35,7 +34,7 @@ def _heads(measures: Iterable[str]) -> list[str]:
 
 
 def _rate_cells(row: Mapping[str, Any]) -> list[str]:
-    return [value_words(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in _RATES]
+    return [value_words(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in RATES]
 
 
 def show_rates(report: dict[str, Any]) -> None:
@@ -45,7 +44,7 @@ def show_rates(report: dict[str, Any]) -> None:
         parts = {f"  {key}": part for key, part in (group["by_type"] or {}).items()}
         parts |= {f"  level {key}": part for key, part in (group["by_level"] or {}).items()}
         rows += [(key, *_rate_cells(part), part["terrains"]) for key, part in ({label: group} | parts).items()]
-    show_table(report["policy"], (*_heads(_RATES), "terrains"), rows)
+    show_table(report["policy"], (*_heads(RATES), "terrains"), rows)
     error = value_words(report["flat"]["vx_error_mean"], None)
     print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
 
@@ -108,4 +107,4 @@ def _show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
          f"{row['failing_families']} of {row['families']}")
         for name, row in rates.items()
     ]  # fmt: skip
-    show_table(title, (*_heads(_RATES), "fails", "families"), rows)
+    show_table(title, (*_heads(RATES), "fails", "families"), rows)

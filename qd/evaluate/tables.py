@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES
-from qd.evaluate.measures import Measured, bounds_of, interval_of, kind_mean, mean_of, of_terrains
+from qd.evaluate.measures import Performance, kind_mean, measure_bounds, select_families, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet
 from qd.search.fitness import FAILING_GOAL_RATE
 from sim.controllers.spec import controller_hash
@@ -45,7 +45,7 @@ Tables = dict[str, Any]
 _MEASURES = (*MEASURES, *CERTIFIED)
 
 Value = TypeVar("Value")
-Crossed = Mapping[str, Mapping[str, Measured]]
+Crossed = Mapping[str, Mapping[str, Performance]]
 """Set -> controller -> what it made of the set's terrains."""
 
 
@@ -85,7 +85,7 @@ def make_tables(
     seed: int,
 ) -> Tables:
     """Everything that the tables say of crossings."""
-    means = _statistics(crossed, sets, lambda values, *_: mean_of(values))
+    means = _statistics(crossed, sets, lambda values, *_: valid_mean(values))
     return {
         "robot": robot.name,
         "episodes": episodes,
@@ -93,7 +93,7 @@ def make_tables(
         **means,
         "certified": _about_certified(sets, controllers),
         "over_seeds": over_seeds(crossed, sets, seed),
-        "intervals": _statistics(crossed, sets, lambda values, *about: interval_of(values, seed, *about)),
+        "intervals": _statistics(crossed, sets, lambda values, *about: valid_interval(values, seed, *about)),
         "terrains": {name: len(terrains) for name, terrains in sets.items()},
         "differences": {
             name: {
@@ -111,7 +111,7 @@ def _statistics(crossed: Crossed, sets: Mapping[str, TerrainSet], statistic: Cal
     for name, row in crossed.items():
         families = sets[name].families
         for key, measure, member in _groups(sets[name]):
-            about = of_terrains(families, member), bounds_of(measure)
+            about = select_families(families, member), measure_bounds(measure)
             tables[key][name] = {
                 who: statistic(measured.values[measure][member], *about) for who, measured in row.items()
             }
@@ -153,10 +153,10 @@ def _about_certified(
     return certified
 
 
-def difference(before: Measured, after: Measured, terrains: TerrainSet, seed: int) -> dict[str, Any]:
+def difference(before: Performance, after: Performance, terrains: TerrainSet, seed: int) -> dict[str, Any]:
     """What became of each terrain of a set from one controller to another, and what the second gains in the mean."""
     both = before.valid & after.valid
-    kin = of_terrains(terrains.families, both)
+    kin = select_families(terrains.families, both)
     fails, then_fails = (both & (rates.values["goal"] < FAILING_GOAL_RATE) for rates in (before, after))
     limits, then_limits = _wilson_limits(before), _wilson_limits(after)
     apart = (limits[:, 1] < then_limits[:, 0]) | (then_limits[:, 1] < limits[:, 0])
@@ -173,7 +173,10 @@ def difference(before: Measured, after: Measured, terrains: TerrainSet, seed: in
         "newly_broken": {**changed(broken), "clear": int((broken & apart).sum())},
         "fine": {"count": int((both & ~fails & ~then_fails).sum())},
         "gain": {
-            name: {"mean": mean_of(gain), "interval": interval_of(gain, seed, kin, bounds_of(name, differences=True))}
+            name: {
+                "mean": valid_mean(gain),
+                "interval": valid_interval(gain, seed, kin, measure_bounds(name, differences=True)),
+            }
             for name, gain in gains.items()
         },
     }
@@ -182,13 +185,15 @@ def difference(before: Measured, after: Measured, terrains: TerrainSet, seed: in
 def is_regression(tables: Mapping[str, Any]) -> bool:
     """Whether the goal rate's difference of :data:`COMPARED` elites, new minus old, has an interval wholly below 0.
 
-    A terrain that newly fails alone is no regression, since among hundreds some do by chance.
+    A terrain that newly fails alone is no regression, since among hundreds some do by chance. Tables of other sets and
+    controllers have none.
     """
-    limits = tables["differences"][COMPARED]["old -> new"]["gain"]["goal"]["interval"]
-    return limits is not None and limits[1] < 0.0
+    pairs = tables["differences"].get(COMPARED)
+    interval = pairs["old -> new"]["gain"]["goal"]["interval"] if pairs else None
+    return interval is not None and interval[1] < 0.0
 
 
-def _wilson_limits(measured: Measured) -> NDArray[np.float64]:
+def _wilson_limits(measured: Performance) -> NDArray[np.float64]:
     """Interval of the goal rate on each terrain, shape (T, 2); anything possible on an invalid one."""
     counts = zip(measured.goals.tolist(), measured.episodes.tolist(), strict=True)
     return np.array([wilson_interval(goals, episodes) for goals, episodes in counts])
@@ -233,8 +238,8 @@ def over_seeds(crossed: Crossed, sets: Mapping[str, TerrainSet], seed: int) -> d
         for kind, of_kind in several.items():
             for key, measure, member in _groups(sets[name]):
                 values = np.array([measured.values[measure][member] for measured in of_kind])
-                mean = kind_mean([values], of_terrains(sets[name].families, member), seed, measure)
+                mean = kind_mean([values], select_families(sets[name].families, member), seed, measure)
                 summary = {part: mean and mean[part] for part in ("mean", "interval")}
-                summary["values"] = [mean_of(of_one) for of_one in values]
+                summary["values"] = [valid_mean(of_one) for of_one in values]
                 summaries.setdefault(key, {}).setdefault(name, {})[kind] = summary
     return summaries

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.faults.families import causes_of, elites_of, families_of
 from qd.faults.numbers import EPISODES, FRESH_EPISODES, OF_VARIED, fault_numbers, found_numbers, fresh_numbers
 from qd.search.archive import ARCHIVE_FILE, Archive, FreshValues, goal_rates, read_archive, write_archive
@@ -251,11 +251,11 @@ def seen_by(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[s
 
     None if the training record of one of them is not at hand.
     """
-    marks, columns = np.array(marks_of(archive.genes)), []
+    marks, columns = np.array(hash_elites(archive.genes)), []
     for name in archive.counts.certifiers:
         if (policy := certifiers.get(name)) is None:
             return None
-        trained_on, files = recorded_marks(policy), ControllerSpec.parse(policy).files
+        trained_on, files = read_trained_on(policy), ControllerSpec.parse(policy).files
         if not trained_on and not any(file.with_suffix(".train.json").is_file() for file in files):
             return None
         columns.append(np.isin(families, families[np.isin(marks, [*trained_on])]))

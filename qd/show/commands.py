@@ -173,18 +173,22 @@ class Export(ControllerFlags, EliteFlags):
         export_terrains(source, formats=split_words(self.formats), out=self.out, overwrite=self.overwrite)
 
     def _make_pack(self) -> None:
-        from qd.evaluate.pack import make_pack
+        from qd.evaluate.make_pack import make_pack
+        from qd.faults.judge import find_search
         from qd.search.directory import find_run
         from qd.workers.evaluator import Compute
 
         making, robot = self.making, get_robot(self.robot or "anymal")
+        run = find_run(robot, self.run, published="never")
         make_pack(
-            find_run(robot, self.run, published="never"),
+            find_search(run, robot=self.robot, policy=self.policy, space=self.space),
             controllers_of(making.controllers, robot) if making.controllers else {},
-            compute=Compute.resolve(making.device, making.workers, making.num_envs), robot=self.robot,
-            policy=self.policy, space=self.space, size=making.size, episodes=making.episodes, seed=making.seed,
+            compute=Compute.resolve(making.device, making.workers, making.num_envs),
+            size=making.size,
+            episodes=making.episodes,
+            seed=making.seed,
             out=self.out,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qd.evaluate.pack import PACK_FILE, pack_folder, read_pack
+from qd.evaluate.pack import PACK_FILE, find_pack, read_pack
 from qd.faults.families import VERDICTS, Ranking, rank
 from qd.faults.minimise.results import read_minimal
 from qd.search.archive import Archive
@@ -78,7 +78,7 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | Non
 
 def source_of_pack(named: str, places: str = "all", robot: str | None = None) -> Source:
     """Terrains of a pack."""
-    folder = pack_folder(named)
+    folder = find_pack(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
     rows = chosen_elites(places, range(len(pack.terrains)), f"{folder} has no place")

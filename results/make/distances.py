@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.marks import marks_of, recorded_marks
-from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, space_of, split_elites
+from qd.evaluate.marks import hash_elites, read_trained_on
+from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, read_space, split_elites
 from results.make.common import parse, published_controllers
 
 
@@ -18,13 +18,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures every set's terrains on the CPU."""
     script = parse(__doc__, argv, "distances.json")
     archive, independent = script.read_archive(), script.read_archive("independent")
-    genes, marks = archive.genes[split_elites(archive).train], recorded_marks(published_controllers(script)["C-G"])
-    trained_on = genes[[mark in marks for mark in marks_of(genes)]][: 20 if script.small else None]
+    genes, marks = archive.genes[split_elites(archive).train], read_trained_on(published_controllers(script)["C-G"])
+    trained_on = genes[[mark in marks for mark in hash_elites(genes)]][: 20 if script.small else None]
     count = 5 if script.small else paper_terrains(script.robot.name)
     names = ("hard_random", "generated", "generated_far", "generated_independent")
-    sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=space_of(archive))
+    sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=read_space(archive))
     nearest = {
-        name: nearest_distance(terrains.terrains, trained_on, space_of(archive)) for name, terrains in sets.items()
+        name: nearest_distance(terrains.terrains, trained_on, read_space(archive)) for name, terrains in sets.items()
     }
     return script.write(
         {

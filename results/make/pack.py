@@ -5,8 +5,8 @@ They are of the independent search, which no published controller has trained on
 
 from collections.abc import Sequence
 
-from qd.evaluate.pack import make_pack
-from qd.faults.judge import judge
+from qd.evaluate.make_pack import make_pack
+from qd.faults.judge import find_search, judge
 from results.make.common import parse, published_controllers
 
 
@@ -18,9 +18,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not script.small:
         judge(run, stages=("resolved", "others"), compute=script.compute)
     make_pack(
-        run, published_controllers(script), compute=script.compute, size=size, episodes=episodes,
-        seed=script.seed, out=script.out.parent,
-    )  # fmt: skip
+        find_search(run),
+        published_controllers(script),
+        compute=script.compute,
+        size=size,
+        episodes=episodes,
+        seed=script.seed,
+        out=script.out.parent,
+    )
 
 
 if __name__ == "__main__":

@@ -58,6 +58,11 @@ def check(settings: Any) -> None:
         raise ValueError("; ".join(lines))
 
 
+def select_settings(cls: type[Settings], flags: Any) -> Settings:
+    """The settings of a dataclass alone, from an object that has fields of the same names among others."""
+    return cls(**{setting.name: getattr(flags, setting.name) for setting in fields(cls)})  # pyright: ignore[reportArgumentType]
+
+
 def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     """A settings dataclass of JSON values by the names of its fields; an error calls it ``name``."""
     try:

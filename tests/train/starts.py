@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from qd.evaluate.marks import TRAINED_ON, marks_of
+from qd.evaluate.marks import TRAINED_ON, hash_elites
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 
@@ -35,5 +35,5 @@ def write_actor(path, *, hidden=(16, 8), critic=False, critic_hidden=None, **ext
 def write_trained(folder: Path, genes: np.ndarray) -> Path:
     """A controller whose record says that it was trained on elites, genes of shape (num_elites, num_genes)."""
     path = write_actor(folder / "tuned.pt")
-    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: marks_of(genes)}))
+    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: hash_elites(genes)}))
     return path

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.evaluate.sets import split_elites
 from qd.search.archive import write_archive
 from sim.controllers.loaders import load_policy
@@ -91,8 +91,8 @@ def test_a_run_leaves_a_controller_and_its_record(places, finished):
     assert settings["ppo"]["hidden_dims"] == [16, 8] and settings["task"]["crosses"]
     assert record["env_steps"] == 3 * 4 * 6 and record["critic_iterations"] == 1
     archive = make_archive(10)
-    train = marks_of(archive.genes[split_elites(archive).train])
-    assert recorded_marks(str(finished / "policy.pt")) == set(train) == set(record["trained_on"])
+    train = hash_elites(archive.genes[split_elites(archive).train])
+    assert read_trained_on(str(finished / "policy.pt")) == set(train) == set(record["trained_on"])
 
 
 def test_it_goes_on_with_the_same_terrains_by_equal_settings_alone(places, finished):
@@ -191,8 +191,8 @@ def test_archives_are_trained_on_together_but_for_what_any_of_them_holds_out(pla
     assert [space.name for space in elites.spaces] == ["super_gaussian", "super_gaussian", "course"]
     assert len(elites.genes[2]) == 7  # two of ten are in the test and one validates
     split = split_elites(whole)
-    held_out = set(marks_of(whole.genes[np.concatenate([split.test, split.validation])]))
-    assert not any(held_out & set(marks_of(part)) for part in elites.genes)
+    held_out = set(hash_elites(whole.genes[np.concatenate([split.test, split.validation])]))
+    assert not any(held_out & set(hash_elites(part)) for part in elites.genes)
 
 
 def test_a_space_of_ones_own_runs_only_where_it_is_named(places, tmp_path, monkeypatch):
@@ -218,13 +218,13 @@ def searched(places):
 
 def test_which_elites_are_trained_on(places, searched):
     genes, archive = make_archive(10).genes, (str(searched),)
-    train = set(marks_of(genes[split_elites(make_archive(10)).train]))
+    train = set(hash_elites(genes[split_elites(make_archive(10)).train]))
     for only, count in (("all", 10), ("failing", 8)):
         marks = {
-            held: set(marks_of(elites_of(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held)).genes[0]))
+            held: set(hash_elites(elites_of(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held)).genes[0]))
             for held in (True, False)
         }
-        assert marks[False] == set(marks_of(genes[:count]))
+        assert marks[False] == set(hash_elites(genes[:count]))
         assert marks[True] == train & marks[False]
     elites = elites_of(ROBOT, cfg_of(places, archive=archive, only="failing"))
     assert elites.goal_rate is not None and set(elites.goal_rate) == {0.1}
@@ -247,7 +247,7 @@ def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, s
     path = searched / "certifiers" / "specialist.pt"
     record = json.loads(path.with_suffix(".train.json").read_text())
     assert record["iterations"] == 2 and len(record["pieces"]) == 2 and record["seed"] == 7
-    assert set(record["trained_on"]) == set(marks_of(make_archive(10).genes[:8]))
+    assert set(record["trained_on"]) == set(hash_elites(make_archive(10).genes[:8]))
     assert record["settings"]["policy"] == str(places / "start.pt")
     assert controller_hash(path) == controller_hash(searched / "specialist" / "policy.pt")
     other = replace(FinetuneCfg.specialist(ROBOT), policy=str(write_actor(places / "other.pt", hidden=(8, 8))))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from qd.evaluate.marks import marks_of, recorded_marks
+from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.evaluate.sets import generated_set, make_sets, split_elites
 from qd.search.archive import read_archive, write_archive
 from qd.workers.evaluator import Compute
@@ -180,11 +180,14 @@ def test_the_choice_is_by_terrains_that_are_neither_reported_nor_trained_on(hard
     assert list(content["choices"]["tune-1"]["goal"]["after"]) == ["hand_crafted", "hard_random", "elites"]
     archive = read_archive(place / "run" / "search-0")
     validation = split_elites(archive).validation
-    assert set(marks_of(seen["search-0"].terrains)) == set(marks_of(archive.genes[validation]))
+    assert set(hash_elites(seen["search-0"].terrains)) == set(hash_elites(archive.genes[validation]))
     reported = make_sets(("hand_crafted", "hard_random"), 3, 0)
     assert not any(np.array_equal(seen[name].terrains, reported[name].terrains) for name in reported)
-    tested, trained = marks_of(generated_set(archive, 3, 0).terrains), recorded_marks(f"{place}/run/tune-1/policy.pt")
-    assert trained and not {*tested, *trained} & set(marks_of(seen["search-0"].terrains))
+    tested, trained = (
+        hash_elites(generated_set(archive, 3, 0).terrains),
+        read_trained_on(f"{place}/run/tune-1/policy.pt"),
+    )
+    assert trained and not {*tested, *trained} & set(hash_elites(seen["search-0"].terrains))
     assert not set(tested) & trained
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from qd.evaluate.measures import Measured, measure
+from qd.evaluate.measures import Performance, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Tables, make_tables
 from sim.robots.find import get_robot
@@ -17,7 +17,7 @@ def make_set(count: int, first: int = 0) -> TerrainSet:
     return replace(plain_set("hard_random", count, 0), numbers=np.arange(first, first + count))
 
 
-def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, bad: Sequence[int] = ()) -> Measured:
+def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, bad: Sequence[int] = ()) -> Performance:
     """A controller that reached the goal in so many of ``of`` episodes of each terrain; ``bad`` ones are invalid."""
     rows = [[GOAL] * count + [HIT if count % 2 else LATE] * (of - count) for count in goals]
     for terrain in bad:

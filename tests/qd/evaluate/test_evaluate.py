@@ -9,9 +9,11 @@ import pytest
 
 from qd.commands import Evaluate
 from qd.evaluate import evaluate as evaluation
+from qd.evaluate import tables
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
+from qd.evaluate.tables import is_regression
 from qd.search.archive import write_archive
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
@@ -123,13 +125,19 @@ def test_errors_come_before_any_work_in_one_line(archive, flags, field, monkeypa
     assert field in line and not Path("runs").exists()
 
 
-@pytest.mark.parametrize(("gain", "status", "order"), [(0.1, 0, 1), (-0.1, 1, -1)])  # named in either order
-def test_ci_fails_on_a_regression(archive, monkeypatch, gain, status, order):
-    def evaluated(robot, controllers, cfg, **_):
-        assert [*controllers] == ["old", "new"] and cfg.seed == 3
-        return {"differences": {"elites": {"old -> new": {"gain": {"goal": {"interval": [-0.5, gain]}}}}}}
+@pytest.mark.parametrize(("worse", "names"), [(STAND, ("old", "new")), (STRETCH, ("new", "old"))])
+def test_a_regression_is_a_goal_rate_below_that_of_before(anymal, archive, worse, names):
+    robots = Robots(lambda cfg, terrains, seeds: np.full(len(seeds), cfg.policy == worse))
+    policies = {"old": STAND, "new": STRETCH}
+    report = tables_of(anymal, robots, {name: policies[name] for name in names}, archive=archive)
+    assert is_regression(report) == (worse == STRETCH) and list(report["controllers"]) == ["old", "new"]
+    assert json.loads(Path("runs/anymal-tables/compared.json").read_text()) == json.loads(json.dumps(report))
+    assert not is_regression(tables_of(anymal, robots, {"base": STAND}, sets=("hand_crafted",)))
 
-    monkeypatch.setattr(evaluation, "evaluate_tables", evaluated)
-    named = ["old=shipped", "new=C-G.pt"][::order]
-    flags = ["--policies", *named, "--archive", "archive.npz", "--seed", "3", "--device", "cpu"]
-    assert run_command(Evaluate, flags, name="evaluate") == status
+
+@pytest.mark.parametrize("status", [0, 1])
+def test_the_exit_status_says_whether_it_is_a_regression(archive, monkeypatch, status):
+    monkeypatch.setattr(evaluation, "evaluate_tables", lambda robot, controllers, cfg, **_: cfg)
+    monkeypatch.setattr(tables, "is_regression", lambda cfg: type(cfg) is SetsCfg and cfg.seed == 1)
+    flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--seed", str(status)]
+    assert run_command(Evaluate, [*flags, "--device", "cpu"], name="evaluate") == status

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from qd.evaluate.measures import (
-    interval_of,
     kind_mean,
-    mean_of,
     measure,
     summarise,
     terrain_rates,
+    valid_interval,
+    valid_mean,
     velocity_error,
 )
 from sim.files.intervals import t_interval
@@ -46,12 +46,12 @@ def test_everything_is_a_mean_over_valid_episodes():
 
 def test_means_and_intervals_leave_invalid_terrains_out():
     values = np.array([1.0, 0.0, np.nan, 1.0, 1.0])
-    assert mean_of(values) == 0.75 and mean_of(np.array([np.nan])) is None
-    low, high = interval_of(values, 0, None, None)
+    assert valid_mean(values) == 0.75 and valid_mean(np.array([np.nan])) is None
+    low, high = valid_interval(values, 0, None, None)
     assert 0.0 <= low < 0.75 < high == 1.0
     # Two families: all ones, and the single zero. A quarter of the resamples has the second alone.
-    assert interval_of(values, 0, np.array([0, 1, 2, 0, 0]), None) == [0.0, 1.0]
-    assert interval_of(values, 0, np.zeros(5, np.int64), None) is None  # one family says nothing of its spread
+    assert valid_interval(values, 0, np.array([0, 1, 2, 0, 0]), None) == [0.0, 1.0]
+    assert valid_interval(values, 0, np.zeros(5, np.int64), None) is None  # one family says nothing of its spread
 
 
 def test_means_of_kinds_hold_families_and_trainings():

@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 
 from qd.commands import Evaluate
+from qd.evaluate.make_pack import choose_terrains, make_pack
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
-    choose_terrains,
+    add_rates,
+    count_failing,
     evaluate_pack,
-    failing_by,
-    make_pack,
-    pack_folder,
+    find_pack,
     passes,
-    rates_over_all,
     read_pack,
     round_heights,
-    with_rates,
+    summarise_rates,
     write_terrains,
 )
-from qd.faults.judge import judge
+from qd.faults.judge import find_search, judge
 from qd.faults.minimise.minimise import minimise
 from qd.search.archive import read_archive
 from sim.files.command import run_command
@@ -30,8 +29,6 @@ from sim.robots.shipped import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
-
-GENES = np.zeros(64, np.float32)
 
 
 def fails(cfg, heights, seeds):
@@ -58,8 +55,7 @@ def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=
 )
 def test_what_comes_next(candidates, expected):
     for size in (9, 1):  # each beginning of a pack is one
-        chosen = choose_terrains([(about, GENES) for about in candidates], size)
-        assert [about["elite"] for about, _ in chosen] == expected[:size]
+        assert choose_terrains(candidates, size) == expected[:size]
 
 
 def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
@@ -67,35 +63,33 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     robots, base = Robots(fails), {"base": str(anymal.policy_file)}
 
     def make(controllers, **changes):
-        return make_pack(path, controllers, compute=compute_by(robots), out=Path("pack"), **changes)
+        return make_pack(find_search(path), controllers, compute=compute_by(robots), out=Path("pack"), **changes)
 
-    given = {"compute": compute_by(Robots(bump_stops))}
-    judge(path, stages=("resolved",), **given)
+    compute = compute_by(Robots(bump_stops))
+    judge(path, stages=("resolved",), compute=compute)
     with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
         make(base)
-    judge(path, stages=("others",), certifiers=OTHER, **given)
-    minimise(path, elite=" ".join(map(str, elites)), judged=True, certifiers=OTHER, **given)
-    with pytest.raises(ValueError, match="anymal"):
-        make(base, robot="cassie")
+    judge(path, stages=("others",), certifiers=OTHER, compute=compute)
+    minimise(path, elite=" ".join(map(str, elites)), judged=True, certifiers=OTHER, compute=compute)
     assert not Path("pack").exists() and not robots.opened
 
     content, archive = make(base | OTHER), read_archive(path)
     assert json.loads(Path("pack/pack.json").read_text()) == json.loads(json.dumps(content))
     assert {"command", "commit", "sources_sha256", "device", "versions", "seed", "date"} <= content.keys()
-    verdicts = [about["verdict"] for about in content["terrains"]]
-    minimal = [about for about in content["terrains"] if about["kind"] == "minimal"]
+    verdicts = [entry["verdict"] for entry in content["terrains"]]
+    minimal = [entry for entry in content["terrains"] if entry["kind"] == "minimal"]
     faults = int((archive.confirmed & archive.certified).sum())
     assert verdicts == sorted(verdicts) and verdicts.count("fault") == faults + 2
-    assert len(minimal) == 2 and all(about["parts"] == [4] and about["cause"] == "rise" for about in minimal)
-    for about in content["terrains"]:
-        assert about["searched"]["goal_rate"] < 0.75 and about["certificates"][0]["controller"] == "C-G"
-        assert about["rates"]["C-G"]["goal_rate"] == 1.0 and about["rates"]["base"]["valid_episodes"] == 20
+    assert len(minimal) == 2 and all(entry["parts"] == [4] and entry["cause"] == "rise" for entry in minimal)
+    for entry in content["terrains"]:
+        assert entry["searched"]["goal_rate"] < 0.75 and entry["certificates"][0]["controller"] == "C-G"
+        assert entry["rates"]["C-G"]["goal_rate"] == 1.0 and entry["rates"]["base"]["valid_episodes"] == 20
     assert (content["searched"], content["certifiers"]) == ("base", ["C-G"])
-    failing = sum(about["rates"]["base"]["goal_rate"] < 0.5 for about in content["terrains"])
+    failing = sum(entry["rates"]["base"]["goal_rate"] < 0.5 for entry in content["terrains"])
     assert content["rates"]["base"]["failing"] == failing
     few = make(OTHER, size=3)  # the first of the same; the searched controller is always among those that cross
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
-    assert [about["name"] for about in few["terrains"]] == [about["name"] for about in content["terrains"][:3]]
+    assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
 
 
@@ -108,11 +102,11 @@ def pack(tmp_path, anymal, monkeypatch):
     heights[2, :, 150:] = 0.5
     Path("pack").mkdir()
     chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
-    abouts = with_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
-    genes = np.array([np.full(64, about["elite"] / 100) for about in chosen], np.float32)
+    entries = add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
+    genes = np.array([np.full(64, entry["elite"] / 100) for entry in chosen], np.float32)
     content = {
-        **identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base", "terrains": abouts,
-        "rates": {"base": rates_over_all(abouts, "base", 0)},
+        **identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base", "terrains": entries,
+        "rates": {"base": summarise_rates(entries, "base", 0)},
         "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), genes),
     }  # fmt: skip
     Path("pack/pack.json").write_text(json.dumps(content))
@@ -120,14 +114,14 @@ def pack(tmp_path, anymal, monkeypatch):
 
 
 def test_a_pack_is_read_as_it_was_written(pack):
-    stored = read_pack(pack_folder("pack"))
+    stored = read_pack(find_pack("pack"))
     assert len(stored.terrains) == 3 and stored.terrains[1]["verdict"] == "near-fault"
     np.testing.assert_array_equal(stored.heights, round_heights(pack))
     assert np.abs(stored.heights - pack).max() <= HEIGHT_UNIT_M / 2 + 1e-6
     assert stored.genes[:, 0].tolist() == pytest.approx([0.03, 0.07, 0.09])
-    assert pack_folder("anymal") == ROBOTS["anymal"].pack and len(read_pack(pack_folder("cassie")).terrains) == 100
+    assert find_pack("anymal") == ROBOTS["anymal"].pack and len(read_pack(find_pack("cassie")).terrains) == 100
     with pytest.raises(FileNotFoundError, match="dog"):
-        pack_folder("dog")
+        find_pack("dog")
 
 
 @pytest.mark.parametrize("damage", ["npz", "other", "key"])
@@ -146,35 +140,38 @@ def test_a_damaged_pack_is_refused(pack, damage):
 
 def test_rates_over_a_pack_are_means_with_families_drawn_together():
     chosen = [candidate(elite, family=family) for elite, family in enumerate((0, 0, 1))]
-    abouts = with_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
-    rates = rates_over_all(abouts, "this", 0)
+    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
+    rates = summarise_rates(entries, "this", 0)
     assert rates["goal_rate"] == pytest.approx(2 / 3) and rates["success_rate"] == pytest.approx((1 + 1 + 0.5) / 3)
     assert (rates["failing"], rates["terrains"], rates["failing_families"], rates["families"]) == (1, 3, 1, 2)
     assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
-    assert failing_by("cause", abouts, "this") == {"ridge": {"terrains": 3, "failing": 1}}
+    assert count_failing(entries, "this", "cause") == {"ridge": {"terrains": 3, "failing": 1}}
     # An invalid terrain is in no rate.
-    abouts = with_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
-    rates = rates_over_all(abouts, "this", 0)
-    assert abouts[1]["rates"]["this"]["goal_rate"] is None
+    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
+    rates = summarise_rates(entries, "this", 0)
+    assert entries[1]["rates"]["this"]["goal_rate"] is None
     assert (rates["goal_rate"], rates["terrains"], rates["failing"]) == (0.5, 2, 1)
 
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     robots = Robots(fails)
-    given = {"compute": compute_by(robots), "episodes": 2}
+    sizes = {"compute": compute_by(robots), "episodes": 2}
     stored = read_pack(Path("pack"))
-    report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **given)
+    report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
     (file,) = Path("runs").glob("anymal-*-pack.json")
     assert json.loads(file.read_text()) == json.loads(json.dumps(report))
     # It fails the first terrain, which is 4 m high, and crosses the flat one.
-    assert [about["rates"]["this"]["goal_rate"] for about in report["terrains"]] == [0.0, 1.0]
+    assert [entry["rates"]["this"]["goal_rate"] for entry in report["terrains"]] == [0.0, 1.0]
     assert (report["rates"]["failing"], report["rates"]["terrains"]) == (1, 2)
     assert report["beside"]["base"]["goal_rate"] == 0.5 and report["pack"]["terrains"] == 3
-    assert {value: part["failing"] for value, part in report["by"]["verdict"].items()} == {"fault": 1, "near-fault": 0}
+    assert {value: counts["failing"] for value, counts in report["by"]["verdict"].items()} == {
+        "fault": 1,
+        "near-fault": 0,
+    }
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
     assert not robots.opened[0].reward and not robots.opened[0].resolved
-    whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **given)
+    whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
     assert whole["rates"]["terrains"] == 3
 
 

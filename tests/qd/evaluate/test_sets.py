@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qd.evaluate.labels import SETS
-from qd.evaluate.marks import marks_of
+from qd.evaluate.marks import hash_elites
 from qd.evaluate.sets import (
     far_third,
     generated_set,
@@ -102,7 +102,7 @@ def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
     alike = replace(archive, genes=np.repeat(archive.genes[:2], 5, axis=0))
     assert np.unique(random_elites("elites", alike, 9, 0).families).tolist() == [0, 1]
     # Elites that somebody was trained on are left out.
-    left = random_elites("elites", archive, 9, 0, {*marks_of(archive.genes[:7])})
+    left = random_elites("elites", archive, 9, 0, {*hash_elites(archive.genes[:7])})
     assert sorted(left.numbers) == [7, 8, 9]
 
 

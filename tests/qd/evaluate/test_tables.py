@@ -63,10 +63,10 @@ def test_values_are_means_over_terrains(report):
 def test_intervals_over_elites_are_over_families_of_kin(anymal):
     measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 32 + [0] * 8, of=4))}
     kin = replace(make_set(40), families=np.array([0] * 16 + [1] * 16 + [2] * 4 + [3] * 4))
-    of_terrains, of_kin = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
+    by_terrains, by_families = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
     # Of four families 1 of 16 resamples has nothing but the two that fail; of 40 terrains hardly any has 20 that do.
-    assert of_kin["intervals"]["goal"]["generated"]["base"][0] == 0.0
-    assert of_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
+    assert by_families["intervals"]["goal"]["generated"]["base"][0] == 0.0
+    assert by_terrains["intervals"]["goal"]["generated"]["base"][0] >= 0.5
 
 
 def test_certified_terrains_stand_apart_with_who_certifies_them(certified):

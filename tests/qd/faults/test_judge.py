@@ -232,8 +232,8 @@ def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_contro
 
 def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
     archive = judged_archive()  # certified by C-G and S
-    trained_on = {"a.pt": {judging.marks_of(archive.genes)[1], "of another archive"}, "b.pt": set()}
-    monkeypatch.setattr(judging, "recorded_marks", lambda policy: trained_on[Path(policy).name])
+    trained_on = {"a.pt": {judging.hash_elites(archive.genes)[1], "of another archive"}, "b.pt": set()}
+    monkeypatch.setattr(judging, "read_trained_on", lambda policy: trained_on[Path(policy).name])
     certifiers = {"C-G": str(tmp_path / "a.pt"), "S": str(tmp_path / "b.pt")}
     families = np.array([0, 1, 1, 2, 0])
     assert seen_by(archive, families, certifiers) is None  # nobody knows what S was trained on
