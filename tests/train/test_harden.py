@@ -235,7 +235,7 @@ def test_specialists_are_trained_before_the_judging(hardened, monkeypatch):
         (["--run-dir", "other"], "seed"),
     ],
 )
-def test_errors_come_before_any_work(place, flags, field, monkeypatch, capsys):
+def test_bad_settings_are_refused_before_any_work(place, flags, field, monkeypatch, capsys):
     monkeypatch.chdir(place)
     for name, content in (("full/file", b""), ("other/rounds.json", to_json({"settings": {"seed": 5}}))):
         (place / name).parent.mkdir()
