@@ -13,34 +13,34 @@ from typing import Any, NamedTuple
 class Command(NamedTuple):
     """A word that may stand after ``faultline``."""
 
-    where: str
-    """Module and class: a dataclass of the flags, whose ``execute`` does the work (:mod:`sim.files.command`)."""
+    module: str
+    """Has the dataclass of its flags: ``ArchiveCommand`` for ``archive``."""
     summary: str
 
 
 COMMANDS: dict[str, dict[str, Command]] = {
     "First": {
-        "archive": Command("qd.commands:Archive", "search the terrains on which a controller fails"),
-        "view": Command("qd.show.commands:View", "look at them in the browser"),
-        "report": Command("qd.show.commands:Report", "one page about them"),
-        "film": Command("qd.show.commands:Film", "film how the robot fails on one, or on a map of your own"),
-        "judge": Command("qd.commands:Judge", "which of them are faults of the controller"),
-        "export": Command("qd.show.commands:Export", "as files, faults as a pack, a controller as ONNX"),
+        "archive": Command("qd.commands", "search the terrains on which a controller fails"),
+        "view": Command("qd.show.commands", "look at them in the browser"),
+        "report": Command("qd.show.commands", "one page about them"),
+        "film": Command("qd.show.commands", "film how the robot fails on one, or on a map of your own"),
+        "judge": Command("qd.commands", "which of them are faults of the controller"),
+        "export": Command("qd.show.commands", "as files, faults as a pack, a controller as ONNX"),
     },
     "Find and measure more": {
-        "minimise": Command("qd.commands:Minimise", "which parts of a failing terrain it takes to fail"),
-        "evaluate": Command("qd.commands:Evaluate", "rates of controllers, of one or compared"),
-        "dose": Command("qd.commands:Dose", "which real obstacle at which size stops a controller"),
-        "replay": Command("qd.show.commands:Replay", "one elite, or a map of your own, again: numbers and paths"),
+        "minimise": Command("qd.commands", "which parts of a failing terrain it takes to fail"),
+        "evaluate": Command("qd.commands", "rates of controllers, of one or compared"),
+        "dose": Command("qd.commands", "which real obstacle at which size stops a controller"),
+        "replay": Command("qd.show.commands", "one elite, or a map of your own, again: numbers and paths"),
     },
     "Train": {
-        "train": Command("train.commands:Train", "train a base controller from scratch"),
-        "finetune": Command("train.commands:Finetune", "train a controller further on terrains that broke it"),
-        "harden": Command("train.commands:Harden", "rounds of search and training, until little breaks it"),
+        "train": Command("train.commands", "train a base controller from scratch"),
+        "finetune": Command("train.commands", "train a controller further on terrains that broke it"),
+        "harden": Command("train.commands", "rounds of search and training, until little breaks it"),
     },
     "Bring a robot or a controller": {
-        "import": Command("qd.commands:Import", "describe a public controller and its robot from what came with it"),
-        "check": Command("qd.commands:Check", "look at a robot and its controller: does it stand, and walk"),
+        "import": Command("qd.commands", "describe a public controller and its robot from what came with it"),
+        "check": Command("qd.commands", "look at a robot and its controller: does it stand, and walk"),
     },
 }
 """What can be done, by what it is for; first the six that a newcomer needs."""
@@ -70,6 +70,11 @@ def __getattr__(name: str) -> Any:
 _BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}
 
 
+def load_command(name: str) -> Any:
+    """The dataclass of the flags of a word; its ``execute`` does the work."""
+    return getattr(importlib.import_module(_BY_NAME[name].module), f"{name.capitalize()}Command")
+
+
 def _print_usage() -> None:
     from sim.files.command import say
 
@@ -95,8 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         meant = f"did you mean {near[0]}?" if near else "faultline --help lists them"
         say(("error:", "bold red"), f" there is no command '{name}': {meant}", error=True)
         return 2
-    module, _, cls = _BY_NAME[name].where.partition(":")
-    return run_command(getattr(importlib.import_module(module), cls), rest, name=name)
+    return run_command(load_command(name), rest, name=name)
 
 
 if __name__ == "__main__":

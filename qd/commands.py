@@ -38,7 +38,7 @@ class ArchiveFitness:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive(ControllerFlags, WorkerFlags):
+class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
@@ -137,7 +137,7 @@ class Archive(ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
+class _RunFlags(ControllerFlags, SpaceFlag, WorkerFlags):
     """What commands that work on a run's elites share."""
 
     run: Path | None = None
@@ -160,7 +160,7 @@ class _OnRun(ControllerFlags, SpaceFlag, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judge(_OnRun):
+class JudgeCommand(_RunFlags):
     """Say which elites of a run are faults of its controller.
 
     fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
@@ -187,7 +187,7 @@ class Judge(_OnRun):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Minimise(_OnRun):
+class MinimiseCommand(_RunFlags):
     """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
     Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
@@ -216,7 +216,7 @@ class Minimise(_OnRun):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import:
+class ImportCommand:
     """Describe a controller and its robot as robot.toml and controller.toml, from what came with its weights.
 
     It prints both files. What is not understood is refused by its name; what is a guess says so, with its reason; what
@@ -239,7 +239,7 @@ class Import:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(ControllerFlags, WorkerFlags):
+class CheckCommand(ControllerFlags, WorkerFlags):
     """Look at a robot and its controller before anything is searched or trained.
 
     It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
@@ -257,7 +257,7 @@ class Check(ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
+class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
@@ -328,7 +328,7 @@ class Evaluate(SetsCfg, ControllerFlags, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dose(RobotFlag, WorkerFlags):
+class DoseCommand(RobotFlag, WorkerFlags):
     """Measure which real obstacle at which size stops a controller.
 
     One obstacle stands alone on flat ground, and one of its sizes grows: the rise of stairs, the width of a ditch; or

@@ -1,7 +1,6 @@
 """The command: its words, how it fails, and that help loads nothing that takes seconds."""
 
 import dataclasses
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -39,11 +38,10 @@ def test_help_names_every_command_the_six_of_a_newcomer_first_and_loads_nothing(
 def test_a_command_is_a_frozen_dataclass_whose_help_teaches_and_is_quick(name):
     text, loaded = loaded_by(name, "--help")
     assert f"usage: faultline {name}" in text and loaded == set()
-    module, _, cls = WORDS[name].where.partition(":")
-    command = getattr(importlib.import_module(module), cls)
+    command = faultline.load_command(name)
     assert dataclasses.is_dataclass(command) and command.__dataclass_params__.frozen
     assert callable(command.execute)
-    assert command.__doc__ and not command.__doc__.startswith(f"{cls}(")  # what dataclass makes up where there is none
+    assert command.__doc__ and not command.__doc__.startswith(f"{command.__name__}(")  # else dataclass made it
 
 
 @pytest.mark.parametrize(("given", "meant"), [("achive", "did you mean archive?"), ("xyz", "--help lists them")])

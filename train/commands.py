@@ -16,7 +16,7 @@ _Cfg = TypeVar("_Cfg")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfTraining(RunCfg):
+class _TrainingFlags(RunCfg):
     """The flags of every training."""
 
     robot: str = "anymal"
@@ -28,7 +28,7 @@ class _OfTraining(RunCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Train(_OfTraining, TrainCfg):
+class TrainCommand(_TrainingFlags, TrainCfg):
     """Train a base controller from scratch: PPO on legged_gym's rough-terrain task.
 
     On CUDA ANYmal trains 8192 robots for 2240 iterations, Cassie 2048 for 3400; on the CPU 32 for 20, enough to see
@@ -53,7 +53,7 @@ class Train(_OfTraining, TrainCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finetune(_OfTraining, FinetuneCfg):
+class FinetuneCommand(_TrainingFlags, FinetuneCfg):
     """Fine-tune a controller by PPO on hand-crafted terrains and on those of an archive (the paper's C-G).
 
     On CUDA the sizes are the paper's, on the CPU small ones, enough to see that it runs. Ctrl-C or SIGTERM saves
@@ -92,7 +92,7 @@ class Finetune(_OfTraining, FinetuneCfg):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Harden(HardenCfg, WorkerFlags):
+class HardenCommand(HardenCfg, WorkerFlags):
     """Search for what breaks a controller, train it on all that was found, and search again, for some rounds.
 
     Each search counts the faults: terrains that another controller crosses and this one does not. Each training is on
@@ -140,7 +140,7 @@ def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
     return from_builtins(kind, values, str(run_dir))
 
 
-def _run_dir(flags: _OfTraining, name: str) -> Path:
+def _run_dir(flags: _TrainingFlags, name: str) -> Path:
     """Where a training works; a new directory is called after ``name`` and the time."""
     from qd.search.directory import free_path
 

@@ -13,7 +13,7 @@ from sim.robots.find import get_robot
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay(ControllerFlags, DeviceFlag, EliteFlags):
+class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
     """Cross terrains again: how often robots get over, what it costs them, and a figure with their paths.
 
     Terrains are elites of a run, or minimal terrains, or a height map of your own. Elites are numbered by falling
@@ -68,7 +68,7 @@ class Replay(ControllerFlags, DeviceFlag, EliteFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Film(Replay):
+class FilmCommand(ReplayCommand):
     """Film how a robot fails, on elites of a run or on a terrain of your own.
 
     The terrains and the episodes are those that `faultline replay` shows. The film begins 3 s before the robot falls,
@@ -116,7 +116,7 @@ class PackFlags(WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(ControllerFlags, EliteFlags):
+class ExportCommand(ControllerFlags, EliteFlags):
     """Write terrains as files that other programs read, a pack of terrains, or a controller as ONNX.
 
     For each elite it writes `elite-N.xml` (MJCF: the terrain with start and goal, whose surface is the simulation's
@@ -192,7 +192,7 @@ class Export(ControllerFlags, EliteFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(ControllerFlags, DeviceFlag, SpaceFlag):
+class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
     """Write one HTML page about a run; it opens from disk, without a network, and prints well.
 
     It begins with what stops the robot, and shows the worst terrains close up at the moment of failure, with another
@@ -222,7 +222,7 @@ class Report(ControllerFlags, DeviceFlag, SpaceFlag):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(RobotFlag, EliteFlags):
+class ViewCommand(RobotFlag, EliteFlags):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
     It opens on the worst terrain of the commonest cause, of causes that have a fault if any has, one second before the

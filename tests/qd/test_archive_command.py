@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from qd import check
-from qd.commands import Archive
+from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
 from qd.search import settings
 from qd.search.archive import read_archive
@@ -48,7 +48,7 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def archive(*argv: str) -> int:
-    return run_command(Archive, argv, name="archive")
+    return run_command(ArchiveCommand, argv, name="archive")
 
 
 def fails(capsys, *argv: str) -> str:
@@ -116,10 +116,10 @@ def test_flags_come_to_the_settings_of_the_run():
 
 
 def test_a_preset_has_its_own_defaults():
-    paper = Archive.defaults(["--preset", "paper"])
+    paper = ArchiveCommand.defaults(["--preset", "paper"])
     assert (paper.iterations, paper.replicas, paper.scheduler.emitters) == (1000, 20, 10)
-    assert Archive.defaults(["--device", "cuda"]).preset == "wide"
-    assert Archive.defaults(["--device", "cpu"]).preset == "small"
+    assert ArchiveCommand.defaults(["--device", "cuda"]).preset == "wide"
+    assert ArchiveCommand.defaults(["--device", "cpu"]).preset == "small"
 
 
 def test_a_run_goes_on_as_it_is_or_not_at_all(capsys):

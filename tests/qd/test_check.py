@@ -5,7 +5,7 @@ import json
 import pytest
 
 from qd.check import check, made_ready
-from qd.commands import Check
+from qd.commands import CheckCommand
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot, read_penalty_scales
@@ -18,7 +18,7 @@ from tests.sim.dogs import CONTROLLER, write_dog, write_toml
 def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mended(tmp_path, capsys):
     file = write_dog(tmp_path)
     file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2, nconmax=2"))
-    assert run_command(Check, ["--robot", str(file), "--device", "cpu"], name="check") == 1
+    assert run_command(CheckCommand, ["--robot", str(file), "--device", "cpu"], name="check") == 1
     text = capsys.readouterr().out
     assert "FL_hip" in text and "default_base_height" in text and "It stands" in text
     assert "it needs nconmax = " in text and "Without a controller" in text
@@ -27,7 +27,7 @@ def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mende
 def test_a_controller_is_tried_before_anything_is_simulated(tmp_path, capsys):
     file = write_toml(tmp_path / "dog", "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n")
     file.with_name("controller.toml").write_text('observation = [{term = "height"}]\n')
-    assert run_command(Check, ["--robot", str(file), "--device", "cpu"], name="check") == 2
+    assert run_command(CheckCommand, ["--robot", str(file), "--device", "cpu"], name="check") == 2
     text = capsys.readouterr()
     assert "height" in text.err and "stands" not in text.out
 

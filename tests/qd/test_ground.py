@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.commands import Archive
+from qd.commands import ArchiveCommand
 from qd.faults.causes import causes_at, effects_of
 from qd.faults.minimise.minimise import minimise
 from qd.search import settings
 from qd.search.archive import read_archive, write_archive
-from qd.show.commands import Export
+from qd.show.commands import ExportCommand
 from sim.files.command import run_command
 from sim.terrains.bank import terrains_of
 from sim.terrains.maps.heightmap import read_heightmap
@@ -25,7 +25,7 @@ SPACE = get_space("super_gaussian+friction+softness")
 
 def search(*words: str) -> int:
     with crossing_by(stand_in.open_stand_in):
-        return run_command(Archive, [*words, "--device", "cpu"], name="archive")
+        return run_command(ArchiveCommand, [*words, "--device", "cpu"], name="archive")
 
 
 @pytest.fixture
@@ -42,14 +42,14 @@ def test_a_run_goes_on_with_its_ground_and_exports_it(run):
     assert (archive.space, archive.genes.shape[1]) == (SPACE.name, 128)
     more = ("--resume", "run", "--iterations", "2")
     assert search(*more) == 0 and read_archive(run).iterations == 2
-    Export(run=run, elite="0", formats=("npz", "xml")).execute()
+    ExportCommand(run=run, elite="0", formats=("npz", "xml")).execute()
     exported = read_heightmap(run / "terrains/elite-0.npz")
     heights, ground = terrains_of(read_archive(run).genes[:1], SPACE)
     np.testing.assert_array_equal(exported.heights, heights[0])
     np.testing.assert_array_equal(exported.ground.friction, ground.friction)
     np.testing.assert_array_equal(exported.ground.time_constant_s, ground.time_constant_s)
     with pytest.raises(ValueError, match="npz"):
-        Export(run=run, elite="0", formats=("stl",), overwrite=True).execute()
+        ExportCommand(run=run, elite="0", formats=("stl",), overwrite=True).execute()
 
 
 def test_a_minimal_terrain_may_be_a_patch(run):
@@ -62,7 +62,7 @@ def test_a_minimal_terrain_may_be_a_patch(run):
     (entry,) = minima.numbers["elites"]
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])
-    Export(run=run, minimal="all", formats=("npz",)).execute()
+    ExportCommand(run=run, minimal="all", formats=("npz",)).execute()
     exported = read_heightmap(run / "minimal-terrains/minimal-0.npz")
     slippery = np.ones((1, 4, 8), np.float32)
     slippery[0, 1, 3] = 0.15  # the 8 x 4 patches are counted along the way first: 11 = 8 + 3

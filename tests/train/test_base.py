@@ -17,7 +17,7 @@ from sim.robots.find import get_robot
 from tests.train.conftest import CURRICULUM
 from train.base import train
 from train.cfg import RunCfg, TrainCfg
-from train.commands import Train
+from train.commands import TrainCommand
 from train.ppo import training
 from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import read_checkpoint
@@ -62,8 +62,8 @@ def test_a_run_leaves_a_controller_and_its_record(finished):
 
 def test_it_goes_on_by_its_own_settings(copied):
     flags = ["--resume", str(copied), "--iterations", "3", "--device", "cpu"]
-    assert Train.defaults(flags).task == CFG.task and Train.defaults(flags).ppo == PPO
-    assert run_command(Train, flags, name="train") == 0
+    assert TrainCommand.defaults(flags).task == CFG.task and TrainCommand.defaults(flags).ppo == PPO
+    assert run_command(TrainCommand, flags, name="train") == 0
     record = json.loads((copied / "policy.train.json").read_text())
     assert record["iterations"] == 3 and record["env_steps"] == 72
     assert [row["iteration"] for row in record["curve"]] == [1, 2, 3]
@@ -89,7 +89,7 @@ def test_other_settings_robots_and_commands_are_refused(finished, copied):
     content["settings"]["ppo"]["gamma"] = "a lot"
     torch.save(content, copied / "checkpoint.pt")
     with pytest.raises(ValueError, match="gamma"):
-        Train.defaults(["--resume", str(copied)])
+        TrainCommand.defaults(["--resume", str(copied)])
     with locked(finished, "busy"), pytest.raises(ValueError, match="another training"):
         train(ROBOT, replace(CFG, iterations=3), finished, ON_CPU)
     assert (finished / "checkpoint.pt").read_bytes() == before
@@ -146,7 +146,7 @@ def test_errors_come_before_any_work(flags, field, tmp_path, monkeypatch, capsys
     monkeypatch.setattr(training, "CommandTask", None)  # building anything would fail with another error
     monkeypatch.chdir(tmp_path)
     given = [flag.format(empty=tmp_path) for flag in flags]
-    assert run_command(Train, [*given, *([] if "--device" in flags else ["--device", "cpu"])], name="train") == 2
+    assert run_command(TrainCommand, [*given, *([] if "--device" in flags else ["--device", "cpu"])], name="train") == 2
     error = capsys.readouterr().err
     assert field in error and error.count("\n") == 1
 
@@ -156,6 +156,6 @@ def test_new_runs_have_places_of_their_own(tmp_path, monkeypatch):
     places = []
     monkeypatch.setattr("train.base.train", lambda robot, cfg, run_dir, run: places.append(run_dir))
     for _ in range(3):
-        assert run_command(Train, ["--device", "cpu"], name="train") == 0
+        assert run_command(TrainCommand, ["--device", "cpu"], name="train") == 0
         places[-1].mkdir(parents=True)
     assert len(set(places)) == 3 and all(place.parent.name == "runs" for place in places)

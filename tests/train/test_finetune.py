@@ -21,7 +21,7 @@ from tests.sim.terrains.spaces.spaces import write_ridges
 from tests.train.conftest import begun
 from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg
-from train.commands import Finetune
+from train.commands import FinetuneCommand
 from train.finetune import elites_of, finetune, train_specialist
 from train.ppo import training
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
@@ -103,7 +103,8 @@ def test_it_goes_on_with_the_same_terrains_by_equal_settings_alone(places, finis
     finetune(ROBOT, cfg_of(places), finished, ON_CPU)  # it is over
     assert (finished / "policy.onnx").exists()
     assert read_checkpoint(finished / "checkpoint.pt")["progress"] == before["progress"]
-    assert run_command(Finetune, ["--resume", str(finished), "--device", "cpu", "--iterations", "4"], name="x") == 0
+    flags = ["--resume", str(finished), "--device", "cpu", "--iterations", "4"]
+    assert run_command(FinetuneCommand, flags, name="x") == 0
     later = read_checkpoint(finished / "checkpoint.pt")
     assert later["iter"] == 4 and later["mix"]["rows"] == before["mix"]["rows"]
     assert later["settings"] == {**before["settings"], "iterations": 4}
@@ -200,7 +201,7 @@ def test_a_space_of_ones_own_runs_only_where_it_is_named(places, tmp_path, monke
     cfg = cfg_of(places, mix="hard-random", archive=(), space=ridges, iterations=1)
     finetune(ROBOT, cfg, run, ON_CPU)
     monkeypatch.setattr(spaces, "_loaded", [])  # as in a program that has just begun
-    assert Finetune.defaults(["--resume", str(run)]).space is None
+    assert FinetuneCommand.defaults(["--resume", str(run)]).space is None
     with pytest.raises(ValueError, match="spaces"):
         finetune(ROBOT, replace(cfg, space=None, iterations=2), run, ON_CPU)
     finetune(ROBOT, replace(cfg, space=write_ridges(tmp_path / "elsewhere"), iterations=2), run, ON_CPU)
@@ -243,7 +244,7 @@ def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, s
     flags = ["--specialist", str(searched), "--num-envs", "6", "--terrains", "4", "--device", "cpu"]
     small = ["--ppo.steps-per-env", "4", "--ppo.epochs", "1"]
     for iterations in ("1", "2"):  # the same command goes on
-        assert run_command(Finetune, [*flags, *small, "--iterations", iterations], name="finetune") == 0
+        assert run_command(FinetuneCommand, [*flags, *small, "--iterations", iterations], name="finetune") == 0
     path = searched / "certifiers" / "specialist.pt"
     record = json.loads(path.with_suffix(".train.json").read_text())
     assert record["iterations"] == 2 and len(record["pieces"]) == 2 and record["seed"] == 7
@@ -254,7 +255,7 @@ def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, s
     with pytest.raises(ValueError, match="searched"):
         train_specialist(ROBOT, searched, other, ON_CPU)
     with pytest.raises(ValueError, match="run_dir"):
-        replace(Finetune.defaults(flags), specialist=searched, run_dir=places / "x").execute()
+        replace(FinetuneCommand.defaults(flags), specialist=searched, run_dir=places / "x").execute()
 
 
 @pytest.mark.parametrize(
@@ -270,7 +271,7 @@ def test_what_is_left_out_is_the_robots_own_recipe_and_on_a_gpu_of_the_papers_si
     assert sizes(cfg) == paper
     given = replace(cfg, terrains=70, recipe=replace(cfg.recipe, swap_every=7))
     assert sizes(given, num_envs=8192) == (8192, 70, 7, paper[3])
-    flags = Finetune.defaults(["--robot", robot])
+    flags = FinetuneCommand.defaults(["--robot", robot])
     assert (flags.task, flags.ppo, flags.recipe) == (cfg.task, cfg.ppo, cfg.recipe)
     assert (cfg.task.rewards.termination, cfg.task.rewards.tracking_lin_vel) == (-200.0, tracking)
     assert (cfg.task.crosses, cfg.recipe.draw, cfg.task.start_spread) == (True, "learnable", 8.0)
@@ -298,6 +299,6 @@ def test_errors_come_before_any_work(flags, field, places, monkeypatch, capsys):
     given = ["--device", "cpu", *(flag.format(dir=places) for flag in flags)]
     if "--archive" not in flags:
         given += ["--archive", str(places / "archive")]
-    assert run_command(Finetune, given, name="finetune") == 2
+    assert run_command(FinetuneCommand, given, name="finetune") == 2
     assert field in capsys.readouterr().err.splitlines()[-1]
     assert not (places / "runs").exists()

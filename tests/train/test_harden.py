@@ -22,7 +22,7 @@ from tests.qd.stand_in import Stub, compute_by, result_of
 from tests.train.starts import PPO, write_actor
 from train import harden as module
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RoundSearchCfg
-from train.commands import Harden
+from train.commands import HardenCommand
 from train.harden import harden, verdict
 
 ROBOT = get_robot("anymal")
@@ -242,6 +242,6 @@ def test_bad_settings_are_refused_before_any_work(place, flags, field, monkeypat
         (place / name).write_bytes(content)
     before = sorted(os.listdir(place))
     given = ["--policy", "start.pt", "--device", "cpu", "--run-dir", "run", *flags]
-    assert run_command(Harden, given, name="harden") == 2
+    assert run_command(HardenCommand, given, name="harden") == 2
     assert field in capsys.readouterr().err.splitlines()[-1]
     assert sorted(os.listdir(place)) == before

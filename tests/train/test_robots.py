@@ -8,7 +8,7 @@ import torch
 import tyro
 
 from sim.robots.find import get_robot
-from train.commands import Train
+from train.commands import TrainCommand
 from train.ppo.cfg import PpoCfg
 from train.task.cfg import TaskCfg
 
@@ -17,7 +17,7 @@ CONTROL_DT = 0.02
 
 def test_the_command_line_begins_with_the_robots_settings():
     flags = ["--task.rewards.no-fly", "0.5", "--robot=cassie", "--task.push-speed", "0.25", "--iterations", "7"]
-    cfg = tyro.cli(Train, args=flags, default=Train.defaults(flags))
+    cfg = tyro.cli(TrainCommand, args=flags, default=TrainCommand.defaults(flags))
     expected = TaskCfg.of(get_robot("cassie"))
     assert (cfg.robot, cfg.iterations, cfg.task.push_speed) == ("cassie", 7, 0.25)
     assert asdict(cfg.task.rewards) == asdict(expected.rewards) | {"no_fly": 0.5}

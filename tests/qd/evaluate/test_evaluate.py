@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.commands import Evaluate
+from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate import tables
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
@@ -120,7 +120,7 @@ def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
 def test_errors_come_before_any_work_in_one_line(archive, flags, field, monkeypatch, capsys):
     monkeypatch.setattr(evaluation, "cross_sets", None)
     write_elites(Path("cassie.npz"), 9, robot="cassie")
-    assert run_command(Evaluate, ["--device", "cpu", "--terrains", "2", *flags], name="evaluate") == 2
+    assert run_command(EvaluateCommand, ["--device", "cpu", "--terrains", "2", *flags], name="evaluate") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert field in line and not Path("runs").exists()
 
@@ -140,4 +140,4 @@ def test_the_exit_status_says_whether_it_is_a_regression(archive, monkeypatch, s
     monkeypatch.setattr(evaluation, "evaluate_tables", lambda robot, controllers, cfg, **_: cfg)
     monkeypatch.setattr(tables, "is_regression", lambda cfg: type(cfg) is SetsCfg and cfg.seed == 1)
     flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--seed", str(status)]
-    assert run_command(Evaluate, [*flags, "--device", "cpu"], name="evaluate") == status
+    assert run_command(EvaluateCommand, [*flags, "--device", "cpu"], name="evaluate") == status

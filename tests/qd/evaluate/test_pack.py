@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.commands import Evaluate
+from qd.commands import EvaluateCommand
 from qd.evaluate.make_pack import choose_terrains, make_pack
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
@@ -180,6 +180,6 @@ def test_ci_fails_where_the_goal_rate_may_be_lower(pack, monkeypatch, capsys, le
     rates = {"rates": {"goal_rate": 0.5, "goal_interval": [0.25, 0.75]}}
     monkeypatch.setattr("qd.evaluate.pack.evaluate_pack", lambda *_, **named: rates)
     flags = ["--pack", "pack", "--device", "cpu", "--fail-under", str(least)]
-    assert run_command(Evaluate, flags, name="evaluate") == status
+    assert run_command(EvaluateCommand, flags, name="evaluate") == status
     assert "0.250" in (out := capsys.readouterr().out) and f"{least:.3f}" in out
     assert not passes({"rates": {"goal_interval": None}}, 0.1)  # one family says nothing of its spread

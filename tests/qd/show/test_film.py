@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.show.commands import Film
+from qd.show.commands import FilmCommand
 from qd.show.crossed import moment_of_failure, title_of, typical_episode
 from qd.show.film import Shot, as_gif, follow, pictures_of, pose_at
 from sim.files.command import run_command
@@ -169,7 +169,7 @@ def run(tmp_path, monkeypatch):
 
 
 def film(*argv):
-    return run_command(Film, [*argv, "--device", "cpu", "--no-shadows"], name="film")
+    return run_command(FilmCommand, [*argv, "--device", "cpu", "--no-shadows"], name="film")
 
 
 def test_films_of_elites_and_of_a_map(run, capsys):

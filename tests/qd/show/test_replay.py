@@ -14,7 +14,7 @@ from qd.faults.families import rank
 from qd.search.archive import write_archive
 from qd.search.descriptors import Cells
 from qd.search.directory import RunDirectory
-from qd.show.commands import Export, Replay
+from qd.show.commands import ExportCommand, ReplayCommand
 from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
@@ -102,7 +102,7 @@ def test_rates_of_ones_own_terrain_with_their_intervals():
     gray[:, 100:] = 200  # a wall of 2 m before the goal
     Image.fromarray(gray).save("wall.png")
     flags = f"--terrain wall.png --size 16 8 --scale 0.01 --policy {STAND} --device cpu --replicas 4"
-    assert run_command(Replay, flags.split(), name="replay") == 0
+    assert run_command(ReplayCommand, flags.split(), name="replay") == 0
     stem = "runs/terrains/wall.png-anymal-tests.sim.policies-stand"
     report = json.loads(Path(f"{stem}.json").read_text())
     # It stands where it starts: no collision, no goal. Wilson of 4 of 4: 1 / (1 + 3.8415 / 4) = .5101
@@ -215,7 +215,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     words = " ".join(capsys.readouterr().out.split())
     assert f"Of the minimal terrain: {opened_run.minima().words(number)}; failing." in words
     assert words.count("- bump of") == 1 and "- bump of <0.24> m" in words  # those that are left alone
-    Export(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
+    ExportCommand(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}
     with np.load(tmp_path / "out" / f"minimal-{number}.npz") as content:
         np.testing.assert_array_equal(content["genes"], genes[number])
