@@ -16,9 +16,9 @@ from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute
 from qd.workers.invalid import refuse_all_invalid
 from qd.workers.shards import join_results
+from sim.controllers.spec import controller_identity
 from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.records import identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.base import MOST_HEIGHT
@@ -82,7 +82,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
             if (count := _failing(result).sum()) >= _ENOUGH:
                 break
             print(f"{count} of {result.invalid.size} episodes did not reach the goal.", flush=True)
-    origin = {**compute.origin(0), **identity(robot, policy), "space": space.name}
+    origin = {**compute.origin(0), **controller_identity(robot, policy), "space": space.name}
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
     report = {**origin, "crossing": crossing, **measured(result)}
     absent = [name for name in robot.penalties if name not in report["scales"]]

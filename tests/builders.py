@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from qd.search.archive import FRESH, Archive, FaultCounts, FreshValues, write_archive
 from sim.files.atomic import to_json
-from sim.files.records import robot_identity
+from sim.robots.identity import robot_identity
 from sim.robots.shipped import ROBOTS
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 

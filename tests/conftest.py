@@ -17,7 +17,7 @@ import warp as wp
 from qd.search.directory import RESULTS
 from sim.device import resolve_device
 from sim.files.command import publish
-from sim.files.records import provenance
+from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from sim.robots.shipped import ROBOTS
 from sim.simulation import Simulation

@@ -56,6 +56,8 @@ def offences_of(path: Path, source: str) -> list[str]:
             offences.append(f"{path}:{line}: {room} may not import {name}: imports point {' <- '.join(ROOMS)}")
         elif room == "train" and top == "qd" and rest.partition(".")[0] not in QD_DOORS_FOR_TRAIN:
             offences.append(f"{path}:{line}: of qd, train may import only {', '.join(QD_DOORS_FOR_TRAIN)}, not {name}")
+        elif path.is_relative_to("sim/files") and top in ROOMS and not name.startswith("sim.files"):
+            offences.append(f"{path}:{line}: sim/files may not import {name}: it imports nothing of the rooms")
         elif top == "tests":
             offences.append(f"{path}:{line}: {room} may not import {name}: tests are not shipped")
         elif not any(path.is_relative_to(door) for door in LIBRARY_DOORS.get(top, ROOMS)):
@@ -108,6 +110,7 @@ def test_few_imports_are_hidden_and_only_the_registry_loads_commands():
         ("qd/a.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),
         ("train/a.py", "from ..qd.show import figures"),
         ("sim/a.py", "from tests.oracles import height"),
+        ("sim/files/a.py", "from sim.robots.robot import RobotCfg"),
         ("sim/a.py", "x = 1\n" * 501),
     ],
 )

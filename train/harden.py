@@ -25,10 +25,10 @@ from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, differences, preset
 from qd.workers.evaluator import Compute, check_policy
+from sim.controllers.spec import controller_identity
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.intervals import value_words
-from sim.files.records import identity
 from sim.files.settings import check
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import load_space, space_at
@@ -108,7 +108,9 @@ class _Hardening:
 
     def _read_content(self, base: str) -> dict[str, Any]:
         """What ``rounds.json`` has, or is to begin with."""
-        settings = json.loads(to_json({**asdict(self.cfg), **identity(self.robot, base)}))  # as they are read again
+        settings = json.loads(
+            to_json({**asdict(self.cfg), **controller_identity(self.robot, base)})
+        )  # as they are read again
         del settings["rounds"]
         file = self.path / ROUNDS_FILE
         if file.exists():
@@ -196,7 +198,9 @@ class _Hardening:
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
         judge(run, certifiers=self.certifiers, **settings)
         counts = RunDirectory(run).read_summary()
-        digest = {key: value for key, value in identity(self.robot, policy).items() if key.startswith("policy")}
+        digest = {
+            key: value for key, value in controller_identity(self.robot, policy).items() if key.startswith("policy")
+        }
         tuned = f"tune-{number}" if number else None
         row = {"controller": name, **digest, "tuned": tuned, "kept": tuned and self.choices[tuned]["kept"]}
         self.rows.append({**row, "search": run.name, **{key: counts.get(key) for key in _COUNTS}})

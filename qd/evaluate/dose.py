@@ -19,8 +19,8 @@ from sim.controllers.spec import about_controllers
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import resamples, value_words, wilson_interval
-from sim.files.records import robot_identity
 from sim.rates import counted_episodes
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.doses import Dose

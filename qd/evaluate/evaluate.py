@@ -27,10 +27,10 @@ from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import about_controllers, crosser_name, spec_of
+from sim.controllers.spec import about_controllers, controller_identity, crosser_name, spec_of
 from sim.files.command import publish
-from sim.files.records import identity, robot_identity
 from sim.robots.find import get_robot, read_penalty_scales
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import load_space, space_at
@@ -221,7 +221,7 @@ def evaluate_rates(
         types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
         return {
             **compute.origin(seed),
-            **identity(robot, policy),
+            **controller_identity(robot, policy),
             "space": terrain_space.name,
             "hand_crafted": summarise(hand_crafted, seed, types=types, levels=levels),
             "hard_random": summarise(hard_random, seed),

@@ -34,10 +34,9 @@ from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import about_controllers, is_same
+from sim.controllers.spec import about_controllers, controller_identity, is_same
 from sim.files.atomic import prepare_output
 from sim.files.command import publish
-from sim.files.records import identity
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.registry import get_space
 
@@ -91,7 +90,7 @@ def make_pack(
         crossed = add_rates([entries[index] for index in chosen], results["pack"])
         return {
             **compute.origin(seed),
-            **identity(robot, search.policy),
+            **controller_identity(robot, search.policy),
             "space": search.cfg.space,
             "space_sha256": search.cfg.space_sha256,
             "episodes": episodes,

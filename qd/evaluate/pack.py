@@ -24,13 +24,12 @@ from qd.faults.numbers import EPISODES
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import crosser_name
+from sim.controllers.spec import controller_identity, crosser_name
 from sim.files.atomic import read_json, write_atomically
 from sim.files.command import publish, say
 from sim.files.intervals import RATES as RATE_BOUNDS
 from sim.files.intervals import wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
-from sim.files.records import identity
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
@@ -154,7 +153,7 @@ def evaluate_pack(
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
         return {
             **compute.origin(seed),
-            **identity(robot, policy),
+            **controller_identity(robot, policy),
             "episodes": episodes,
             "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": size},
             "rates": summarise_rates(tested, "this", seed),

@@ -23,7 +23,7 @@ from qd.search.fitness import FAILING_GOAL_RATE
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.intervals import wilson_interval
-from sim.files.records import check_robot
+from sim.robots.identity import check_robot_digest
 from sim.robots.robot import RobotCfg
 
 Tables = dict[str, Any]
@@ -59,7 +59,7 @@ def read_tables(file: Path, robot: RobotCfg) -> Tables:
         raise ValueError(f"{file} must hold the tables of `faultline evaluate`: {error}: give that file") from None
     if tables["robot"] != robot.name:
         raise ValueError(f"{file} must be of robot {robot.name}, got {tables['robot']}: give other tables")
-    check_robot(tables, robot, file, "make them anew")
+    check_robot_digest(tables, robot, file, "make them anew")
     return tables
 
 

@@ -24,9 +24,8 @@ from qd.search.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import ControllerSpec, controller_hash, spec_of, weights_file
+from sim.controllers.spec import ControllerSpec, controller_hash, controller_identity, spec_of, weights_file
 from sim.files.atomic import read_json, to_json, write_atomically
-from sim.files.records import identity
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout, RolloutResult
@@ -314,7 +313,7 @@ def judge(
                 families = families_of(archive.genes, search.space)
                 causes = causes_of(elites_of(archive), archive, search.space)
                 archive = replace(archive, family=families, cause=causes)
-            origin = compute.origin(search.cfg.seed) | identity(search.robot, search.policy)
+            origin = compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
             _write(archive, search, certifiers, {stage: origin})
     return archive
 

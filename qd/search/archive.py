@@ -92,7 +92,7 @@ class Archive(Evaluation):
     robot: str
     robot_sha256: str
     penalty_definition: str
-    """How its penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
+    """How its penalties are defined (:data:`sim.robots.identity.PENALTY_DEFINITION`)."""
     space: str
     """Name of the terrain space of the genes (:func:`sim.terrains.spaces.registry.get_space`)."""
     penalties: tuple[str, ...]
@@ -123,7 +123,7 @@ class Archive(Evaluation):
     elite that does not fail; None likewise."""
 
     def named(self) -> dict[str, Any]:
-        """Robot, controller and definition of the penalties, as :func:`sim.files.records.identity` names them."""
+        """Robot, controller and penalties: keys of :func:`sim.controllers.spec.controller_identity`."""
         return {name: getattr(self, name) for name in ("robot", "robot_sha256", "policy_sha256", "penalty_definition")}
 
     def __len__(self) -> int:

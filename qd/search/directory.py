@@ -16,7 +16,7 @@ from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
-from sim.files.records import check_identity
+from sim.robots.identity import check_robot_identity
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import get_space, load_space
 
@@ -98,7 +98,7 @@ def read_archive_of(robot: RobotCfg, run: Path, space: str | None = None) -> Arc
     archive = read_archive(run)
     check_space(archive, space)
     if archive.robot == robot.name:
-        check_identity(archive.named(), robot, run, "search again, or give another archive")
+        check_robot_identity(archive.named(), robot, run, "search again, or give another archive")
     return archive
 
 

@@ -10,9 +10,9 @@ from qd.search.descriptors import Cells
 from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg, preset_of
 from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
-from sim.files.records import robot_identity
 from sim.files.settings import NonNegativeInt, PositiveInt, check, from_builtins
 from sim.robots.find import read_penalty_scales
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 
 _MOST_EPISODES = 10_000_000
@@ -26,7 +26,7 @@ class SearchCfg:
     robot_sha256: str
     """Hash of its settings, model and meshes."""
     penalty_definition: str
-    """How the penalties are defined (:data:`sim.files.records.PENALTY_DEFINITION`)."""
+    """How the penalties are defined (:data:`sim.robots.identity.PENALTY_DEFINITION`)."""
     preset: str
     policy: str
     """Controller: ``shipped``, or as :func:`sim.controllers.loaders.load_policy` takes it."""

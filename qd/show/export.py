@@ -16,7 +16,7 @@ from sim.controllers.loaders import load_checkpoint
 from sim.controllers.onnx import export_onnx
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import chosen_elites
-from sim.files.records import provenance
+from sim.files.provenance import provenance
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import terrains_of

@@ -20,9 +20,10 @@ from qd.search.progress import Bar
 from qd.workers.cross import Cache
 from qd.workers.evaluator import episode_seeds
 from sim.controllers.spec import controller_hash
-from sim.files.records import code_fingerprint, robot_identity
+from sim.files.provenance import code_fingerprint
 from sim.recording.file import read_recording, write_recording
 from sim.recording.recorder import Recording, record
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.terrains.ground import GroundMaps

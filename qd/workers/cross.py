@@ -25,9 +25,10 @@ from sim.controllers.spec import controller_hash, spec_of
 from sim.files.atomic import locked, write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
-from sim.files.records import code_fingerprint, robot_identity
+from sim.files.provenance import code_fingerprint
 from sim.mujoco_c.crossing import cross_terrains
 from sim.robots.find import get_robot
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import identity, load_space

@@ -22,7 +22,7 @@ from qd.workers.shards import join_results
 from sim.controllers.loaders import load_policy
 from sim.crossing import SolverCfg, resolved
 from sim.device import resolve_device as resolve_warp_device
-from sim.files.records import provenance
+from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.rollout import CrossingCfg, Rollout, RolloutResult

@@ -26,7 +26,7 @@ from qd.workers.process import EvaluatorError
 from qd.workers.shards import copied, flaw_of, join_results
 from sim.controllers.spec import ControllerSpec
 from sim.files.command import debugging
-from sim.files.records import code_fingerprint
+from sim.files.provenance import code_fingerprint
 from sim.robots.find import get_robot
 from sim.robots.user import PackedRobot, pack_robot
 from sim.rollout import RolloutResult

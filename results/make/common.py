@@ -26,10 +26,11 @@ from qd.search.directory import RunDirectory, read_archive_of
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, preset
 from qd.workers.evaluator import Compute
+from sim.controllers.spec import controller_identity
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import DIFFERENCES, bootstrap_interval, t_interval
-from sim.files.records import identity, provenance, sources_sha256
+from sim.files.provenance import provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -261,7 +262,7 @@ def parse(
         seed=args.seed,
         small=args.small,
         out=out,
-        origin={**provenance(device, args.seed), **identity(robot, str(robot.policy_file)), **trial},
+        origin={**provenance(device, args.seed), **controller_identity(robot, str(robot.policy_file)), **trial},
         parts=tuple(getattr(args, "parts", None) or ()),
     )
 

@@ -32,7 +32,7 @@ from results.make.speed import time_crossings
 from sim.controllers.imports import import_controller
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.records import provenance
+from sim.files.provenance import provenance
 from sim.files.settings import read_toml
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg

@@ -17,7 +17,7 @@ import torch
 
 from results.make import peer
 from results.make.common import Script, parse
-from sim.files.records import device_name
+from sim.files.provenance import device_name
 from train.ppo.learner import Learner, PpoCfg, Ranks
 from train.task.task import CommandTask, TaskCfg
 from train.task.vec_env import CommandVecEnv

@@ -21,8 +21,8 @@ from sim.controllers.mlp import ACTIVATIONS, MlpPolicy, RnnPolicy
 from sim.controllers.runner import Recurrent, action_problem, forget_all, with_rows_of_zeros
 from sim.controllers.spec import ControllerSpec, agent_file, find_named, in_one_line, weights_file
 from sim.files.atomic import check_zip, read_json
-from sim.files.records import robot_digest
 from sim.robots.find import get_robot
+from sim.robots.identity import robot_digest
 from sim.robots.robot import RobotCfg
 
 _WEIGHTS = "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx)"

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 
 SHIPPED = "shipped"
@@ -116,6 +117,15 @@ def controller_hash(policy: str | Path) -> str | None:
     if spec.place is None and len(hashes) == 1:
         return hashes[0]
     return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
+
+
+def controller_identity(robot: RobotCfg, policy: str | Path) -> dict[str, str | None]:
+    """What a record of a robot under a controller names: ``robot``, ``policy`` (a name without folders), their hashes.
+
+    ``policy_sha256`` is None for a controller without a file.
+    """
+    controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(str(policy))}
+    return {"robot": robot.name, **robot_identity(robot), **controller}
 
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, PENALTIES
-from sim.files.records import identity, provenance
+from sim.controllers.spec import controller_identity
+from sim.files.provenance import provenance
 from sim.rollout import Rollout, RolloutResult
 from sim.terrains.ground import GroundMaps
 
@@ -76,7 +77,7 @@ class Recording:
     command: NDArray[np.float32]
     """Command of the coming control step: v_x, v_y [m/s], yaw rate [rad/s], yaw frame; 0 once ended; (T, K, F, 3)."""
     origin: dict[str, Any]
-    """Where it comes from: :func:`sim.files.records.identity`, command, commit, device, versions, seed, date."""
+    """Of :func:`sim.controllers.spec.controller_identity` and :func:`sim.files.provenance.provenance`."""
     geom_names: tuple[str, ...]
     """Of the G geoms whose touch is known: base, limbs and feet."""
     touching: NDArray[np.bool_]
@@ -226,7 +227,7 @@ def record(
         genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
         seeds=seeds.astype(np.uint32),
         origin={
-            **identity(robot, str(policy)),
+            **controller_identity(robot, str(policy)),
             "policy": str(policy),
             "space": rollout.space.name,
             "space_sha256": rollout.space.sha256,

@@ -8,7 +8,7 @@ from typing import Any
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import command_line
-from sim.files.records import check_identity
+from sim.robots.identity import check_robot_identity
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 
@@ -36,8 +36,8 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
     """The robot that a file names, for example a run's, if it is still what it was.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
-    file names. The record is a file's :func:`sim.files.records.identity`; ``given`` is what the command line names, if
-    anything; errors name the file and its ``kind``.
+    file names. The record has the keys of :func:`sim.robots.identity.robot_identity`; ``given`` is what the command
+    names, if anything; errors name the file and its ``kind``.
     """
     name, robot = record["robot"], None if given is None else get_robot(given)
     if robot is not None and robot.name != name:
@@ -45,7 +45,7 @@ def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Pa
     if robot is None and name not in ROBOTS:
         raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
     robot = robot or ROBOTS[name]
-    check_identity(record, robot, file, "make it anew")
+    check_robot_identity(record, robot, file, "make it anew")
     return robot
 
 
@@ -58,7 +58,7 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
     if not robot.scales_file.exists():
         raise ValueError(f"no penalty scales of robot '{robot.name}': expected {robot.scales_file}; {remedy}")
     content = read_json(robot.scales_file)
-    check_identity(content, robot, robot.scales_file, remedy)
+    check_robot_identity(content, robot, robot.scales_file, remedy)
     scales = content.get("scales")
     scales = scales if isinstance(scales, dict) else {}
     missing = [name for name in robot.penalties if type(scales.get(name)) not in (int, float)

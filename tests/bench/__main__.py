@@ -17,7 +17,7 @@ from sim.controllers.loaders import prepare_torch
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.intervals import value_words
-from sim.files.records import provenance
+from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
 from tests.bench.ceiling import Ceiling, measure_ceiling

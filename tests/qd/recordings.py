@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from kernels.episode import Outcome
-from sim.files.records import identity
+from sim.controllers.spec import controller_identity
 from sim.recording.recorder import Recording
 from sim.robots.find import get_robot
 from tests.qd.stand_in import PENALTIES
@@ -60,7 +60,7 @@ def stand_in_cross(crossed: list):
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
             outcomes = [ends[(number + k) % 4] for k in range(crossing.replicas)]
             recording = recording_of(outcomes, np.linspace(6.0, 14.0, crossing.replicas), seed=crossing.terrain_seed)
-            origin = identity(get_robot("anymal"), crossing.policy) | {"space": "super_gaussian"}
+            origin = controller_identity(get_robot("anymal"), crossing.policy) | {"space": "super_gaussian"}
             origin["seed"] = crossing.seed
             given = {"genes" if crossing.terrain.ndim == 1 else "heights": crossing.terrain[None]}
             made.append(replace(recording, labels=(crossing.label,), origin=origin, **given))

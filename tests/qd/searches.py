@@ -17,8 +17,8 @@ from qd.search.settings import SearchCfg
 from qd.show import figures
 from qd.workers.evaluator import Compute
 from sim.controllers.spec import controller_hash
-from sim.files.records import robot_identity
 from sim.robots.find import get_robot
+from sim.robots.identity import robot_identity
 from tests.qd import stand_in
 from tests.qd.stand_in import compute_by, open_stand_in
 

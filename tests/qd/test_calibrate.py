@@ -8,7 +8,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.calibrate import calibrate, fitting_height, measured
-from sim.files.records import identity
+from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import get_space
@@ -71,7 +71,7 @@ def test_the_file_is_what_the_robot_reads(scales):
     content = json.loads(scales.read_text())
     assert read_penalty_scales(ROBOT) == tuple(content["scales"].values())
     assert (content["terrains"], content["episodes"], content["invalid_episodes"], content["seed"]) == (60, 240, 0, 0)
-    assert identity(ROBOT, ROBOT.policy_file).items() <= content.items()
+    assert controller_identity(ROBOT, ROBOT.policy_file).items() <= content.items()
     assert (content["space"], content["crossing"]["speed"]) == ("super_gaussian", 0.75)
 
 

@@ -6,8 +6,9 @@ import json
 import pytest
 
 from sim.controllers.loaders import load_policy
-from sim.files.records import identity, robot_digest, robot_identity
+from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, robot_of
+from sim.robots.identity import robot_digest, robot_identity
 from sim.robots.shipped import ROBOTS
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.dogs import write_dog
@@ -36,4 +37,4 @@ def test_the_shipped_scales_are_of_the_shipped_robot_and_controller(name):
     """If this fails, a shipped file has changed: its scales must be measured again."""
     robot = ROBOTS[name]
     content = json.loads(robot.scales_file.read_text())
-    assert identity(robot, robot.policy_file).items() <= content.items()
+    assert controller_identity(robot, robot.policy_file).items() <= content.items()

@@ -20,7 +20,7 @@ RUN_COMMANDS = """
 import contextlib, io, json, sys
 import faultline
 
-from sim.files.records import robot_identity
+from sim.robots.identity import robot_identity
 from sim.robots.find import get_robot
 
 if __name__ == "__main__":

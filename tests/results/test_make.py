@@ -19,7 +19,7 @@ import pytest
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
 from results.make import archive, bare, common, docs, rounds, search, search_noise, speed, tables, train_speed
-from sim.files.records import sources_sha256
+from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.searches import rows_of, run, without_figures

@@ -21,7 +21,8 @@ from sim.controllers.spec import is_same
 from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
-from sim.files.records import provenance, robot_digest
+from sim.files.provenance import provenance
+from sim.robots.identity import robot_digest
 from sim.robots.robot import RobotCfg
 from train.cfg import TrainCfg
 from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, read_checkpoint, write_checkpoint

@@ -19,10 +19,10 @@ from qd.search.directory import claimed
 from qd.show.figures import draw_minimal, save_figure
 from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, check_policy
+from sim.controllers.spec import controller_identity
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import chosen_elites
 from sim.files.npz import npz_bytes
-from sim.files.records import identity
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.base import TerrainSpace
 
@@ -79,7 +79,7 @@ def minimise(
         if not entries:
             return None
         ordered = [entries[number] for number in sorted(entries)]
-        origin = compute.origin(search.cfg.seed) | identity(search.robot, search.policy)
+        origin = compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
         space_named = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
         content = {**origin, **space_named, **_totals(ordered), "elites": ordered}
         arrays = {name: np.array(value) for name, value in space_named.items() if value is not None}

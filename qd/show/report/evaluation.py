@@ -12,7 +12,7 @@ from qd.show.report.page import Table, check_page, origin_rows, percent, publish
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.intervals import value_words
-from sim.files.records import without_machine
+from sim.files.provenance import without_machine
 from sim.robots.find import get_robot
 
 _COUNTS = ("elites", "failing", "confirmed", "certified", "faults")

@@ -20,7 +20,7 @@ from qd.show.report.pictures import close_pictures, failure_of, same_moment, why
 from qd.show.report.search import content_of
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.controllers.spec import spec_of
-from sim.files.records import without_machine
+from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
 
 _OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown

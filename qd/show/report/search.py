@@ -18,7 +18,7 @@ from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
 from sim.controllers.spec import SHIPPED, ControllerSpec, spec_of
 from sim.files.intervals import RATES, bootstrap_interval
-from sim.files.records import without_machine
+from sim.files.provenance import without_machine
 
 _MOST_BARS = 10
 _FAULT = VERDICTS.index("fault")

@@ -23,8 +23,8 @@ from qd.evaluate.pack import (
 from qd.faults.judge import find_search, judge
 from qd.faults.minimise.minimise import minimise
 from qd.search.archive import read_archive
+from sim.controllers.spec import controller_identity
 from sim.files.command import run_command
-from sim.files.records import identity
 from sim.robots.shipped import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.robots import OTHER, Robots, bump_stops
@@ -105,7 +105,8 @@ def pack(tmp_path, anymal, monkeypatch):
     entries = add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
     genes = np.array([np.full(64, entry["elite"] / 100) for entry in chosen], np.float32)
     content = {
-        **identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base", "terrains": entries,
+        **controller_identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base",
+        "terrains": entries,
         "rates": {"base": summarise_rates(entries, "base", 0)},
         "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), genes),
     }  # fmt: skip

@@ -20,9 +20,9 @@ from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
 from qd.show.view.show import find_show
-from sim.controllers.spec import controller_hash
+from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
-from sim.files.records import identity, robot_identity
+from sim.robots.identity import robot_identity
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import FRAMES, recording_of
 from tests.qd.searches import CFG
@@ -53,7 +53,7 @@ def recording(anymal):
     sums = np.tile([2.0, 16.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
     outcomes = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.GOAL, Outcome.GOAL]
     made = recording_of(outcomes, [5.0, 14.0, 14.0, 14.0], penalties=sums)
-    return dataclasses.replace(made, origin=identity(anymal, "shipped") | {"space": "super_gaussian"})
+    return dataclasses.replace(made, origin=controller_identity(anymal, "shipped") | {"space": "super_gaussian"})
 
 
 def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
-from sim.files.records import robot_identity
 from sim.robots.find import read_penalty_scales
+from sim.robots.identity import robot_identity
 from sim.robots.model import build_robot
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank

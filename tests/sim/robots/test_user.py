@@ -14,10 +14,10 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from sim.controllers.adapters import read_row
 from sim.crossing import resolved
-from sim.files.records import robot_digest
 from sim.mujoco_c.crossing import cross, draw_starts
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot, read_penalty_scales
+from sim.robots.identity import robot_digest
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes

@@ -1,4 +1,4 @@
-"""What every results file says of where it comes from and what it is of: command, code, device, robot, controller."""
+"""Where a results file comes from: command, code, device, versions, seed and date."""
 
 import hashlib
 import json
@@ -8,20 +8,13 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, fields
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.spec import ControllerSpec, controller_hash
-from sim.robots.model_files import read_model_files
-from sim.robots.robot import RobotCfg
-
-PENALTY_DEFINITION = "squared"
-"""How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
 ROOMS = ("kernels", "sim", "qd", "train")
 """Folders of the source code."""
 
@@ -29,8 +22,6 @@ ROOT = Path(__file__).resolve().parents[2]
 """Folder of the rooms."""
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
 _SOURCES = (".py", ".cu", ".xml")
-_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning")
-_SHOWN = 12  # digits of a hash in a message
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
@@ -108,52 +99,3 @@ def _output(command: Sequence[str | Path]) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
-
-
-def robot_digest(robot: RobotCfg) -> str:
-    """SHA-256 of a robot: its settings without those of training, its model and its meshes.
-
-    A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
-    """
-    settings = {}
-    for field in fields(robot):
-        value = getattr(robot, field.name)
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        if field.name not in _NOT_IN_DIGEST and value != default:
-            settings[field.name] = value
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    for file in read_model_files(robot.model_file).files:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
-
-
-def robot_identity(robot: RobotCfg) -> dict[str, str]:
-    """The keys ``robot_sha256`` and ``penalty_definition``, which every record of a robot has."""
-    return {"robot_sha256": robot_digest(robot), "penalty_definition": PENALTY_DEFINITION}
-
-
-def identity(robot: RobotCfg, policy: str | Path) -> dict[str, str | None]:
-    """What a record of a robot under a controller names: ``robot``, ``policy`` (a name without folders), their hashes.
-
-    ``policy_sha256`` is None for a controller without a file.
-    """
-    controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(str(policy))}
-    return {"robot": robot.name, **robot_identity(robot), **controller}
-
-
-def check_robot(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
-    """Refuses the record in a file that is of the robot before it changed; ``remedy`` is what else helps."""
-    expected, now = record.get("robot_sha256"), robot_digest(robot)
-    if expected != now:
-        raise ValueError(
-            f"{file} is of robot '{robot.name}' as it was before its settings, model or meshes changed (expected "
-            f"SHA-256 {str(expected)[:_SHOWN]}, got {now[:_SHOWN]} of {robot.spec}): put that back, or {remedy}"
-        )
-
-
-def check_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
-    """Refuses a record of a robot that has changed since (:func:`check_robot`) or of penalties defined otherwise."""
-    definition = record.get("penalty_definition")
-    if definition != PENALTY_DEFINITION:
-        raise ValueError(f"{file} is of penalties by {definition} errors, expected {PENALTY_DEFINITION} ones; {remedy}")
-    check_robot(record, robot, file, remedy)

@@ -1,11 +1,8 @@
 """Provenance, and files that are whole or absent."""
 
-import dataclasses
-import hashlib
 import json
 import re
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,8 +10,7 @@ import pytest
 
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
-from sim.files.records import check_identity, code_fingerprint, identity, provenance, robot_digest
-from sim.robots.training import TrainingCfg
+from sim.files.provenance import code_fingerprint, provenance
 
 
 def test_provenance_has_its_keys(monkeypatch):
@@ -52,7 +48,7 @@ def test_what_is_no_json_object_is_refused(tmp_path, text):
 
 
 def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
-    monkeypatch.setattr("sim.files.records.ROOT", tmp_path)
+    monkeypatch.setattr("sim.files.provenance.ROOT", tmp_path)
     for room in ("one", "two"):
         (tmp_path / room).mkdir()
         (tmp_path / room / "a.py").write_text("x = 1")
@@ -62,7 +58,7 @@ def test_a_fingerprint_follows_the_code(monkeypatch, tmp_path):
     assert code_fingerprint(["one"]) == before != code_fingerprint(["one", "two"])
     (tmp_path / "one" / "robot.xml").write_text("<mujoco/>")
     with_robot = code_fingerprint(["one"])
-    monkeypatch.setattr("sim.files.records.versions", lambda: {"torch": "0"})
+    monkeypatch.setattr("sim.files.provenance.versions", lambda: {"torch": "0"})
     assert len({before, with_robot, code_fingerprint(["one"])}) == 3
 
 
@@ -76,24 +72,6 @@ def test_the_command_recorded_is_the_one_to_type(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     given = ("bench", "--out", str(tmp_path / "a" / "b.json"), "--run=/home/me/runs/x")
     assert recorded("faultline", *given) == "faultline bench --out a/b.json --run=x"
-
-
-def test_records_name_robot_and_controller_by_hash(anymal, tmp_path):
-    record = identity(anymal, anymal.policy_file)
-    assert record["robot"] == "anymal" and record["policy"] == "anymal.pt"
-    assert record["robot_sha256"] == robot_digest(anymal)
-    assert record["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
-    check_identity(record, anymal, Path("a.json"), "make it anew")
-    for key in ("robot_sha256", "penalty_definition"):
-        for changed in (record | {key: "other"}, {name: value for name, value in record.items() if name != key}):
-            with pytest.raises(ValueError, match=r"a\.json"):
-                check_identity(changed, anymal, Path("a.json"), "make it anew")
-
-
-def test_a_robots_hash_follows_its_settings_but_those_of_training(anymal):
-    digest = robot_digest(anymal)
-    assert robot_digest(dataclasses.replace(anymal, max_speed=99.0)) != digest
-    assert robot_digest(dataclasses.replace(anymal, training=TrainingCfg(push_speed=9.0))) == digest
 
 
 def test_arrays_are_read_by_name_and_their_shapes_agree(tmp_path):
