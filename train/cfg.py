@@ -1,6 +1,6 @@
 """Settings of trainings. Nothing here loads torch or Warp: the help of a command shows them."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -16,8 +16,6 @@ _Cfg = TypeVar("_Cfg", bound="TrainCfg")
 Sizes = dict[str, int]
 """Sizes of a training by the names of their settings."""
 _BASE_ON_CPU: Sizes = {"num_envs": 32, "iterations": 20}
-_PAPER: Sizes = {"num_envs": 1500, "terrains": 500, "swap_every": 400, "iterations": 1200}  # its ANYmal
-_PAPER_CASSIE: Sizes = {"num_envs": 600, "terrains": 100, "swap_every": 200, "iterations": 3000}
 _TUNING_ON_CPU: Sizes = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
 LARGE: Sizes = {"num_envs": 8192, "terrains": 2000}
 """Sizes that left ANYmal a third of the faults that the paper's left."""
@@ -137,8 +135,7 @@ class FinetuneCfg(TrainCfg):
 
     def sized(self, robot: RobotCfg, device: str, **on_cuda: int) -> Self:
         """The same with sizes that suit the robot and the Warp device, or are given, in place of those that are 0."""
-        paper = _PAPER_CASSIE if robot.name == "cassie" else _PAPER
-        sizes = paper | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
+        sizes = asdict(robot.paper) | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
         recipe = replace(self.recipe, swap_every=self.recipe.swap_every or sizes["swap_every"])
         return replace(_with_sizes(self, sizes), recipe=recipe)
 
@@ -203,7 +200,7 @@ class HardenCfg:
 
     def sized_tune(self, robot: RobotCfg, device: str) -> FinetuneCfg:
         """Each training with sizes that suit the robot and the Warp device in place of those that are 0."""
-        return self.tune.sized(robot, device, **({} if robot.name == "cassie" else LARGE))
+        return self.tune.sized(robot, device, **(LARGE if robot.tuning.large_rounds else {}))
 
 
 def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:

@@ -23,6 +23,8 @@ from qd.faults.families import families_of, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_archive_of, search_seed
 from sim.robots.robot import RobotCfg
+from sim.robots.shipped import ROBOTS
+from sim.robots.training import PaperCfg
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
@@ -93,7 +95,7 @@ class TerrainSet:
 
 def paper_terrains(robot: str) -> int:
     """Terrains a set of the published tables of a robot; 300 of one that the paper does not have."""
-    return 180 if robot == "cassie" else 300
+    return (ROBOTS[robot].paper if robot in ROBOTS else PaperCfg()).test_terrains
 
 
 def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:

@@ -16,6 +16,7 @@ from sim.files.figures import new_figure
 from sim.files.intervals import rate_words, wilson_interval
 from sim.rates import typical_outcome
 from sim.recording.recorder import Recording
+from sim.robots.find import robot_label
 from sim.terrains.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
 
@@ -120,12 +121,9 @@ def episode_beside(recording: Recording, episode: int, scales: dict[str, float])
     return episode if arrived[episode] or not arrived.any() else typical_episode(recording, scales, Outcome.GOAL)
 
 
-_NAMES = {"anymal": "ANYmal C", "cassie": "Cassie"}  # of robots, as their makers write them
-
-
 def title_of(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
-    who = _NAMES.get(recording.robot, recording.robot) + (f" with {controller}" if controller else "")
+    who = robot_label(recording.robot) + (f" with {controller}" if controller else "")
     outcome, most = recording.outcome[0], int(typical_outcome(recording.outcome[0]))
     valid, ended, fallen = outcome != Outcome.INVALID, outcome == most, recording.fallen[0]
     if not valid.any():

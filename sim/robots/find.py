@@ -32,6 +32,11 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     raise ValueError(f"unknown robot '{spec}': expected {known}, a robot.toml or a Python file (docs/robots.md)")
 
 
+def robot_label(name: str) -> str:
+    """Name of a shipped robot as its makers write it; the name itself of any other."""
+    return ROBOTS[name].label if name in ROBOTS else name
+
+
 def robot_of(record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, kind: str = "run") -> RobotCfg:
     """The robot that a file names, for example a run's, if it is still what it was.
 

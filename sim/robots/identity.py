@@ -12,7 +12,7 @@ from sim.robots.robot import RobotCfg
 
 PENALTY_DEFINITION = "squared"
 """How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
-_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning")
+_NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
 _SHOWN_DIGITS = 12  # of a hash in a message
 
 

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from sim.files.command import command_line
 from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
-from sim.robots.training import LearningCfg, TrainingCfg, TuningCfg
+from sim.robots.training import LearningCfg, PaperCfg, TrainingCfg, TuningCfg
 
 ROBOTS_DIR = Path(__file__).parent
 """Folder of the files of the shipped robots."""
@@ -65,8 +65,6 @@ class RobotCfg:
     """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
     nconmax: PositiveInt = 40
     """Most contacts of a robot with the ground."""
-    njmax: PositiveInt = 100
-    """Has no effect: constraint rows have the room that so many contacts need. It stays for the hashes that have it."""
     stiffness: tuple[PositiveFloat, ...] | None = None
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
     damping: tuple[NonNegativeFloat, ...] | None = None
@@ -94,6 +92,10 @@ class RobotCfg:
     training: TrainingCfg = field(default_factory=TrainingCfg)
     learning: LearningCfg = field(default_factory=LearningCfg)
     tuning: TuningCfg = field(default_factory=TuningCfg)
+    label: str = ""
+    """Name of a shipped robot as its makers write it."""
+    paper: PaperCfg = field(default_factory=PaperCfg)
+    """What the paper did with a shipped robot."""
     settings_file: Path | None = None
     """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
 

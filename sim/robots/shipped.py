@@ -1,7 +1,7 @@
 """The shipped robots, ANYmal and Cassie."""
 
 from sim.robots.robot import ROBOTS_DIR, RobotCfg
-from sim.robots.training import LearningCfg, RewardCfg, TrainingCfg, TuningCfg
+from sim.robots.training import LearningCfg, PaperCfg, RewardCfg, TrainingCfg, TuningCfg
 
 
 def _steps(low: int, high: int) -> tuple[float, ...]:
@@ -15,6 +15,7 @@ _PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble")
 ROBOTS = {
     "anymal": RobotCfg(
         name="anymal",
+        label="ANYmal C",
         model_file=ROBOTS_DIR / "anymal.xml",
         base_geoms=("base",),
         foot_geoms=tuple(f"{leg}_FOOT" for leg in _LEGS),
@@ -33,6 +34,7 @@ ROBOTS = {
     ),
     "cassie": RobotCfg(
         name="cassie",
+        label="Cassie",
         model_file=ROBOTS_DIR / "cassie.xml",
         base_geoms=("pelvis",),
         foot_geoms=tuple(f"{side}_toe" for side in _SIDES),
@@ -51,7 +53,6 @@ ROBOTS = {
         penalties=_PENALTIES,
         collision_bit=True,
         nconmax=7,  # the most there can be: a sphere, and 3 on each toe
-        njmax=48,
         max_speed=300.0,  # its light ankles get faster than 100 rad/s in falls, by their motors alone
         training=TrainingCfg(
             rewards=RewardCfg(
@@ -74,6 +75,7 @@ ROBOTS = {
             start_joint_range=0.2,
         ),
         learning=LearningCfg(num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005),
-        tuning=TuningCfg(tracking_lin_vel=4.0),
+        tuning=TuningCfg(tracking_lin_vel=4.0, large_rounds=False),
+        paper=PaperCfg(num_envs=600, terrains=100, swap_every=200, iterations=3000, test_terrains=180),
     ),
 }

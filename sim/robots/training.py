@@ -110,3 +110,19 @@ class TuningCfg:
     """Weight of the entropy bonus. It widens the noise of the actions, which a further training begins with."""
     average: Share = 0.2
     """Share of all iterations, the last ones, whose actors are averaged into the controller."""
+    large_rounds: bool = True
+    """Whether a hardening on a GPU trains with 8192 robots and 2000 terrains at a time, else with the paper's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperCfg:
+    """Sizes of the paper's fine-tunings and tables (arXiv 2506.01362); the defaults are its ANYmal's."""
+
+    num_envs: int = 1500
+    terrains: int = 500
+    """Terrains at a time."""
+    swap_every: int = 400
+    """Iterations after which the terrains are exchanged."""
+    iterations: int = 1200
+    test_terrains: int = 300
+    """Terrains of each set of its tables."""

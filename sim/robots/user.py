@@ -27,6 +27,7 @@ _NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
 INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
             "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
 """Settings that a robot.toml may leave out though there is no default."""
+_NOT_IN_TOML = ("label", "paper", "settings_file")  # settings
 NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
 """What a robot may be called, since files and folders are called after it."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
@@ -70,7 +71,7 @@ def load_robot(path: Path) -> RobotCfg:
 def _read_toml(path: Path, file: Path) -> tuple[RobotCfg, RobotFile]:
     """The robot of a robot.toml, and its model, from which is inferred what it leaves out."""
     given = read_toml(path)
-    known = [field.name for field in fields(RobotCfg) if field.name != "settings_file"]
+    known = [field.name for field in fields(RobotCfg) if field.name not in _NOT_IN_TOML]
     if unknown := [name for name in given if name not in known]:
         raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(known)}")
     if no_list := [name for name in _NAMES if not isinstance(given.get(name, []), list)]:

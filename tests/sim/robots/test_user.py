@@ -95,6 +95,8 @@ def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path)
     ("text", "named"),
     [
         ("speeed = 1", "speeed"),
+        ("njmax = 100", "njmax"),
+        ("label = 'Dog'", "label"),
         ("stiffness = {'.*hip' = 50}\ndamping = 2", "FL_knee"),
         ("stiffness = {'.*' = 50, '.*knee' = 40}\ndamping = 2", "FL_knee"),
         ("stiffness = {'.*' = 50, '.*ankle' = 40}\ndamping = 2", "ankle"),
