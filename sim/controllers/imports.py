@@ -14,8 +14,10 @@ import onnx
 from sim.controllers.loaders import activation_in, load_network, read_yaml, widths
 from sim.files.command import command_line
 from sim.files.settings import to_toml
-from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
+from sim.robots.compiled import PER_JOINT
+from sim.robots.elements import joint_names
 from sim.robots.robot import RobotCfg
+from sim.robots.robot_file import read_robot_file
 from sim.robots.user import NEW_NAME, is_new_name, per_joint
 
 _FILES = {

@@ -44,7 +44,8 @@ from sim.mujoco_c.model import (
     to_mujoco,
     vary_model,
 )
-from sim.robots.compiled import mj, robot_spec
+from sim.robots.compiled import robot_spec
+from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, terrains_of

@@ -17,7 +17,8 @@ from kernels.conditions import Condition
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
-from sim.robots.compiled import mj, robot_spec, rotation_matrix
+from sim.robots.compiled import robot_spec
+from sim.robots.elements import mj, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
 from sim.terrains.ground import PATCHES, GroundMaps

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_CONTROLLER, TOUCH, scene_model
-from sim.robots.compiled import mj
+from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import touches_of
 from sim.terrains.ground import GroundMaps

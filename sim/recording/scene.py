@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
-from sim.robots.compiled import mj
+from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import robot_model, shown_spec
 from sim.terrains.ground import GroundMaps

@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.robots.compiled import mesh_of, mj, robot_spec, rotation_matrix
+from sim.robots.compiled import robot_spec
+from sim.robots.elements import mj, read_mesh, rotation_matrix
 from sim.robots.robot import RobotCfg
 
 _GEOM, _TYPE = mj.mjtGeom, newton.GeoType
@@ -129,7 +130,7 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
     """Adds a shape that touches the ground."""
     kind, source, scale = _GEOM(int(model.geom_type[geom])), None, model.geom_size[geom]
     if kind == _GEOM.mjGEOM_MESH:
-        vertices, faces = mesh_of(model, geom)
+        vertices, faces = read_mesh(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)
     builder.add_shape(
         body=int(model.geom_bodyid[geom]) - 1,

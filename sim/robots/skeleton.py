@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.compiled import mesh_of, mj, robot_spec, touching_geoms
+from sim.robots.compiled import robot_spec
+from sim.robots.elements import mj, read_mesh, touching_geoms
 from sim.robots.robot import RobotCfg
 
 _KIND = mj.mjtGeom
@@ -127,7 +128,7 @@ class Skeleton:
         model = self.model
         kind, size = int(model.geom_type[geom]), model.geom_size[geom]
         if kind == _KIND.mjGEOM_MESH:
-            shape = trimesh.Trimesh(*mesh_of(model, geom), process=False)
+            shape = trimesh.Trimesh(*read_mesh(model, geom), process=False)
         else:
             shape = trimesh.graph.smooth_shade(_primitive(kind, size), angle=_CREASE)
         transform = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])  # w x y z too
