@@ -16,7 +16,7 @@ import numpy as np
 
 from qd.evaluate.evaluate import cross_sets, evaluate, fill_sizes
 from qd.evaluate.measures import terrain_rates
-from qd.evaluate.sets import MIN_ELITES, Part, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
+from qd.evaluate.sets import MIN_ELITES, Purpose, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
 from qd.evaluate.show import show_table
 from qd.faults.judge import judge
 from qd.faults.numbers import EPISODES
@@ -176,13 +176,13 @@ class _Hardening:
             goal[when] = {name: float(np.nanmean(values)) for name, values in (rates | {"elites": elites}).items()}
         return {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal}
 
-    def _sets(self, searches: Sequence[Path], part: Part) -> dict[str, TerrainSet]:
-        """The fixed sets, and of each search the elites of a part that no training draws, by its name."""
+    def _sets(self, searches: Sequence[Path], purpose: Purpose) -> dict[str, TerrainSet]:
+        """The fixed sets, and for each search, by its name, the elites that no training draws."""
         terrains = self.cfg.evaluation.terrains
-        sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, part=part))
+        sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, purpose=purpose))
         for run in searches:
             archive = read_elites(run, self.robot, self.space.name)
-            sets[run.name] = generated_set(archive, terrains, 0, part)
+            sets[run.name] = generated_set(archive, terrains, 0, purpose)
         return sets
 
     def search(self, number: int) -> None:

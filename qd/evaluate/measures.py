@@ -1,4 +1,4 @@
-"""What crossings say of a controller: rates, reward and scaled penalties by terrain, by terrain type and by level."""
+"""Rates, reward and scaled penalties of a controller on each terrain, by terrain type and by level."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ VELOCITY_FROM_S = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Performance:
-    """What one controller made of T terrains; NaN on an invalid terrain, of which over a quarter of the episodes are.
+    """A controller's numbers on each of T terrains, over the valid episodes; NaN on an invalid terrain.
 
-    Statistics are over the valid episodes of a terrain.
+    A terrain is invalid if over a quarter of its episodes are.
     """
 
     values: dict[str, NDArray[np.float64]]
@@ -48,33 +48,33 @@ Families = NDArray[np.int64] | None
 
 def valid_mean(values: NDArray[np.float64]) -> float | None:
     """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else None
+    valid = values[~np.isnan(values)]
+    return float(valid.mean()) if len(valid) else None
 
 
 def valid_interval(
     values: NDArray[np.float64], seed: int, families: Families, bounds: tuple[float, float] | None
 ) -> list[float] | None:
     """95 % interval of :func:`valid_mean`: bootstrap over terrains, or over their families."""
-    known = ~np.isnan(values)
-    return bootstrap_interval(values[known], seed, families=select_families(families, known), bounds=bounds)
+    valid = ~np.isnan(values)
+    return bootstrap_interval(values[valid], seed, families=select_families(families, valid), bounds=bounds)
 
 
 def measure_bounds(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
-    """Where a measure lies, or differences of it; None of one without bounds."""
+    """Least and largest value of a measure, or of differences of it; None if it has no bounds."""
     return (DIFFERENCES if differences else RATES) if CERTIFIED.get(measure, measure) in RATE_MEASURES else None
 
 
 def kind_mean(
     values: Sequence[NDArray[np.float64]], families: Families, seed: int, measure: str = "goal"
 ) -> dict[str, Any] | None:
-    """What a measure is in the mean for one kind of controller, or how much more it is for the first of two kinds.
+    """The mean of a measure for one kind of controller, or the difference of two kinds, the first minus the second.
 
     Args:
-        values: Of the trainings of one kind or of two on the terrains, each of shape (num_trainings, num_terrains).
-        families: Of terrains that are not independent.
-        seed: Of the bootstrap.
-        measure: Which one of :data:`qd.evaluate.labels.MEASURES` or of the certified terrains.
+        values: The measure for each kind, shape (num_trainings, num_terrains).
+        families: Family of each terrain; None of independent terrains.
+        seed: Seed of the bootstrap.
+        measure: Its name in :data:`qd.evaluate.labels.MEASURES` or ``CERTIFIED``.
 
     Returns:
         ``mean``, its 95 % ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain
@@ -82,30 +82,32 @@ def kind_mean(
         kind; the interval is Student's with Satterthwaite's degrees of freedom (1946), and no narrower than the
         bootstrap's. One training says nothing of others.
     """
-    known = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
-    if not known.any():
+    valid = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
+    if not valid.any():
         return None
-    of_seeds = [sign * kind[:, known] for sign, kind in zip((1.0, -1.0), values, strict=False)]
-    on_terrains = np.sum([kind.mean(axis=0) for kind in of_seeds], axis=0)
-    bounds = measure_bounds(measure, differences=len(of_seeds) > 1)
-    limits = valid_interval(on_terrains, seed, select_families(families, known), bounds)
-    parts = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in of_seeds if len(kind) > 1]
-    of_families = 0.0 if limits is None else ((limits[1] - limits[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2
-    variance = of_families + sum(part for part, _ in parts)
-    spread = sum(part**2 / freedom for part, freedom in parts)
+    kinds = [sign * kind[:, valid] for sign, kind in zip((1.0, -1.0), values, strict=False)]
+    by_terrain = np.sum([kind.mean(axis=0) for kind in kinds], axis=0)
+    bounds = measure_bounds(measure, differences=len(kinds) > 1)
+    bootstrap = valid_interval(by_terrain, seed, select_families(families, valid), bounds)
+    variances = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in kinds if len(kind) > 1]
+    variance = sum(value for value, _ in variances)
+    if bootstrap is not None:
+        variance = ((bootstrap[1] - bootstrap[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2 + variance
+    spread = sum(value**2 / freedom for value, freedom in variances)
     freedom = variance**2 / spread if spread > 0.0 else np.inf
-    mean, half = float(on_terrains.mean()), float(stdtrit(freedom, 0.975) * np.sqrt(variance))
-    ends = [[mean - half, mean + half]] if parts else []
-    ends += [] if limits is None else [limits]
-    interval = [min(low for low, _ in ends), max(high for _, high in ends)] if ends else None
+    mean = float(by_terrain.mean())
+    half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+    intervals = [[mean - half, mean + half]] if variances else []
+    intervals += [] if bootstrap is None else [bootstrap]
+    interval = [min(low for low, _ in intervals), max(high for _, high in intervals)] if intervals else None
     if interval and bounds:
         interval = np.clip(interval, *bounds).tolist()
-    return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in of_seeds]}
+    return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in kinds]}
 
 
-def select_families(families: Families, chosen: NDArray[np.bool_]) -> Families:
-    """Families of some of the terrains."""
-    return None if families is None else families[chosen]
+def select_families(families: Families, mask: NDArray[np.bool_]) -> Families:
+    """Families of the terrains of a mask, shape (T,)."""
+    return None if families is None else families[mask]
 
 
 def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
@@ -116,7 +118,7 @@ def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
 
 
 def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
-    """Everything that the tables say of crossings with their reward; ``scales`` are of the penalties in order."""
+    """A controller's numbers from its crossings with their reward; ``scales`` has each penalty's scale, in order."""
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
     counted = counted_episodes(result.invalid)
@@ -132,8 +134,8 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
     )
 
 
-def _group(rates: dict[str, np.ndarray], members: np.ndarray) -> dict[str, Any]:
-    return {"terrains": int(members.sum())} | {name: valid_mean(values[members]) for name, values in rates.items()}
+def _summarise_group(rates: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+    return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
 
 
 def summarise(
@@ -141,18 +143,17 @@ def summarise(
 ) -> dict[str, Any]:
     """Rates over a set of terrains, with 95 % intervals and, where known, by type and level."""
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
-    everywhere = np.ones(len(result.outcome), bool)
-    summary = _group(rates, everywhere)
+    summary = _summarise_group(rates, np.ones(len(result.outcome), bool))
     summary |= {f"{name}_interval": valid_interval(values, seed, None, RATES) for name, values in rates.items()}
     summary["episodes"] = int(result.outcome.size)
-    ends = [outcome for outcome in Outcome if outcome != Outcome.TILT]
-    summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in ends}
+    outcomes = [outcome for outcome in Outcome if outcome != Outcome.TILT]
+    summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in outcomes}
     summary["invalid_terrains"] = int(np.isnan(rates["success_rate"]).sum())
     summary["by_type"] = summary["by_level"] = None
     if types is not None:
-        summary["by_type"] = {CROSSING_TYPES[k]: _group(rates, types == k) for k in np.unique(types)}
+        summary["by_type"] = {CROSSING_TYPES[k]: _summarise_group(rates, types == k) for k in np.unique(types)}
     if levels is not None:
-        summary["by_level"] = {str(level): _group(rates, levels == level) for level in np.unique(levels)}
+        summary["by_level"] = {str(level): _summarise_group(rates, levels == level) for level in np.unique(levels)}
     return summary
 
 

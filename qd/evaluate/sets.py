@@ -1,11 +1,11 @@
-"""The terrains that controllers are evaluated on, and which elites of an archive are held out of training for that.
+"""The terrains that controllers are evaluated on, and which elites of an archive are held out of training.
 
-A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers meet
+A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers cross
 the same terrains with the same episode seeds. Validation sets, by which settings are chosen, have other terrains of the
-same kinds: nothing is chosen by what is reported.
+same kinds: no setting is chosen by the reported terrains.
 
-Which elites are held out follows from the archive. An archive that grew holds out others, among them some that a
-controller was trained on before; :mod:`qd.evaluate.marks` finds them.
+The archive determines which elites are held out. An archive that grew holds out others, and a controller may have been
+trained on some of them before; :mod:`qd.evaluate.marks` finds these.
 """
 
 import hashlib
@@ -31,14 +31,14 @@ from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
-Part = Literal["test", "validation"]
-"""What terrains are for: to be reported, or to choose settings by."""
+Purpose = Literal["test", "validation"]
+"""What terrains are for: numbers to report, or the choice of settings."""
 MIN_ELITES = 5
 """Fewest elites that can be split: a fifth of them is one."""
 _TRAINING_ELITES = 750  # the paper's
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
-_KEYS = {"test": 20250604, "validation": 20250606}  # with place of name and seed, the entropy of a set
+_KEYS = {"test": 20250604, "validation": 20250606}  # with index of name and seed, the entropy of a set
 _SPLIT_KEY = 20250605
 _NAMES = ("hand_crafted", "hard_random", "flat", "generated", "pack", INDEPENDENT, "dose", "elites")
 _BANK = 50  # height maps that are compared at once
@@ -46,13 +46,13 @@ _BANK = 50  # height maps that are compared at once
 
 @dataclass(frozen=True, kw_only=True)
 class EliteSplit:
-    """Elites to train on and elites held out, as rows of the archive in the order drawn; no elite is in two parts."""
+    """Elites to train on and elites held out, as rows of the archive in the order drawn; the three are disjoint."""
 
     train: NDArray[np.int64]
     validation: NDArray[np.int64]
-    """Held out to choose settings by."""
+    """Held out for the choice of settings."""
     test: NDArray[np.int64]
-    """Held out to be reported: the first n are a random choice of n of them."""
+    """Held out for reported numbers: the first n are a random choice of n of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class TerrainSet:
     seeds: NDArray[np.uint32]
     """Seed of each terrain's episodes, shape (T,)."""
     numbers: NDArray[np.int64]
-    """Number of each terrain: of an elite its row in the archive, of others their place in the set; shape (T,)."""
+    """Number of each terrain, shape (T,): an elite's row in the archive, else the index in the set."""
     types: NDArray[np.int64] | None = None
     """Index into :data:`sim.terrains.hand_crafted.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
     levels: NDArray[np.int64] | None = None
@@ -75,22 +75,22 @@ class TerrainSet:
     """Number of each elite's family (:func:`qd.faults.families.families_of`), shape (T,); None of independent
     terrains."""
     elites: Archive | None = None
-    """The elites, with what is known of them; None of other terrains."""
+    """The elites as an archive; None of other terrains."""
 
     def __len__(self) -> int:
         return len(self.seeds)
 
     @property
     def certified(self) -> NDArray[np.bool_] | None:
-        """Whether anybody crosses each elite that its search's controller fails, shape (T,); None if none was asked."""
+        """Whether another controller crosses each elite that the searched one fails, shape (T,); None if unknown."""
         return self.elites.certified if self.elites is not None and self.elites.counts.certifiers else None
 
-    def rows(self, places: NDArray[np.int64]) -> "TerrainSet":
-        """The terrains in some places."""
+    def rows(self, indices: NDArray[np.int64]) -> "TerrainSet":
+        """The terrains at some indices."""
         arrays: dict[str, Any] = {
-            name: value[places] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+            name: value[indices] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
-        return replace(self, **arrays, elites=None if self.elites is None else self.elites.rows(places))
+        return replace(self, **arrays, elites=None if self.elites is None else self.elites.rows(indices))
 
 
 def paper_terrains(robot: str) -> int:
@@ -101,15 +101,14 @@ def paper_terrains(robot: str) -> int:
 def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
     """Draw at random which elites are trained on and which are held out; without ``held_out`` all are trained on.
 
-    The paper's numbers where the archive has so many: 750 to train on, 300 (ANYmal) or 180 (Cassie) for the test; else
-    80 % and 20 %. A tenth as many as are to be trained on are for validation, at least one. They are those that
-    training leaves over, if there are so many; else training has so many fewer. The draw depends on the elites' genes
-    alone, not on their order in the file: judging an archive again, which reorders it, moves no elite from one part to
-    the other.
+    If the archive has as many elites as the paper's, 750 are trained on and 300 (ANYmal) or 180 (Cassie) are tested on;
+    else 80 % and 20 %. Validation has a tenth as many as training, at least one, from those left over; if too few are
+    left over, training has fewer. The draw depends on the elites' genes alone, not on their order in the file: judging
+    an archive again, which reorders it, changes no elite's purpose.
     """
     if not held_out:
-        nobody = np.zeros(0, np.int64)
-        return EliteSplit(train=_in_order_of_genes(archive), validation=nobody, test=nobody)
+        none = np.zeros(0, np.int64)
+        return EliteSplit(train=_sort_by_genes(archive), validation=none, test=none)
     if len(archive) < MIN_ELITES:
         raise ValueError(
             f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites, got "
@@ -121,20 +120,20 @@ def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
         num_train = len(archive) - num_test
     num_validation = max(1, round(_VALIDATION_SHARE * num_train))
     rng = np.random.default_rng([_SPLIT_KEY, 0, int(elites_sha256(archive)[:16], 16)])
-    drawn = _in_order_of_genes(archive)[rng.permutation(len(archive))]
-    test, rest = drawn[:num_test], drawn[num_test:]
-    num_train = min(num_train, len(rest) - num_validation)
-    return EliteSplit(train=rest[:num_train], validation=rest[num_train : num_train + num_validation], test=test)
+    drawn = _sort_by_genes(archive)[rng.permutation(len(archive))]
+    num_train = min(num_train, len(archive) - num_test - num_validation)
+    test, train, validation, _ = np.split(drawn, np.cumsum([num_test, num_train, num_validation]))
+    return EliteSplit(train=train, validation=validation, test=test)
 
 
-def _in_order_of_genes(archive: Archive) -> NDArray[np.int64]:
+def _sort_by_genes(archive: Archive) -> NDArray[np.int64]:
     """Rows of an archive in an order that does not depend on that of the file."""
     return np.lexsort(archive.genes.T[::-1])
 
 
 def elites_sha256(archive: Archive) -> str:
     """Hash of an archive's genes, whatever their order."""
-    genes = archive.genes[_in_order_of_genes(archive)]
+    genes = archive.genes[_sort_by_genes(archive)]
     return hashlib.sha256(np.ascontiguousarray(genes).tobytes()).hexdigest()
 
 
@@ -147,12 +146,13 @@ def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archiv
 
 
 def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, space: str | None = None) -> Archive:
-    """The archive of another search, which shares no elite and no ancestor with the one trained on, if there is one."""
+    """The archive of another search, which shares no elite and no ancestor with that of ``archive_path``, if given."""
     independent = read_elites(path, robot, space)
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")
     if archive_path is not None:
-        archive, seed = read_elites(archive_path, robot, space), search_seed(path)
+        archive = read_elites(archive_path, robot, space)
+        seed = search_seed(path)
         shared = len({*hash_elites(independent.genes)} & {*hash_elites(archive.genes)})
         other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)
         if other_space or shared or (seed is not None and seed == search_seed(archive_path)):
@@ -164,9 +164,9 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
     return independent
 
 
-def set_rng(name: str, seed: int, part: Part = "test") -> np.random.Generator:
+def set_rng(name: str, seed: int, purpose: Purpose = "test") -> np.random.Generator:
     """Random numbers of a set, shared with no other use of ``seed`` in the project."""
-    return np.random.default_rng([_KEYS[part], _NAMES.index(name), seed])
+    return np.random.default_rng([_KEYS[purpose], _NAMES.index(name), seed])
 
 
 def _episode_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint32]:
@@ -174,10 +174,10 @@ def _episode_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint32]:
 
 
 def plain_set(
-    name: str, count: int, seed: int, space: TerrainSpace = SUPER_GAUSSIAN, part: Part = "test"
+    name: str, count: int, seed: int, space: TerrainSpace = SUPER_GAUSSIAN, purpose: Purpose = "test"
 ) -> TerrainSet:
     """``count`` terrains of a set that needs no archive: ``hand_crafted``, ``hard_random`` of a space, or ``flat``."""
-    rng = set_rng(name, seed, part)
+    rng = set_rng(name, seed, purpose)
     types = levels = None
     if name == "hand_crafted":
         terrains, types, levels = hand_crafted_crossings(count, rng)
@@ -186,30 +186,32 @@ def plain_set(
         terrains = space.hard_random(count, rng)
     else:
         terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
-    seeds, numbers = _episode_seeds(rng, count), np.arange(count)
+    seeds = _episode_seeds(rng, count)
+    numbers = np.arange(count)
     return TerrainSet(terrains=terrains, seeds=seeds, numbers=numbers, types=types, levels=levels, space=space.name)
 
 
-def generated_set(archive: Archive, count: int, seed: int, part: Part = "test") -> TerrainSet:
+def generated_set(archive: Archive, count: int, seed: int, purpose: Purpose = "test") -> TerrainSet:
     """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     split = split_elites(archive)
-    held_out = split.test if part == "test" else split.validation
-    seeds = _episode_seeds(set_rng("generated", seed, part), len(held_out))
+    held_out = split.test if purpose == "test" else split.validation
+    seeds = _episode_seeds(set_rng("generated", seed, purpose), len(held_out))
     return _set_of_elites(archive, held_out[:count], seeds[:count])
 
 
 def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on: Set[str] = frozenset()) -> TerrainSet:
-    """``count`` elites, or all, without those of some marks (:mod:`qd.evaluate.marks`); ``seed`` draws them."""
+    """``count`` elites, or all, without those of some hashes (:mod:`qd.evaluate.marks`); ``seed`` draws them."""
     rng = set_rng(name, seed)
-    rows = _in_order_of_genes(archive)[rng.permutation(len(archive))]
+    rows = _sort_by_genes(archive)[rng.permutation(len(archive))]
     seeds = _episode_seeds(rng, len(archive))
     untrained = ~np.isin(hash_elites(archive.genes[rows]), [*trained_on])
     return _set_of_elites(archive, rows[untrained][:count], seeds[untrained][:count])
 
 
 def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
-    """Their families are those in the whole archive, where it was judged: kin of kin may not be in the set."""
-    elites, space = archive.rows(rows), read_space(archive)
+    """A set of elites with their families in the whole archive, if it was judged: kin of kin may not be in the set."""
+    elites = archive.rows(rows)
+    space = read_space(archive)
     families = families_of(elites.genes, space) if elites.family is None else elites.family
     return TerrainSet(
         terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families, elites=elites
@@ -217,14 +219,14 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
 
 
 def read_space(archive: Archive) -> TerrainSpace:
-    """What an archive's genes mean."""
+    """The terrain space of an archive."""
     return get_space(archive.space, archive.space_sha256)
 
 
 def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
     """The third of a set that is farthest from training terrains, in the set's order and with the same episodes.
 
-    ``distance`` of each terrain to its nearest training terrain has shape (T,).
+    ``distance`` is that of each terrain to its nearest training terrain, shape (T,).
     """
     return whole.rows(np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)]))
 
@@ -232,16 +234,16 @@ def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
 def nearest_distance(
     genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
 ) -> NDArray[np.float64]:
-    """Root mean square distance over all nodes [m] of T height maps to the nearest of others, shape (T,).
+    """Root mean square distance over all nodes [m] of T height maps to the nearest training map, shape (T,).
 
     Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
     """
-    maps, others = (
+    maps, training_maps = (
         heights_of(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
     )
     nearest = np.full(len(maps), np.inf)
-    for first in range(0, len(others), _BANK):
-        nearest = np.minimum(nearest, rms_distances(maps, others[first : first + _BANK]).min(axis=1))
+    for first in range(0, len(training_maps), _BANK):
+        nearest = np.minimum(nearest, rms_distances(maps, training_maps[first : first + _BANK]).min(axis=1))
     return nearest
 
 
@@ -253,13 +255,13 @@ def make_sets(
     archive: Archive | None = None,
     independent: Archive | None = None,
     space: TerrainSpace = SUPER_GAUSSIAN,
-    part: Part = "test",
+    purpose: Purpose = "test",
 ) -> dict[str, TerrainSet]:
-    """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; all that can be had if unnamed.
+    """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; without names all possible ones.
 
-    A set has ``count`` terrains, of generated ones fewer where the archive holds out fewer. ``archive`` has the elites
-    for ``generated`` and ``generated_far``, ``independent`` for ``generated_independent``. ``space`` is that of the
-    hard-random ones.
+    A set has ``count`` terrains; a generated one has fewer if the archive holds out fewer. ``archive`` has the elites
+    for ``generated`` and ``generated_far``, ``independent`` those for ``generated_independent``. ``space`` is that of
+    the hard-random ones.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]
@@ -267,9 +269,10 @@ def make_sets(
         raise ValueError(f"sets must be some of {', '.join(SETS)}, got {', '.join(unknown)}")
     if missing := [name for name in names if name in lacking]:
         raise ValueError(f"sets {', '.join(missing)} are made of elites: give --archive or --independent")
-    sets = {name: plain_set(name, count, seed, space, part) for name in names if name not in (*HELD_OUT, INDEPENDENT)}
+    plain = [name for name in names if name not in (*HELD_OUT, INDEPENDENT)]
+    sets = {name: plain_set(name, count, seed, space, purpose) for name in plain}
     if archive is not None and not set(HELD_OUT).isdisjoint(names):
-        sets["generated"] = whole = generated_set(archive, count, seed, part)
+        sets["generated"] = whole = generated_set(archive, count, seed, purpose)
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
             distance = nearest_distance(whole.terrains, training_genes, read_space(archive))

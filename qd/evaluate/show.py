@@ -18,19 +18,15 @@ _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 
 
 def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Prints a table; its first column is the rows' names."""
+    """Prints a table; its first column has the rows' names."""
     console = Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
-    table = Table(box=None, pad_edge=False)
-    for place, column in enumerate(head):
-        table.add_column(column, justify="right" if place else "left", overflow="fold")
+    table = Table(*head[:1], box=None, pad_edge=False)
+    for column in head[1:]:
+        table.add_column(column, justify="right", overflow="fold")
     for row in rows:
         table.add_row(*map(str, row))
     console.print(f"\n{title}", style="bold")
     console.print(table)
-
-
-def _heads(measures: Iterable[str]) -> list[str]:
-    return ["", *(MEASURES[measure] for measure in measures)]
 
 
 def _rate_cells(row: Mapping[str, Any]) -> list[str]:
@@ -39,12 +35,13 @@ def _rate_cells(row: Mapping[str, Any]) -> list[str]:
 
 def show_rates(report: dict[str, Any]) -> None:
     """Prints the rates of one controller, as ``base.json`` has them."""
-    sets, rows = {SETS[name]: report[name] for name in ("hand_crafted", "hard_random")}, []
-    for label, group in sets.items():
-        parts = {f"  {key}": part for key, part in (group["by_type"] or {}).items()}
-        parts |= {f"  level {key}": part for key, part in (group["by_level"] or {}).items()}
-        rows += [(key, *_rate_cells(part), part["terrains"]) for key, part in ({label: group} | parts).items()]
-    show_table(report["policy"], (*_heads(RATES), "terrains"), rows)
+    rows = []
+    for name in ("hand_crafted", "hard_random"):
+        groups = {SETS[name]: report[name]}
+        groups |= {f"  {key}": group for key, group in (report[name]["by_type"] or {}).items()}
+        groups |= {f"  level {key}": group for key, group in (report[name]["by_level"] or {}).items()}
+        rows += [(label, *_rate_cells(group), group["terrains"]) for label, group in groups.items()]
+    show_table(report["policy"], ("", *map(MEASURES.__getitem__, RATES), "terrains"), rows)
     error = value_words(report["flat"]["vx_error_mean"], None)
     print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
 
@@ -54,11 +51,11 @@ def show_tables(report: dict[str, Any]) -> None:
     for name, count in report["terrains"].items():
         limits = {measure: report["intervals"][measure][name] for measure in _FORMS}
         rows = [
-            (who, *(value_words(report[key][name][who], limits[key][who], form) for key, form in _FORMS.items()))
-            for who in report["controllers"]
+            (label, *(value_words(report[key][name][label], limits[key][label], form) for key, form in _FORMS.items()))
+            for label in report["controllers"]
         ]
         title = f"{SETS.get(name, name)}: {count} terrains x {report['episodes']} episodes"
-        show_table(title, _heads(_FORMS), rows)
+        show_table(title, ("", *map(MEASURES.__getitem__, _FORMS)), rows)
     rows = []
     for name, pairs in report["differences"].items():
         for pair, change in pairs.items():
@@ -76,10 +73,11 @@ def show_comparison(report: dict[str, Any]) -> None:
     for name in ("old", "new"):
         goal = value_words(report["goal"][COMPARED][name], report["intervals"]["goal"][COMPARED][name])
         say(f"{name}: {goal} of the robots reach the goal")
-    for fate, words, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
-        count, numbers = change[fate]["count"], ", ".join(map(str, change[fate]["terrains"]))
-        which = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
-        say((f"{count} of {change['compared']} elites {words}", style if count else ""), which)
+    for fate, label, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
+        count = change[fate]["count"]
+        numbers = ", ".join(map(str, change[fate]["terrains"]))
+        clear = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
+        say((f"{count} of {change['compared']} elites {label}", style if count else ""), clear)
     gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
     verdict = ("a regression", "bold red") if is_regression(report) else ("no regression", "bold green")
     say(f"new - old: {gain}, 95 % interval over families: ", verdict)
@@ -87,24 +85,23 @@ def show_comparison(report: dict[str, Any]) -> None:
 
 def show_pack(report: dict[str, Any]) -> None:
     """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
-    verdicts = Counter(about["verdict"] for about in report["terrains"])
+    verdicts = Counter(entry["verdict"] for entry in report["terrains"])
     title = ", ".join(f"{verdict}: {count} terrains" for verdict, count in verdicts.items())
     _show_pack_rates(title, report["rates"])
 
 
 def show_pack_test(report: dict[str, Any]) -> None:
-    """Prints what of a pack a controller fails, beside the pack's controllers."""
+    """Prints how many terrains of a pack a controller fails, beside the pack's controllers."""
     title = f"pack {report['pack']['folder']} of {report['pack']['robot']}"
     _show_pack_rates(title, {"this": report["rates"], **report["beside"]})
-    for group, parts in report["by"].items():
-        rows = [(value, part["failing"], part["terrains"]) for value, part in parts.items()]
+    for group, counts in report["by"].items():
+        rows = [(value, count["failing"], count["terrains"]) for value, count in counts.items()]
         show_table(f"failed, by {group}", ("", "fails", "of"), rows)
 
 
 def _show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
-    rows = [
-        (name, *_rate_cells(row), f"{row['failing']} of {row['terrains']}",
-         f"{row['failing_families']} of {row['families']}")
-        for name, row in rates.items()
-    ]  # fmt: skip
-    show_table(title, (*_heads(RATES), "fails", "families"), rows)
+    rows = []
+    for name, row in rates.items():
+        families = f"{row['failing_families']} of {row['families']}"
+        rows.append((name, *_rate_cells(row), f"{row['failing']} of {row['terrains']}", families))
+    show_table(title, ("", *map(MEASURES.__getitem__, RATES), "fails", "families"), rows)

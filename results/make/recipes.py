@@ -52,7 +52,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     if script.parts:
         return {}
     terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
-    sets = {name: plain_set(name, terrains, script.seed, part="validation") for name in ("hand_crafted", "hard_random")}
+    plain = ("hand_crafted", "hard_random")
+    sets = {name: plain_set(name, terrains, script.seed, purpose="validation") for name in plain}
     sets["generated"] = generated_set(script.read_archive(), terrains, script.seed, "validation")
     crossed = cross_sets(
         {"base": script.policy, **controllers}, sets, robot=script.robot, compute=script.compute, episodes=episodes,
