@@ -10,8 +10,8 @@ from msgspec import Meta
 
 from qd.evaluate.labels import SetsCfg
 from qd.search.presets import PRESETS, SchedulerCfg, preset_of
-from sim.controllers.spec import controllers_of
-from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_words
+from sim.controllers.spec import parse_controllers
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
 from sim.robots.find import get_robot, robot_of
 
@@ -152,7 +152,7 @@ class _RunFlags(ControllerFlags, SpaceFlag, WorkerFlags):
         robot = get_robot(self.robot)
         return find_run(robot, self.run, published="never"), {
             "compute": _compute(self),
-            "certifiers": controllers_of(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
+            "certifiers": parse_controllers(self.certifiers, robot, flag="certifiers") if self.certifiers else None,
             "robot": self.robot,
             "policy": self.policy,
             "space": self.space,
@@ -304,9 +304,9 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
             raise ValueError(
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
-        controllers = controllers_of(self.policies, robot)
+        controllers = parse_controllers(self.policies, robot)
         robot = made_ready(robot, next(iter(controllers.values())), compute)
-        cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_words(self.sets)))
+        cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
 
     def _makes_tables(self) -> bool:
@@ -367,7 +367,7 @@ class DoseCommand(RobotFlag, WorkerFlags):
 
         robot = get_robot(self.robot)
         measure_dose(
-            robot, controllers_of(self.policies, robot), parse_doses(self.elements, self.at),
+            robot, parse_controllers(self.policies, robot), parse_doses(self.elements, self.at),
             compute=_compute(self), resolved=self.resolved,
             terrains=self.terrains, episodes=self.episodes, seed=self.seed, out=self.out,
         )  # fmt: skip

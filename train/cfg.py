@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveInt, check
+from sim.files.settings import NonNegativeInt, PositiveInt, check_settings
 from sim.robots.robot import RobotCfg
 from sim.robots.training import Draw
 from train.ppo.cfg import PpoCfg, ppo_problems
@@ -64,7 +64,7 @@ class TrainCfg:
 
     def check(self, robot: RobotCfg) -> None:
         """Refuses settings that nothing can be learned with; sizes are given."""
-        check(self)
+        check_settings(self)
         lines = [*task_problems(self.task, robot.control_dt), *ppo_problems(self.ppo, self.num_envs)]
         if lines:
             raise ValueError("; ".join(lines))

@@ -13,7 +13,7 @@ from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elite
 from qd.faults.judge import CERTIFIERS_FOLDER
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.search.directory import RunDirectory, directory_of, find_run
-from sim.controllers.loaders import load_checkpoint
+from sim.controllers.loaders import load_actor
 from sim.controllers.onnx import export_onnx
 from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
@@ -89,7 +89,7 @@ def _with_onnx(policy: Path, robot: RobotCfg, *, anew: bool = False) -> Path:
     """A controller as it is, once its ONNX file lies beside it; one with a description has none."""
     onnx = policy.with_suffix(".onnx")
     if policy.name == POLICY and (anew or not onnx.exists()):
-        export_onnx(load_checkpoint(policy, robot), onnx)
+        export_onnx(load_actor(policy, robot), onnx)
     return policy
 
 

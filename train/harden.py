@@ -28,8 +28,8 @@ from qd.workers.evaluator import Compute, check_policy
 from sim.controllers.spec import controller_identity
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
-from sim.files.intervals import value_words
-from sim.files.settings import check
+from sim.files.intervals import format_value
+from sim.files.settings import check_settings
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import load_space, space_at
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
@@ -88,7 +88,7 @@ class _Hardening:
     def __init__(
         self, robot: RobotCfg, cfg: HardenCfg, path: Path, compute: Compute, certifiers: Mapping[str, str] | None
     ) -> None:
-        check(cfg)
+        check_settings(cfg)
         base = cfg.policy or str(robot.policy_file)
         read_start(Path(base), robot)
         check_policy(base, robot, compute.device)
@@ -244,7 +244,7 @@ def _show(content: Mapping[str, Any]) -> None:
     counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
     rows = [
         [row["controller"], *("-" if row[name] is None else f"{row[name]:,}" for name in counts),
-         *(value_words(goal[name].get(row["controller"]), limits[name].get(row["controller"])) for name in FIXED_SETS)]
+         *(format_value(goal[name].get(row["controller"]), limits[name].get(row["controller"])) for name in FIXED_SETS)]
         for row in content["rounds"]
     ]  # fmt: skip
     show_table("Rounds", ["controller", *counts, *(f"goal on {name}" for name in FIXED_SETS)], rows)

@@ -15,10 +15,10 @@ from qd.evaluate.show import show_table
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import about_controllers
+from sim.controllers.spec import describe_controllers
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
-from sim.files.intervals import resamples, value_words, wilson_interval
+from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
@@ -76,7 +76,7 @@ def measure_dose(
             "resolved": resolved,
             "terrains": count,
             "episodes": episodes,
-            "controllers": about_controllers(controllers, robot),
+            "controllers": describe_controllers(controllers, robot),
             "titles": {name: dose.describe() for name, dose in doses.items()},
             "dose": [{**row, "resolved": resolved} for of_dose in rows.values() for row in of_dose],
             "half": [half_of(doses[name], of_dose, results[name][by]) for (name, by), of_dose in rows.items()],
@@ -174,9 +174,9 @@ def show_dose(report: dict[str, Any]) -> None:
         lines = []
         for half in (half for half in report["half"] if half["element"] == element):
             rates = [row["goal_rate"] for row in rows if row["controller"] == half["controller"]]
-            low, high = (value_words(limit, None, ".2f") for limit in half["interval"])
+            low, high = (format_value(limit, None, ".2f") for limit in half["interval"])
             passed = f"{half['value']:.2f} ({low} to {high})" if half["value"] is not None else _BEYOND[half["beyond"]]
-            lines.append((half["controller"], *(value_words(rate, None, ".0%") for rate in rates), passed))
+            lines.append((half["controller"], *(format_value(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
         unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
         head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots reach the goal")

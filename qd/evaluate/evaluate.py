@@ -27,7 +27,7 @@ from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, search_seed
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import about_controllers, controller_identity, crosser_name, spec_of
+from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, resolve_policy
 from sim.files.command import publish
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.identity import robot_identity
@@ -105,7 +105,7 @@ def evaluate(
     """
     robot = get_robot(robot)
     sets = sets or make_sets((), _SMALL[0], seed)
-    controllers = {name: spec_of(policy, robot) for name, policy in controllers.items()}
+    controllers = {name: resolve_policy(policy, robot) for name, policy in controllers.items()}
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
     scales = read_penalty_scales(robot, others[0] if others else None)
     results = cross_sets(controllers, sets, robot, compute or Compute(), episodes, reward=True, cache=cache)
@@ -113,7 +113,7 @@ def evaluate(
         name: {controller: measure(result, scales) for controller, result in row.items()}
         for name, row in results.items()
     }
-    about = about_controllers(controllers, robot)
+    about = describe_controllers(controllers, robot)
     return make_tables(performances, sets, robot, controllers=about, episodes=episodes, seed=seed)
 
 

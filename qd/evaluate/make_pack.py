@@ -34,7 +34,7 @@ from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import about_controllers, controller_identity, is_same
+from sim.controllers.spec import controller_identity, describe_controllers, is_same_controller
 from sim.files.atomic import prepare_output
 from sim.files.command import publish
 from sim.terrains.bank import heights_of
@@ -64,7 +64,7 @@ def make_pack(
     archive = _read_judged(search)
     robot = search.robot
     controllers = {**(controllers or {"base": str(robot.policy_file), **certifiers_of(search)})}
-    if not any(is_same(search.policy, policy) for policy in controllers.values()):
+    if not any(is_same_controller(search.policy, policy) for policy in controllers.values()):
         controllers = {"searched": search.policy, **controllers}
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
@@ -94,12 +94,12 @@ def make_pack(
             "space": search.cfg.space,
             "space_sha256": search.cfg.space_sha256,
             "episodes": episodes,
-            "searched": next(name for name, policy in controllers.items() if is_same(policy, search.policy)),
+            "searched": next(name for name, policy in controllers.items() if is_same_controller(policy, search.policy)),
             "iterations": archive.iterations,
             "certifiers": list(archive.counts.certifiers),
             "candidates": len(untrained),
             "not_known_to_be_passable": not_passable,
-            "controllers": about_controllers(controllers, robot),
+            "controllers": describe_controllers(controllers, robot),
             "rates": {name: summarise_rates(crossed, name, seed) for name in controllers},
             "terrains_sha256": write_terrains(out, heights, chosen_genes),
             "terrains": crossed,

@@ -11,7 +11,7 @@ from rich.table import Table
 from qd.evaluate.labels import COMPARED, MEASURES, RATES, SETS
 from qd.evaluate.tables import is_regression
 from sim.files.command import say
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
@@ -30,7 +30,7 @@ def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]
 
 
 def _rate_cells(row: Mapping[str, Any]) -> list[str]:
-    return [value_words(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in RATES]
+    return [format_value(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in RATES]
 
 
 def show_rates(report: dict[str, Any]) -> None:
@@ -42,7 +42,7 @@ def show_rates(report: dict[str, Any]) -> None:
         groups |= {f"  level {key}": group for key, group in (report[name]["by_level"] or {}).items()}
         rows += [(label, *_rate_cells(group), group["terrains"]) for label, group in groups.items()]
     show_table(report["policy"], ("", *map(MEASURES.__getitem__, RATES), "terrains"), rows)
-    error = value_words(report["flat"]["vx_error_mean"], None)
+    error = format_value(report["flat"]["vx_error_mean"], None)
     print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")
 
 
@@ -51,7 +51,7 @@ def show_tables(report: dict[str, Any]) -> None:
     for name, count in report["terrains"].items():
         limits = {measure: report["intervals"][measure][name] for measure in _FORMS}
         rows = [
-            (label, *(value_words(report[key][name][label], limits[key][label], form) for key, form in _FORMS.items()))
+            (label, *(format_value(report[key][name][label], limits[key][label], form) for key, form in _FORMS.items()))
             for label in report["controllers"]
         ]
         title = f"{SETS.get(name, name)}: {count} terrains x {report['episodes']} episodes"
@@ -60,7 +60,7 @@ def show_tables(report: dict[str, Any]) -> None:
     for name, pairs in report["differences"].items():
         for pair, change in pairs.items():
             changed = (f"{change[fate]['count']} ({change[fate]['clear']})" for fate in ("mended", "newly_broken"))
-            gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+            gain = format_value(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
             rows.append((f"{name}, {pair}", *changed, change["still_failing"]["count"], change["compared"], gain))
     if rows:
         title = "terrains on which under half of the episodes reach the goal; in brackets beyond chance"
@@ -71,14 +71,14 @@ def show_comparison(report: dict[str, Any]) -> None:
     """Prints what became of elites from an old controller to a new one."""
     change = report["differences"][COMPARED]["old -> new"]
     for name in ("old", "new"):
-        goal = value_words(report["goal"][COMPARED][name], report["intervals"]["goal"][COMPARED][name])
+        goal = format_value(report["goal"][COMPARED][name], report["intervals"]["goal"][COMPARED][name])
         say(f"{name}: {goal} of the robots reach the goal")
     for fate, label, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
         count = change[fate]["count"]
         numbers = ", ".join(map(str, change[fate]["terrains"]))
         clear = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
         say((f"{count} of {change['compared']} elites {label}", style if count else ""), clear)
-    gain = value_words(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+    gain = format_value(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
     verdict = ("a regression", "bold red") if is_regression(report) else ("no regression", "bold green")
     say(f"new - old: {gain}, 95 % interval over families: ", verdict)
 

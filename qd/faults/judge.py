@@ -24,7 +24,7 @@ from qd.search.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.show import figures
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute, check_policy
-from sim.controllers.spec import ControllerSpec, controller_hash, controller_identity, spec_of, weights_file
+from sim.controllers.spec import ControllerSpec, controller_hash, controller_identity, resolve_policy, weights_file
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
@@ -103,7 +103,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     if space is not None:
         load_space(space)  # one of a user's own, which the run's name then finds
     robot_cfg = robot_of(as_settings(cfg), robot, run)
-    controller = find_policy(run, cfg, robot_cfg) if policy is None else spec_of(policy, robot_cfg)
+    controller = find_policy(run, cfg, robot_cfg) if policy is None else resolve_policy(policy, robot_cfg)
     if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
     return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=get_space(cfg.space, cfg.space_sha256))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
-from sim.files.intervals import bootstrap_interval, rate_words, wilson_interval
+from sim.files.intervals import bootstrap_interval, format_rate, wilson_interval
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
@@ -148,7 +148,7 @@ def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
 def elite_words(archive: Archive, number: int) -> list[str]:
     """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
     faults, rates = archive.counts, further_rates(archive, number)
-    sentences = [f"{who}: {rate_words(*rate)} reach the goal." for who, rate in rates.items()]
+    sentences = [f"{who}: {format_rate(*rate)} reach the goal." for who, rate in rates.items()]
     if not sentences:
         return []
     crossers = [*compress(faults.certifiers, faults.certificates()[number].tolist())]

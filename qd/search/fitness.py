@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.search.descriptors import Cells, terrain_ratios
-from sim.files.settings import PositiveFloat, check
+from sim.files.settings import PositiveFloat, check_settings
 from sim.rates import MAX_INVALID_SHARE, typical_outcome
 from sim.rollout import RolloutResult
 
@@ -37,7 +37,7 @@ class FitnessCfg:
     """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
 
     def __post_init__(self) -> None:
-        check(self)
+        check_settings(self)
         if len(self.scales) != len(self.penalties):
             raise ValueError(f"scales must be one for each of {', '.join(self.penalties)}, got {self.scales}")
 

@@ -22,7 +22,7 @@ from qd.show.figures import write_figures
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
 from qd.workers.shards import join_results
-from sim.controllers.spec import ControllerSpec, spec_of
+from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
@@ -61,7 +61,7 @@ def search(
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):
         known = ", ".join(robot.penalties)
         raise ValueError(f"fitness.penalties must be some of {robot.name}'s, {known}, got {', '.join(sorted(unknown))}")
-    policy = policy or spec_of(cfg.policy, robot)
+    policy = policy or resolve_policy(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
     space, run = get_space(cfg.space, cfg.space_sha256), RunDirectory(path)
     evaluator = EvaluatorCfg(

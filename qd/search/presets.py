@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveInt, Share, check
+from sim.files.settings import NonNegativeInt, PositiveInt, Share, check_settings
 
 METHODS = ("cma_mae", "cma_me", "map_elites", "surrogate", "hard_random", "uniform_random")
 Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
@@ -63,7 +63,7 @@ class SchedulerCfg:
     """Surrogate: steps of training an iteration, each on 64 terrains a network, or as many as an iteration has."""
 
     def __post_init__(self) -> None:
-        check(self)
+        check_settings(self)
         if not set(self.methods) <= set(METHODS) or len(set(self.methods)) < len(self.methods):
             raise ValueError(
                 f"method must be one of {', '.join(METHODS)}, or several joined by a plus, each once, got {self.method}"

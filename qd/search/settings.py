@@ -9,8 +9,8 @@ from typing import Any
 from qd.search.descriptors import Cells
 from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg, preset_of
-from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, spec_of
-from sim.files.settings import NonNegativeInt, PositiveInt, check, from_builtins
+from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, resolve_policy
+from sim.files.settings import NonNegativeInt, PositiveInt, check_settings, from_builtins
 from sim.robots.find import read_penalty_scales
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
@@ -49,7 +49,7 @@ class SearchCfg:
     scheduler: SchedulerCfg
 
     def __post_init__(self) -> None:
-        check(self)
+        check_settings(self)
         if self.episodes_per_iteration > _MOST_EPISODES:
             raise ValueError(
                 f"an iteration must have at most {_MOST_EPISODES:,} episodes, got {self.episodes_per_iteration:,}: "
@@ -83,7 +83,7 @@ def preset(
         **robot_identity(robot),
         preset=name,
         policy=policy or SHIPPED,
-        policy_sha256=controller_hash(spec_of(policy or SHIPPED, robot)),
+        policy_sha256=controller_hash(resolve_policy(policy or SHIPPED, robot)),
         space=space,
         space_sha256=space_sha256,
         collision_bit=robot.collision_bit,
@@ -121,7 +121,7 @@ def differences(stored: dict[str, Any], settings: dict[str, Any], prefix: str = 
 def is_searched(cfg: SearchCfg, policy: str, robot: RobotCfg) -> bool:
     """Whether a controller is that of a search: by its hash, or by its name where it has none."""
     if cfg.policy_sha256 is None:
-        return policy == spec_of(cfg.policy, robot)
+        return policy == resolve_policy(cfg.policy, robot)
     return controller_hash(policy) == cfg.policy_sha256
 
 
@@ -135,7 +135,7 @@ def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
             f"{path} was searched with the controller {cfg.policy}, which is code: name it again "
             f"(--policy {shlex.quote(cfg.policy)}), since no code runs that the command line does not name"
         )
-    policy = spec_of(cfg.policy, robot)
+    policy = resolve_policy(cfg.policy, robot)
     if not is_searched(cfg, policy, robot):
         digest = controller_hash(policy)
         state = "lost" if digest is None else "another one now"

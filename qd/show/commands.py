@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from sim.controllers.spec import controllers_of
-from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_words
+from sim.controllers.spec import parse_controllers
+from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt
 from sim.robots.find import get_robot
 
@@ -170,7 +170,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
         else:
             opened_run = open_run(self.robot, self.run, space=self.space)
             source = source_of_archive(opened_run, self.elite, self.minimal)
-        export_terrains(source, formats=split_words(self.formats), out=self.out, overwrite=self.overwrite)
+        export_terrains(source, formats=split_values(self.formats), out=self.out, overwrite=self.overwrite)
 
     def _make_pack(self) -> None:
         from qd.evaluate.make_pack import make_pack
@@ -182,7 +182,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
         run = find_run(robot, self.run, published="never")
         make_pack(
             find_search(run, robot=self.robot, policy=self.policy, space=self.space),
-            controllers_of(making.controllers, robot) if making.controllers else {},
+            parse_controllers(making.controllers, robot) if making.controllers else {},
             compute=Compute.resolve(making.device, making.workers, making.num_envs),
             size=making.size,
             episodes=making.episodes,

@@ -13,7 +13,7 @@ from kernels.episode import Outcome
 from qd.faults.families import way_to_end
 from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
-from sim.files.intervals import rate_words, wilson_interval
+from sim.files.intervals import format_rate, wilson_interval
 from sim.rates import typical_outcome
 from sim.recording.recorder import Recording
 from sim.robots.find import robot_label
@@ -55,7 +55,7 @@ class Rate(NamedTuple):
     count: int
 
     def __str__(self) -> str:
-        return rate_words(self.hits, self.count)
+        return format_rate(self.hits, self.count)
 
     @property
     def limits(self) -> str:

@@ -16,8 +16,8 @@ from qd.search.archive import Archive, read_archive
 from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
 from qd.search.fitness import FitnessCfg
 from qd.search.settings import SearchCfg, find_policy
-from sim.controllers.spec import SHIPPED, controller_hash, is_same, label_suffix, spec_of
-from sim.files.command import chosen_elites, command_line
+from sim.controllers.spec import SHIPPED, controller_hash, is_same_controller, label_suffix, resolve_policy
+from sim.files.command import choose_elites, command_line
 from sim.robots.find import get_robot, robot_of
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
@@ -82,7 +82,7 @@ class OpenedRun:
         cfg = self.search()
         if given is None and cfg is not None:
             return find_policy(self.path, cfg, self.robot)
-        policy, searched = spec_of(given or SHIPPED, self.robot), self.archive.policy_sha256
+        policy, searched = resolve_policy(given or SHIPPED, self.robot), self.archive.policy_sha256
         if given is None and searched not in (None, digest := controller_hash(policy)):
             raise ValueError(
                 f"{self.path} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
@@ -92,8 +92,8 @@ class OpenedRun:
 
     def suffix(self, policy: str) -> str:
         """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``."""
-        searched, named = self.archive.policy_sha256, spec_of(self.as_searched()[0], self.robot)
-        same = is_same(policy, named) if searched is None else controller_hash(policy) == searched
+        searched, named = self.archive.policy_sha256, resolve_policy(self.as_searched()[0], self.robot)
+        same = is_same_controller(policy, named) if searched is None else controller_hash(policy) == searched
         return "" if same else label_suffix(policy)
 
     def certifiers(self) -> dict[str, str]:
@@ -131,7 +131,7 @@ class OpenedRun:
         else:
             if not elite and len(archive):
                 elite = str(rank(archive, self.space, minima).worst(1)[0])
-            numbers = chosen_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
+            numbers = choose_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
             known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
         causes = rank(archive, self.space, minima, numbers=numbers).causes
         return [

@@ -12,10 +12,10 @@ from qd.search.archive import Archive
 from qd.search.directory import RUNS, folder_for
 from qd.search.progress import Bar
 from qd.show.elites import OpenedRun
-from sim.controllers.loaders import load_checkpoint
+from sim.controllers.loaders import load_actor
 from sim.controllers.onnx import export_onnx
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.command import chosen_elites
+from sim.files.command import choose_elites
 from sim.files.provenance import provenance
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
@@ -81,7 +81,7 @@ def source_of_pack(named: str, places: str = "all", robot: str | None = None) ->
     folder = find_pack(named)
     pack = read_pack(folder)
     of_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
-    rows = chosen_elites(places, range(len(pack.terrains)), f"{folder} has no place")
+    rows = choose_elites(places, range(len(pack.terrains)), f"{folder} has no place")
     names = {pack.terrains[row]["name"]: row for row in rows}
     return Source(
         folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
@@ -144,7 +144,7 @@ def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwri
     """Writes a robot's controller, an rsl_rl checkpoint or by default the shipped one, as one ONNX file."""
     if out.exists() and not overwrite:
         raise ValueError(f"{out} exists: give --overwrite to replace it, or another --onnx")
-    export_onnx(load_checkpoint(policy or robot.policy_file, robot), out)
+    export_onnx(load_actor(policy or robot.policy_file, robot), out)
     print(f"Controller: {out}")
 
 

@@ -16,7 +16,7 @@ from qd.search.archive import Archive
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 from sim.terrains.bank import terrains_of
 from sim.terrains.ground import GroundMaps
 from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
@@ -181,6 +181,6 @@ def draw_minimal(
         ground, entry = None if grounds is None else grounds[k : k + 1], entries[place]
         panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
         parts = f"{len(entry['bumps'])} of {entry['of']} parts"
-        arrive = value_words(entry["goal_rate"], None, ".0%")
+        arrive = format_value(entry["goal_rate"], None, ".0%")
         panel.set_title(f"elite {entry['elite']}: {causes[place]}, {parts}, {arrive} arrive", fontsize=9)
     return figure

@@ -22,7 +22,7 @@ from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
 from qd.show.replay import Source, save
 from qd.workers.evaluator import check_policy
-from sim.controllers.spec import SHIPPED, label_suffix, spec_of
+from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights
 from sim.recording.recorder import Recording
@@ -278,7 +278,7 @@ def film_source(
     others: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
         others_known = controllers_in(robot.panel) | (run.certifiers() if run else {})
-        policy = others_known.get(beside, spec_of(beside, robot))
+        policy = others_known.get(beside, resolve_policy(beside, robot))
         try:
             check_policy(policy, robot, device)
         except ValueError as error:

@@ -20,7 +20,7 @@ from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.controllers.spec import ControllerSpec, crosser_name
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.figures import as_png
-from sim.files.intervals import rate_words, wilson_interval
+from sim.files.intervals import format_rate, wilson_interval
 from sim.recording.recorder import Recording
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
@@ -205,7 +205,7 @@ def describe(source: Source, k: int, recording: Recording) -> str:
     for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
         shares = [getattr(values, rate)[row] for _, values, row in columns]
         counted = zip(shares, valid, strict=True)
-        words = [rate_words(round(share * count) if count else 0, count, short=True) for share, count in counted]
+        words = [format_rate(round(share * count) if count else 0, count, short=True) for share, count in counted]
         rows[label] = [text.replace("% to ", "-").replace(" to ", "-") for text in words]
     for p, (name, scale) in enumerate(zip(names, scales, strict=True)):
         rows[label_of(name)] = [

@@ -21,7 +21,7 @@ from qd.search.progress import Bar
 from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, available_cores, parse_workers
 from qd.workers.invalid import report_invalid
 from qd.workers.shards import arrays_of, join_results
-from sim.controllers.spec import controller_hash, spec_of
+from sim.controllers.spec import controller_hash, resolve_policy
 from sim.files.atomic import locked, write_atomically
 from sim.files.command import Interrupted
 from sim.files.npz import array_names, npz_bytes, read_arrays
@@ -317,7 +317,7 @@ def cross(
     with Crossings(robot, compute or Compute(), cache=cache) as crossings:
         return {
             name: crossings.cross(
-                spec_of(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how,
+                resolve_policy(policy, crossings.robot), terrains, seeds, replicas=replicas, space=space, how=how,
                 reward=reward, penalties_from_s=penalties_from_s, label=name,
             )
             for name, policy in controllers.items()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 from sim.terrains.conditions import KINDS
 
 ROOT = Path(__file__).parents[2]
@@ -66,7 +66,7 @@ def shown(key: str, form: str = ",.0f", factor: float = 1.0) -> Callable[[Any], 
 
     def cell(row: Any) -> str:
         value, limits = row.get(key), row.get(f"{key}_interval")
-        return value_words(value and factor * value, limits and [factor * limit for limit in limits], form)
+        return format_value(value and factor * value, limits and [factor * limit for limit in limits], form)
 
     return cell
 
@@ -94,7 +94,7 @@ def rate(robot: str, measure: str, terrains: str, controller: str, *, short: boo
     seeds = tables["over_seeds"].get(measure, {}).get(terrains, {}).get(controller, {})
     value = seeds.get("mean", tables[measure].get(terrains, {}).get(controller))
     limits = seeds.get("interval", tables["intervals"][measure].get(terrains, {}).get(controller))
-    return value_words(value, None if short else limits, ".1f" if measure == "reward" else ".3f")
+    return format_value(value, None if short else limits, ".1f" if measure == "reward" else ".3f")
 
 
 def archives() -> str:
@@ -144,7 +144,7 @@ def differences() -> str:
             for name, of_set in tables["differences"].items() if name in SETS and name not in HELD_OUT}  # fmt: skip
 
     def cell(pair: str) -> Callable[[Any], str]:
-        return lambda row: value_words(row[pair]["goal"], row[pair]["interval"], "+.3f") if row.get(pair) else NONE
+        return lambda row: format_value(row[pair]["goal"], row[pair]["interval"], "+.3f") if row.get(pair) else NONE
 
     pairs = ("C-G - C-HR", "C-G - C-HC", "hardened - C-G")
     return table(rows, {pair: cell(pair) for pair in pairs})
@@ -176,7 +176,7 @@ def methods(robot: str) -> str:
 
     def cell(count: str) -> Callable[[Any], str]:
         ends = (min, max)
-        return lambda row: value_words(row[count], [end(one[count] for one in row["seeds"]) for end in ends], ",.0f")
+        return lambda row: format_value(row[count], [end(one[count] for one in row["seeds"]) for end in ends], ",.0f")
 
     names = ("elites", "corrected_elites", "failing", "faults_panel", "fault_families")
     return table(rows, {in_words(name): cell(name) for name in names})
@@ -347,7 +347,7 @@ def packs() -> str:
 
     def cell(rates: Mapping[str, Any]) -> Callable[[Any], str]:
         return lambda name: NONE if name not in rates else "{}; {} of {}".format(
-            value_words(rates[name]["goal_rate"], rates[name]["goal_interval"]), rates[name]["failing"],
+            format_value(rates[name]["goal_rate"], rates[name]["goal_interval"]), rates[name]["failing"],
             rates[name]["terrains"])  # fmt: skip
 
     names = dict.fromkeys(name for pack in files.values() for name in pack["rates"])

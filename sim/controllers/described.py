@@ -115,7 +115,7 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
 
 
-def text_of(cfg: ControllerCfg) -> str:
+def format_controller(cfg: ControllerCfg) -> str:
     """The description as TOML, which :func:`read_controller` reads."""
     given = asdict(cfg, dict_factory=lambda items: {name: value for name, value in items if value is not None})
     return "".join(f"{name} = {to_toml(value)}\n" for name, value in given.items())

@@ -427,7 +427,7 @@ def _answers_rows_apart(policy: Any, width: int, device: str) -> bool:
     return torch.allclose(*answers, rtol=1e-3, atol=1e-3, equal_nan=True)
 
 
-def load_checkpoint(spec: str | Path, robot: RobotCfg) -> MlpPolicy:
+def load_actor(spec: str | Path, robot: RobotCfg) -> MlpPolicy:
     """A robot's controller from an rsl_rl checkpoint, on the CPU, as ONNX can be written of it."""
     prepare_torch("cpu")
     policy = load_policy(spec, robot, "cpu")

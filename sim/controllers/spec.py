@@ -93,7 +93,7 @@ def agent_file(weights: Path) -> Path | None:
     return next((place for place in places if weights.suffix == ".pt" and place.is_file()), None)
 
 
-def spec_of(policy: str, robot: RobotCfg) -> str:
+def resolve_policy(policy: str, robot: RobotCfg) -> str:
     """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
@@ -187,16 +187,16 @@ def find_named(place: str, name: str) -> Any:
     return target
 
 
-def about_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
+def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
     """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
     own = str(robot.policy_file)
     return {
-        name: {"policy": SHIPPED if is_same(policy, own) else policy, "sha256": controller_hash(policy)}
+        name: {"policy": SHIPPED if is_same_controller(policy, own) else policy, "sha256": controller_hash(policy)}
         for name, policy in controllers.items()
     }
 
 
-def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
+def parse_controllers(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the robot's own as ``base`` if there is none.
 
     Each is ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; a text may hold several, with spaces. Errors
@@ -213,7 +213,7 @@ def controllers_of(policies: Sequence[str], robot: RobotCfg, *, flag: str = "pol
             )
         if name in controllers:
             raise ValueError(f"{flag} must have different names, got '{name}' twice: rename one of them")
-        controllers[name] = spec_of(policy, robot)
+        controllers[name] = resolve_policy(policy, robot)
     return controllers
 
 
@@ -227,10 +227,10 @@ def label_suffix(policy: str) -> str:
 
 def crosser_name(robot: RobotCfg, policy: str) -> str:
     """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
-    return robot.name + ("" if is_same(policy, str(robot.policy_file)) else label_suffix(policy))
+    return robot.name + ("" if is_same_controller(policy, str(robot.policy_file)) else label_suffix(policy))
 
 
-def is_same(policy: str, other: str) -> bool:
+def is_same_controller(policy: str, other: str) -> bool:
     """Whether two names are of the same controller, by name or by its files."""
     digest = controller_hash(policy)
     return policy == other or (digest is not None and digest == controller_hash(other))

@@ -4,9 +4,7 @@ A command is a frozen dataclass: its docstring is its help, its fields are its f
 module loads quickly; what takes seconds to import (torch, warp, newton, pyribs) is imported inside ``execute``.
 """
 
-import contextlib
 import inspect
-import io
 import os
 import re
 import select
@@ -18,7 +16,8 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, takewhile
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from shutil import get_terminal_size
 from types import FrameType
@@ -28,7 +27,10 @@ import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.settings import PositiveInt, check
+from sim.files.settings import PositiveInt, check_settings
+
+_MIN_COLUMNS = 40
+"""Help is written for a terminal of at least this width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,14 +94,14 @@ class EliteFlags(SpaceFlag):
 
 
 class UserError(Exception):
-    """What a user can mend, where no built-in error says it; its text is all that is shown."""
+    """An error that a user can mend, where no built-in type fits; only its text is shown."""
 
     status = 2
     """Exit status."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """The program was asked to stop; its text says what comes next, for example how to resume."""
+    """The program stops because the user asked for it; the text says how to go on."""
 
 
 def debugging() -> bool:
@@ -108,7 +110,7 @@ def debugging() -> bool:
 
 
 def with_traceback(error: BaseException, text: str) -> str:
-    """What a process sends of an error to the one that waits for it: a text, and the traceback when debugging."""
+    """A text about an error, for another process; when debugging, the traceback too."""
     return f"{text}\n{''.join(traceback.format_exception(error))}" if debugging() else text
 
 
@@ -118,21 +120,21 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     A command whose defaults follow from some of its flags has a class method ``defaults(argv)``.
 
     Returns:
-        Exit status: what ``execute`` returns if that is a number, else 0; 2 after one line on stderr for what a user
-        can mend (ValueError, OSError, FloatingPointError), after a UserError its own; 130 for Ctrl-C and SIGTERM; 1
-        without a word, as of rich, where nobody reads what it prints any more, as in ``faultline ... | head -1``.
-        FAULTLINE_DEBUG=1 shows the traceback instead of the line.
+        Exit status: what ``execute`` returns if that is a number, else 0; 2 after wrong flags, and after one line on
+        stderr for what a user can mend (ValueError, OSError, FloatingPointError); that of a UserError; 130 for Ctrl-C
+        and SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``. FAULTLINE_DEBUG=1
+        shows the traceback in place of the line.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         defaults = {"default": cls.defaults(argv)} if hasattr(cls, "defaults") else {}
         command = _parse(cls, argv, name, defaults)
-        check(command)
+        check_settings(command)
         status = command.execute()
         sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and _drop_unread():
+        if isinstance(error, BrokenPipeError) and _is_output_closed():
             return 1
         remedy = _cache_remedy(error)
         if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
@@ -140,24 +142,26 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
         text = " ".join(filter(None, map(str.strip, str(error).splitlines())))
         say(("error:", "bold red"), f" {text}{remedy}", error=True)
         return error.status if isinstance(error, UserError) else 2
+    except SystemExit as stop:
+        return int(stop.code or 0)
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
 
 
-def _drop_unread() -> bool:
-    """Whether nobody reads standard output or errors any more; what is left for them to print is dropped."""
+def _is_output_closed() -> bool:
+    """Whether standard output or errors have lost their reader; what is left to print there is dropped."""
     poll = select.poll()
     for stream in (1, 2):
         poll.register(stream, 0)
-    unread = [stream for stream, _ in poll.poll(0)]
-    for stream in unread:
+    closed = [stream for stream, _ in poll.poll(0)]
+    for stream in closed:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-    return bool(unread)
+    return bool(closed)
 
 
 def _cache_remedy(error: Exception) -> str:
-    """What helps where Warp's or numba's cache of compiled code is damaged, or cannot be written; else nothing."""
+    """The remedy if Warp's or numba's cache of compiled code is damaged or cannot be written; else an empty text."""
     folder = Path(os.environ.get("WARP_CACHE_PATH") or Path.home() / ".cache" / "warp").absolute()
     if re.search(r"Failed to load (CPU|CUDA) module", str(error)):
         return f": the compiled kernels in {folder} are damaged: remove that folder, they are compiled again"
@@ -170,7 +174,7 @@ def _cache_remedy(error: Exception) -> str:
 
 
 def say(*parts: str | tuple[str, str], error: bool = False) -> None:
-    """Prints texts, some paired with a style of rich, which a terminal shows; a terminal breaks lines at words."""
+    """Prints texts, or (text, rich style) pairs; in a terminal, lines break between words."""
     from rich.console import Console
     from rich.text import Text
 
@@ -179,61 +183,54 @@ def say(*parts: str | tuple[str, str], error: bool = False) -> None:
 
 
 def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
-    """The command with its flags; what tyro says of wrong ones in a box is an error of one line."""
+    """The command with its flags; SystemExit after help, or after a message about wrong flags."""
+    if get_terminal_size().columns < _MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(_MIN_COLUMNS)  # tyro never ends in a narrower terminal
     if {"-h", "--help"} & {*argv}:
-        paragraphs, width = (inspect.getdoc(cls) or "").split("\n\n"), max(40, get_terminal_size().columns)
-        print("\n\n".join(textwrap.fill(paragraph, width) for paragraph in paragraphs), end="\n\n")
-    said = io.StringIO()
+        for paragraph in (inspect.getdoc(cls) or "").split("\n\n"):
+            print(textwrap.fill(paragraph, get_terminal_size().columns), end="\n\n")
     try:
-        with contextlib.redirect_stderr(said):
-            return tyro.cli(
-                cls, prog=f"faultline {name}", args=list(argv), description="", registry=_plain_help(),
-                config=(tyro.conf.DisallowNone,), **defaults,
-            )  # fmt: skip
-    except SystemExit as stop:
-        if not stop.code:  # it was asked for help
-            sys.stdout.flush()
-            raise
-        lines = [line.strip(" \u2502\u256d\u256e\u2570\u256f\u2500") for line in said.getvalue().splitlines()]
-        _title, *words = [line for line in lines if line.strip("-")]
-        text = " ".join(takewhile(lambda line: not line.startswith("For full helptext"), words))
-        what, _, help_line = text.partition(" Argument helptext: ")
-        if form := re.match(r"(--\S+) (\{.*?\}|\S+)", help_line):
-            expected = form[2].strip("{}").replace("|", " or ")
-            what = f"{form[1]} must be {expected}, got {_values(argv, form[1])}"
-        raise UserError(f"{what.rstrip('.')}; `faultline {name} --help` tells all flags") from None
+        return tyro.cli(
+            cls,
+            prog=f"faultline {name}",
+            args=list(argv),
+            description="",
+            registry=_plain_help(),
+            config=(tyro.conf.DisallowNone,),
+            **defaults,
+        )
+    finally:
+        sys.stdout.flush()
 
 
 def _plain_help() -> ConstructorRegistry:
-    """What makes the help of flags plain: no default where it is nothing, and lines broken by the terminal alone."""
-    registry, asked = ConstructorRegistry(), list[StructTypeInfo]()
+    """Makes the help of flags plain: no default where it is None, and lines broken by the terminal alone."""
+    registry = ConstructorRegistry()
     hint = tyro.conf.arg(help_behavior_hint=lambda text: "" if text in ("", "None") else f"(default: {text})")
+    busy = False
 
     @registry.struct_rule
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if asked:  # tyro's own rules answer
+        nonlocal busy
+        if busy:  # tyro's own rules answer
             return None
-        asked.append(info)
+        busy = True
         spec = ConstructorRegistry.get_struct_spec(info)
-        asked.clear()
+        busy = False
         if not isinstance(spec, StructConstructorSpec):
             return None
-
-        def helptext(get: Any) -> Callable[[], str | None]:
-            return lambda: " ".join(str((get() if callable(get) else get) or "").split()) or None
-
         fields = [
-            replace(field, type=Annotated[field.type, hint], helptext=helptext(field.helptext)) for field in spec.fields
+            replace(field, type=Annotated[field.type, hint], helptext=partial(_join_lines, field.helptext))
+            for field in spec.fields
         ]
         return replace(spec, fields=tuple(fields))
 
     return registry
 
 
-def _values(argv: Sequence[str], flag: str) -> str:
-    """What a flag is given: the words up to the next one."""
-    after = argv[argv.index(flag) + 1 :] if flag in argv else [peek(argv, flag) or ""]
-    return shlex.join(takewhile(lambda word: not word.startswith("--"), after))
+def _join_lines(helptext: Any) -> str | None:
+    text: Any = helptext() if callable(helptext) else helptext
+    return " ".join((text or "").split()) or None
 
 
 def peek(argv: Sequence[str], flag: str) -> str | None:
@@ -262,37 +259,37 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 def command_line(name: str, **flags: object) -> str:
     """A command as it is typed: ``faultline replay --run runs/x --elite 0``.
 
-    Flags are named by fields; None, False and empty lists are left out, True is a bare flag. Of a path below the
-    present folder the rest is shown; any other stays whole, since the command must work.
+    Flags are named by fields. None, False and empty lists are left out, True is a bare flag. Paths below the working
+    folder become relative.
     """
-    words, here = ["faultline", name], f"{Path.cwd()}{os.sep}"
+    argv = ["faultline", name]
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"
-        value = str(value).removeprefix(here) if isinstance(value, str | Path) else value
+        value = str(value).removeprefix(f"{Path.cwd()}{os.sep}") if isinstance(value, str | Path) else value
         if value is True:
-            words.append(flag)
+            argv.append(flag)
         elif isinstance(value, list | tuple):
-            words += [flag, *map(str, value)] if value else []
+            argv += [flag, *map(str, value)] if value else []
         elif str(value).startswith("-"):  # would be taken for a flag
-            words.append(f"{flag}={value}")
+            argv.append(f"{flag}={value}")
         elif value is not None and value is not False:
-            words += [flag, str(value)]
-    return shlex.join(words)
+            argv += [flag, str(value)]
+    return shlex.join(argv)
 
 
-def split_words(values: Sequence[str]) -> list[str]:
-    """The words of arguments; one argument may hold several, separated by spaces or commas."""
-    return " ".join(values).replace(",", " ").split()
+def split_values(arguments: Sequence[str]) -> list[str]:
+    """The values in arguments, each of which may hold several, separated by spaces or commas."""
+    return " ".join(arguments).replace(",", " ").split()
 
 
-def chosen_elites(text: str, numbers: Sequence[int], missing: str) -> list[int]:
+def choose_elites(text: str, numbers: Sequence[int], missing: str) -> list[int]:
     """Some of the numbers of elites: separated by spaces or commas, or ``all``; ``missing`` begins the error."""
-    known = [str(number) for number in numbers]
-    words = known if split_words([text]) == ["all"] else split_words([text])
-    if not words or not set(words) <= set(known):
-        few = known if len(known) <= 12 else [*known[:10], "...", known[-1]]
-        raise ValueError(f"{missing} {text}: expected all, or some of {', '.join(few) or 'none'}")
-    return [int(word) for word in dict.fromkeys(words)]
+    choices = [str(number) for number in numbers]
+    chosen = choices if split_values([text]) == ["all"] else split_values([text])
+    if not chosen or not set(chosen) <= set(choices):
+        shown = choices if len(choices) <= 12 else [*choices[:10], "...", choices[-1]]
+        raise ValueError(f"{missing} {text}: expected all, or some of {', '.join(shown) or 'none'}")
+    return [int(number) for number in dict.fromkeys(chosen)]
 
 
 def publish(
@@ -302,21 +299,21 @@ def publish(
     *,
     draw: Callable[[dict[str, Any]], bytes] | None = None,
 ) -> dict[str, Any]:
-    """Measures, shows and writes a report, which is returned; where to write is tried before the work.
+    """Measures a report, shows it, writes it to the JSON file ``out`` if given, and returns it.
 
-    Without a file ``out`` it is shown alone; of a ``.json`` ``draw`` makes a PNG that is written beside it.
+    ``draw`` makes a PNG of it, which is written beside the JSON. Both files are tried before the work.
     """
-    makers: dict[Path, Callable[[Any], bytes]] = {} if out is None else {out: to_json}
+    writers: dict[Path, Callable[[dict[str, Any]], bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:
         if out.suffix != ".json":
             raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
-        makers[out.with_suffix(".png")] = draw
-    for file in makers:
+        writers[out.with_suffix(".png")] = draw
+    for file in writers:
         prepare_output(file)
     report = measure()
     show(report)
-    for file, make in makers.items():
+    for file, write in writers.items():
         replaced = " (replaced)" if file.exists() else ""
-        write_atomically(file, make(report))
+        write_atomically(file, write(report))
         print(f"written to {file}{replaced}")
     return report

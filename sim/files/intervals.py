@@ -98,7 +98,7 @@ def _where_few_differ(
     return max(low, bounds[0]), min(high, bounds[1])
 
 
-def value_words(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:
+def format_value(value: float | None, limits: Sequence[float] | None, form: str = ".3f") -> str:
     """A number with its interval: ``0.750 (0.301 to 0.954)``, by ``.0%`` ``75% (30 to 95%)``; "-" for None."""
     if value is None:
         return "-"
@@ -108,9 +108,9 @@ def value_words(value: float | None, limits: Sequence[float] | None, form: str =
     return f"{value:{form}} ({low.removesuffix('%')} to {high})"
 
 
-def rate_words(hits: int, count: int, *, short: bool = False) -> str:
+def format_rate(hits: int, count: int, *, short: bool = False) -> str:
     """A rate with its Wilson interval: ``3 of 4 (75%, 30 to 95%)``, in short ``75% (30 to 95%)``."""
     if not count:
         return "no valid episode"
-    words = value_words(hits / count, wilson_interval(hits, count), ".0%")
+    words = format_value(hits / count, wilson_interval(hits, count), ".0%")
     return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -23,16 +23,6 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
 Settings = TypeVar("Settings")
-_EXPECTED = re.compile(r"Expected (?P<what>.*?)(, got .*?)?( - at `\$\.?(?P<field>.*)`)?")
-_PLAIN_WORDS = {
-    r"`str` matching regex '\^\((.*)\)\$'": r"one of \1", r"(?<=\w)\|(?=\w)": ", ",
-    r"`(int|float)` >= (\S+?)(\.0)?$": r"at least \2",
-    r"`(int|float)` > (\S+?)(\.0)?$": r"above \2",
-    r"`(int|float)` <= (\S+?)(\.0)?$": r"at most \2",
-    r"\bint\b": "a whole number", r"\bfloat\b": "a finite number", r"\bstr\b": "a text", r"\bbool\b": "True or False",
-    r"\barray\b": "a tuple", r"\bnull\b": "None", r" \| ": " or ", "`": "",
-}  # fmt: skip
-"""What msgspec calls a type or a range, and what a user does."""
 
 
 def problems(settings: Any, prefix: str = "") -> list[str]:
@@ -42,17 +32,16 @@ def problems(settings: Any, prefix: str = "") -> list[str]:
     """
     lines: list[str] = []
     for setting in fields(settings):
-        value, name = getattr(settings, setting.name), f"{prefix}{setting.name}"
+        name = f"{prefix}{setting.name}"
+        value = getattr(settings, setting.name)
         if is_dataclass(value):
             lines += problems(value, f"{name}.")
-        elif expected := _mismatch(setting.type, value):
-            lines.append(f"{name} must be {expected}, got {_brief(value)}")
-        elif setting.type is Interval and value[0] > value[1]:
-            lines.append(f"{name} must have its lower limit first, got {_brief(value)}")
+        elif problem := _mismatch(setting.type, value):
+            lines.append(f"{name} = {_brief(value)}: {problem}")
     return lines
 
 
-def check(settings: Any) -> None:
+def check_settings(settings: Any) -> None:
     """Raises a ValueError that names every value of settings that is of another type or out of its range."""
     if lines := problems(settings):
         raise ValueError("; ".join(lines))
@@ -68,15 +57,7 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
     except (msgspec.ValidationError, TypeError) as error:
-        words = str(error).replace("Object missing required field", "missing").replace("`", "'")
-        if match := _EXPECTED.fullmatch(str(error)):
-            place, expected = match["field"] or "", match["what"]
-            for word, words in {" | null": "", "array": "a list", "object": "a table"}.items():  # as a file has them
-                expected = expected.replace(word, words)
-            for key in re.findall(r"[^.\[\]]+", place):
-                data = data[int(key) if key.isdigit() else key]
-            words = f"{place or 'it'} must be {_in_words(expected)}, got {_brief(data)}"
-        raise ValueError(f"{name}: {words}") from None
+        raise ValueError(f"{name}: {error}") from None
     if unknown := list(_unknown(data, settings)):
         raise ValueError(f"{name} has no setting {'; and no '.join(unknown)}")
     if lines := problems(settings):
@@ -85,41 +66,30 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
 
 
 def _unknown(given: dict[str, Any], settings: Any, table: str = "") -> Iterator[str]:
-    """The names of each table that nobody knows, with those that it has."""
-    known = [setting.name for setting in fields(settings)]
-    if unknown := [f"{table}{key}" for key in given if key not in known]:
-        yield f"{', '.join(unknown)}: there are {', '.join(known)}"
+    """The keys of each table that are no setting, with the settings that there are."""
+    names = [setting.name for setting in fields(settings)]
+    if unknown := [f"{table}{key}" for key in given if key not in names]:
+        yield f"{', '.join(unknown)}: there are {', '.join(names)}"
     for key, value in given.items():
-        if isinstance(value, dict) and is_dataclass(part := getattr(settings, key, None)):
-            yield from _unknown(value, part, f"{table}{key}.")
+        if isinstance(value, dict) and is_dataclass(inner := getattr(settings, key, None)):
+            yield from _unknown(value, inner, f"{table}{key}.")
 
 
 def _mismatch(annotation: Any, value: Any) -> str | None:
-    """What a value should have been; None if it fits or its annotation is beyond msgspec."""
-    parts = value if isinstance(value, tuple) else (value,)
-    parts = [float(part) if isinstance(part, float) else part for part in parts]  # a NumPy float as Python's
-    if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
-        return "a finite number"
-    plain = tuple(parts) if isinstance(value, tuple) else parts[0]
+    """What is wrong with a value; None if it fits or msgspec does not know its annotation."""
+    values = value if isinstance(value, tuple) else (value,)
+    values = tuple(float(item) if isinstance(item, float) else item for item in values)  # a NumPy float as Python's
+    if any(isinstance(item, float) and not math.isfinite(item) for item in values):
+        return "Expected a finite number"
     try:
-        converted = msgspec.convert(plain, annotation)
+        converted = msgspec.convert(values if isinstance(value, tuple) else values[0], annotation)
     except msgspec.ValidationError as error:
-        match = _EXPECTED.fullmatch(str(error))
-        return _in_words(match["what"]) if match else f"one of {', '.join(map(str, _choices(annotation)))}"
+        return str(error)
     except TypeError:
         return None
-    return "a tuple" if isinstance(value, list) and isinstance(converted, tuple) else None
-
-
-def _in_words(expected: str) -> str:
-    for pattern, words in _PLAIN_WORDS.items():
-        expected = re.sub(pattern, words, expected)
-    return expected
-
-
-def _choices(annotation: Any) -> tuple[Any, ...]:
-    parts = get_args(annotation)
-    return parts if get_origin(annotation) is Literal else tuple(value for part in parts for value in _choices(part))
+    if annotation is Interval and value[0] > value[1]:
+        return "Expected the lower limit first"
+    return "Expected a tuple" if isinstance(value, list) and isinstance(converted, tuple) else None
 
 
 def _brief(value: Any) -> str:
@@ -140,7 +110,7 @@ def read_toml(path: Path, text: str | None = None) -> dict[str, Any]:
 def to_toml(value: Any) -> str:
     """A value as TOML writes it, tables in braces."""
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{_key(key)} = {to_toml(part)}' for key, part in value.items())}}}"
+        return f"{{{', '.join(f'{_key(key)} = {to_toml(item)}' for key, item in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(to_toml, value))}]"
     if isinstance(value, float):

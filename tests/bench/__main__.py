@@ -16,7 +16,7 @@ from qd.evaluate.show import show_table
 from sim.controllers.loaders import prepare_torch
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
@@ -60,7 +60,7 @@ def print_table(report: dict[str, Any]) -> None:
     rows = [
         (
             row["kernel"],
-            *(value_words(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")),
+            *(format_value(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")),
             f"{row['speedup']:.1f}x",
             f"{row['ceiling_share']:.1%}",
             row["bound_by"],

@@ -12,7 +12,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 from kernels.rewards import REWARDS
 from qd.search.progress import clock
 from sim.files.atomic import explain_failed_write
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 from train.ppo.checkpoint import STD
 from train.ppo.learner import Iteration, Learner
 
@@ -125,7 +125,7 @@ class Progress:
     def _print(self, row: dict[str, Any]) -> None:
         left_s = (self._iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
         forms = {"reward": ".2f", "length_s": ".1f", "fall_rate": ".3f", "goal_rate": ".3f"}
-        reward, length, falls, goals = (value_words(row[name], None, form) for name, form in forms.items())
+        reward, length, falls, goals = (format_value(row[name], None, form) for name, form in forms.items())
         print(
             f"{clock(left_s):>8} {row['iteration']:>5}/{self._iterations:<4} {row['env_steps_per_s']:>8,.0f} "
             f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} {row['level']:>6.2f} "

@@ -16,8 +16,8 @@ from qd.evaluate.marks import TRAINED_ON
 from qd.search.archive import ARCHIVE_FILE
 from qd.search.directory import CHECKPOINT_FILE
 from qd.search.settings import differences
-from sim.controllers.described import ControllerCfg, text_of
-from sim.controllers.spec import is_same
+from sim.controllers.described import ControllerCfg, format_controller
+from sim.controllers.spec import is_same_controller
 from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
@@ -89,7 +89,7 @@ def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
     if export is not None:
         if export.suffix != ".pt":
             raise ValueError(f"export must be a file named *.pt, got {export}")
-        if export.exists() and not is_same(str(export), str(run_dir / POLICY)):
+        if export.exists() and not is_same_controller(str(export), str(run_dir / POLICY)):
             raise ValueError(f"export {export} must not be there yet, got another training's: move it, or name another")
         prepare_output(export)
     prepare_output(run_dir / CONFIG)  # last: what is refused leaves no directory
@@ -122,7 +122,7 @@ def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
     """Whether a training has done its iterations and written its controller wherever it is asked for."""
     record = (run_dir / POLICY).with_suffix(".train.json")
-    is_exported = export is None or is_same(str(export), str(run_dir / POLICY))
+    is_exported = export is None or is_same_controller(str(export), str(run_dir / POLICY))
     if export is not None:  # what is written last
         last = ".toml" if (run_dir / DESCRIBED).exists() else ".train.json"
         is_exported = is_exported and export.with_suffix(last).exists()
@@ -185,12 +185,13 @@ class Training:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
+        controller = self.learner.env.controller
         return {
             **self.learner.state(),
             "kind": self.kind,
             "settings": self._settings,
             "progress": self.progress.state(),
-            **({} if self.learner.env.controller is None else {DESCRIPTION: text_of(self.learner.env.controller)}),
+            **({DESCRIPTION: format_controller(controller)} if controller is not None else {}),
             **self._facts,
         }
 
@@ -244,7 +245,7 @@ class Training:
             written = path
             if learner.env.controller is not None:
                 written = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
-                write_atomically(written, text_of(replace(learner.env.controller, policy=path.name)).encode())
+                write_atomically(written, format_controller(replace(learner.env.controller, policy=path.name)).encode())
             print(f"Controller and training record written to {written} and {path.with_suffix('.train.json').name}")
 
 

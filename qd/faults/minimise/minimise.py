@@ -21,7 +21,7 @@ from qd.workers.cross import Crossings
 from qd.workers.evaluator import Compute, check_policy
 from sim.controllers.spec import controller_identity
 from sim.files.atomic import to_json, write_atomically
-from sim.files.command import chosen_elites
+from sim.files.command import choose_elites
 from sim.files.npz import npz_bytes
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.base import TerrainSpace
@@ -104,7 +104,7 @@ def _failing(archive: Archive, elite: str | None, run: Path, most: int) -> list[
         return sorted(sorted(failing, key=lambda number: -verdict[number])[:most])
     if elite.strip() == "all":
         return failing
-    numbers = chosen_elites(elite, range(len(archive)), f"{run} has no elite")
+    numbers = choose_elites(elite, range(len(archive)), f"{run} has no elite")
     if crossed := [number for number in numbers if number not in failing]:
         worst = [number for number in elites_of(archive).by_severity().tolist() if number in failing]
         known = f"{len(failing)} fail, the worst are {', '.join(map(str, worst[:5]))}" if worst else "none fails"

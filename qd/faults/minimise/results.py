@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from qd.search.archive import Archive
 from sim.files.atomic import read_json
-from sim.files.command import chosen_elites
-from sim.files.intervals import value_words
+from sim.files.command import choose_elites
+from sim.files.intervals import format_value
 from sim.files.npz import read_arrays
 
 MINIMAL_FILE = "minimal.npz"
@@ -30,7 +30,7 @@ class MinimalTerrains:
 
     def chosen(self, text: str, run: object) -> list[int]:
         """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
-        return chosen_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
+        return choose_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
 
     def entry(self, number: int) -> dict[str, Any]:
         """What ``minimal.json`` says of the minimal terrain of an elite."""
@@ -39,7 +39,7 @@ class MinimalTerrains:
     def words(self, number: int) -> str:
         """What is known of the minimal terrain of an elite, in a sentence."""
         entry = self.entry(number)
-        rate = value_words(entry["goal_rate"], entry["goal_interval"], ".0%")
+        rate = format_value(entry["goal_rate"], entry["goal_interval"], ".0%")
         words = f"{len(entry['bumps'])} of {entry['of']} parts; goal reached {rate} when they were found"
         if entry["cause"]:
             words += f"; cause: {entry['cause']['kind']}"

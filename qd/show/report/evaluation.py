@@ -11,7 +11,7 @@ from qd.search.directory import ROUNDS_FILE
 from qd.show.report.page import Table, check_page, origin_rows, percent, publish_page
 from sim.files.atomic import read_json
 from sim.files.command import command_line
-from sim.files.intervals import value_words
+from sim.files.intervals import format_value
 from sim.files.provenance import without_machine
 from sim.robots.find import get_robot
 
@@ -40,7 +40,7 @@ def compared_of(tables: Mapping[str, Any], *, file: str = "", searched: str | No
 
 def _value(measure: str, value: float | None, limits: Sequence[float] | None) -> str:
     if measure == "reward":
-        return value_words(value, limits, ".1f")
+        return format_value(value, limits, ".1f")
     if value is None:
         return "-"
     return percent(value) + (f" ({100 * limits[0]:.0f} to {100 * limits[1]:.0f})" if limits else "")
@@ -104,7 +104,7 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     check_page(out)
     rounds = content["rounds"]
     rows = [
-        [row["controller"], *(value_words(row.get(key), None, ",") for key in ("episodes", *_COUNTS)),
+        [row["controller"], *(format_value(row.get(key), None, ",") for key in ("episodes", *_COUNTS)),
          ", ".join(row["certifiers"]) or "nobody"] for row in rounds
     ]  # fmt: skip
     return publish_page(

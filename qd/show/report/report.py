@@ -19,7 +19,7 @@ from qd.show.report.page import Table, check_page, figure_source, publish_page
 from qd.show.report.pictures import close_pictures, failure_of, same_moment, why_no_pictures
 from qd.show.report.search import content_of
 from qd.workers.evaluator import check_policy, resolve_device
-from sim.controllers.spec import spec_of
+from sim.controllers.spec import resolve_policy
 from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
 
@@ -52,7 +52,7 @@ def write_report(
     ranking, missing = rank(archive, opened_run.space, minima, judged=True), list[str]()
     if not len(ranking.elites):
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
-    crosser = spec_of(policy or opened_run.as_searched()[0], opened_run.robot)
+    crosser = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
     suffix = "" if policy is None else opened_run.suffix(crosser)
     out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)

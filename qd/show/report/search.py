@@ -16,7 +16,7 @@ from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.report.page import figure_source, origin_rows, percent
 from qd.show.report.pictures import sheet_of
-from sim.controllers.spec import SHIPPED, ControllerSpec, spec_of
+from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
 
@@ -34,7 +34,7 @@ def content_of(
     elites, space, (searched, _) = ranking.elites, opened_run.space, opened_run.as_searched()
     metrics = _metrics_of(run, archive)
     controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
-    if search is None and opened_run.suffix(spec_of(SHIPPED, opened_run.robot)):
+    if search is None and opened_run.suffix(resolve_policy(SHIPPED, opened_run.robot)):
         controller = "a controller that is not at hand"
     return {
         "archive": archive,

@@ -14,7 +14,7 @@ from qd.faults.numbers import certifier_of, elite_words
 from qd.search.archive import Archive
 from qd.show.crossed import ARRIVED, FAILED, rates_of
 from sim.crossing import CrossingCfg
-from sim.files.intervals import rate_words
+from sim.files.intervals import format_rate
 from sim.recording.recorder import Recording
 from sim.terrains.spaces.base import TerrainSpace
 
@@ -121,7 +121,7 @@ def table_html(columns: Sequence[Column]) -> str:
     for name, words in RATES.items():
         cells = []
         for _, count, hits in columns:
-            rate, _, interval = rate_words(hits[name], count, short=True).partition(" ") if name in hits else ("",) * 3
+            rate, _, interval = format_rate(hits[name], count, short=True).partition(" ") if name in hits else ("",) * 3
             cells.append(f"<td><b>{rate}</b> <small>{interval.strip('()')}</small></td>")
         rows.append(f"<tr><th>{words}</th>{''.join(cells)}</tr>")
     return f'<table class="faultline-rates"><tr><th></th>{heads}</tr>{"".join(rows)}</table>'

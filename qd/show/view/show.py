@@ -14,7 +14,7 @@ from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Wanted, on_elite
 from qd.show.view.listing import Listing
 from qd.workers.evaluator import check_policy
-from sim.controllers.spec import ControllerSpec, controllers_of
+from sim.controllers.spec import ControllerSpec, parse_controllers
 from sim.robots.robot import RobotCfg
 
 SEARCHED = "searched controller"
@@ -106,7 +106,7 @@ def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dic
     """The controllers by name, and why there are none."""
     certifiers = opened_run.certifiers()
     if any(map(str.strip, policies)):
-        controllers = controllers_of(policies, opened_run.robot)
+        controllers = parse_controllers(policies, opened_run.robot)
         for policy in controllers.values():
             check_policy(policy, opened_run.robot, "cpu")
         return {**controllers, **{name: file for name, file in certifiers.items() if name not in controllers}}, ""

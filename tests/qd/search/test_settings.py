@@ -39,7 +39,7 @@ def test_paper_has_the_papers_numbers():
     ("name", "value"), [("method", "ppo"), ("method", "cma_me+cma_me"), ("disagree_share", 0.9), ("sigma0", 1e30)]
 )
 def test_values_of_the_scheduler_out_of_range_are_named(name, value):  # the square of 1e30 is no float32
-    with pytest.raises(ValueError, match=f"{name} must"):
+    with pytest.raises(ValueError, match=name):
         SchedulerCfg(**{name: value})
 
 

@@ -12,11 +12,11 @@ from sim.controllers.mlp import MlpPolicy
 from sim.controllers.onnx import export_onnx
 from sim.controllers.spec import (
     ControllerSpec,
-    about_controllers,
     controller_hash,
-    controllers_of,
+    describe_controllers,
     label_suffix,
-    spec_of,
+    parse_controllers,
+    resolve_policy,
 )
 from tests.builders import OBSERVATIONS, rsl_rl_actor, save_checkpoint
 
@@ -127,16 +127,16 @@ def test_the_hash_is_of_all_that_is_in_files(tmp_path, write):
 
 def test_controllers_have_names(anymal, tmp_path):
     shipped = str(anymal.policy_file)
-    assert controllers_of([], anymal) == {"base": shipped}
+    assert parse_controllers([], anymal) == {"base": shipped}
     given = ["C-G@1=a b/c.pt base=shipped", "mine=m.py:act"]
-    assert controllers_of(given, anymal) == {"C-G@1": "a b/c.pt", "base": shipped, "mine": "m.py:act"}
+    assert parse_controllers(given, anymal) == {"C-G@1": "a b/c.pt", "base": shipped, "mine": "m.py:act"}
     for wrong in ("a.pt", "a=", "a=x a=y", "a/b=x"):
         with pytest.raises(ValueError, match="policies"):
-            controllers_of([wrong], anymal)
+            parse_controllers([wrong], anymal)
     copy = tmp_path / "C-G 1.pt"
     copy.write_bytes(anymal.policy_file.read_bytes())
-    about = about_controllers({"mine": str(copy), "other": "a.pt"}, anymal)
+    about = describe_controllers({"mine": str(copy), "other": "a.pt"}, anymal)
     assert [about[name]["policy"] for name in about] == ["shipped", "a.pt"]
-    assert (spec_of("shipped", anymal), spec_of("a.pt", anymal)) == (shipped, "a.pt")
+    assert (resolve_policy("shipped", anymal), resolve_policy("a.pt", anymal)) == (shipped, "a.pt")
     assert label_suffix(str(copy)) == "-C-G-1"
     assert label_suffix(str(tmp_path / "go2" / "controller.toml")) == "-go2"

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from onnx import TensorProto, helper, numpy_helper
 
-from sim.controllers.loaders import load_checkpoint, load_policy
+from sim.controllers.loaders import load_actor, load_policy
 from sim.controllers.mlp import MlpPolicy
 from sim.controllers.onnx import export_onnx, load_onnx
 from sim.controllers.runner import PolicyRunner, is_graph_safe
@@ -176,6 +176,6 @@ def test_only_a_checkpoint_can_be_exported_and_to_an_onnx_file(tmp_path, anymal)
     with pytest.raises(ValueError, match=r"policy\.pt"):
         export_onnx(MlpPolicy(rsl_rl_actor(48, 3).state_dict()), tmp_path / "policy.pt")
     assert not list(tmp_path.iterdir())
-    export_onnx(load_checkpoint(anymal.policy_file, anymal), tmp_path / "a.onnx")
+    export_onnx(load_actor(anymal.policy_file, anymal), tmp_path / "a.onnx")
     with pytest.raises(ValueError, match=r"a\.onnx"):
-        load_checkpoint(tmp_path / "a.onnx", anymal)
+        load_actor(tmp_path / "a.onnx", anymal)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.files.command import Interrupted, UserError, chosen_elites, command_line, peek, publish, run_command
+from sim.files.command import Interrupted, UserError, choose_elites, command_line, peek, publish, run_command
 from sim.files.settings import NonNegativeInt
 
 NothingError = type("NothingError", (UserError,), {"status": 1})
@@ -82,19 +83,43 @@ def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsy
     assert (run(), run("--status", "1")) == (0, 1)
     assert run("--status", "-1") == 2 and "status" in capsys.readouterr().err
     assert run("--size", "3") == run("--status=z") == run("--nobody") == 2
-    size, status, nobody = capsys.readouterr().err.splitlines()
-    assert "--size must be FLOAT FLOAT, got 3;" in size and "--status must be INT, got z;" in status
-    assert "--nobody" in nobody
+    errors = capsys.readouterr().err
+    assert all(flag in errors for flag in ("--size", "--status", "--nobody"))
 
 
 def test_help_fits_the_terminal_and_says_no_none(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "46")
-    with pytest.raises(SystemExit):
-        run("--help")
+    assert run("--help") == 0
     text = capsys.readouterr().out
     assert text.startswith("Fail as told.") and "usage: faultline toy" in text and "--status INT" in text
     assert "None" not in text and "(default: )" not in text
     assert max(len(line) for line in text.splitlines() if not line.startswith("usage")) <= 46
+
+
+HELP_IN_ANY_WIDTH = """
+import os
+import faultline
+for columns in (1, 2, 3, 5, 8, 13, 20, 39, 40, 41, 80, 200, 399, 400):
+    os.environ["COLUMNS"] = str(columns)
+    assert faultline.main(["archive", "--help"]) == 0
+    assert faultline.main(["archive", "--nobody"]) == 2
+"""
+
+
+def test_help_ends_in_a_terminal_of_any_width(capsys, monkeypatch):
+    for columns in range(1, 401):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert run("--help") == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert max(len(line) for line in lines if not line.startswith("usage")) <= max(columns, 40)
+    limit = (2**33, 2**33)  # [B]; a help that never ends would take all memory
+    done = subprocess.run(
+        [sys.executable, "-c", HELP_IN_ANY_WIDTH],
+        capture_output=True,
+        timeout=120,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, limit),
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_sigterm_in_the_midst_of_compiling_is_not_lost():
@@ -173,10 +198,10 @@ def test_a_report_is_shown_and_written_and_where_is_tried_before_the_work(tmp_pa
 
 
 def test_elites_are_named_by_numbers_or_all():
-    assert chosen_elites("2 0, 2", [0, 2], "") == [2, 0] and chosen_elites("all", range(3), "") == [0, 1, 2]
+    assert choose_elites("2 0, 2", [0, 2], "") == [2, 0] and choose_elites("all", range(3), "") == [0, 1, 2]
     for text, count in (("3", 3), ("-1", 3), ("", 3), ("0 all", 3), ("all", 0)):
         with pytest.raises(ValueError, match="a run"):
-            chosen_elites(text, range(count), "a run has no elite")
+            choose_elites(text, range(count), "a run has no elite")
 
 
 @pytest.mark.parametrize(("line", "value"), [("--seed 3 --a wide", "wide"), ("--a=b=c", "b=c"), ("--a b --a=", "")])

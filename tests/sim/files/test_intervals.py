@@ -12,9 +12,9 @@ from sim.files.intervals import (
     DIFFERENCES,
     RATES,
     bootstrap_interval,
-    rate_words,
+    format_rate,
+    format_value,
     t_interval,
-    value_words,
     wilson_interval,
 )
 
@@ -37,12 +37,12 @@ def test_wilson_interval_by_hand():
 
 
 def test_rates_and_values_in_words():
-    assert rate_words(3, 4) == "3 of 4 (75%, 30 to 95%)"
-    assert rate_words(3, 4, short=True) == "75% (30 to 95%)"
-    assert rate_words(0, 0) == "no valid episode"
-    assert value_words(0.012, (-0.1, 0.1), "+.2f") == "+0.01 (-0.10 to +0.10)"
-    assert value_words(2.0, None, ".1f") == "2.0"
-    assert value_words(None, None) == "-"
+    assert format_rate(3, 4) == "3 of 4 (75%, 30 to 95%)"
+    assert format_rate(3, 4, short=True) == "75% (30 to 95%)"
+    assert format_rate(0, 0) == "no valid episode"
+    assert format_value(0.012, (-0.1, 0.1), "+.2f") == "+0.01 (-0.10 to +0.10)"
+    assert format_value(2.0, None, ".1f") == "2.0"
+    assert format_value(None, None) == "-"
 
 
 def test_the_bootstrap_resamples_terrains_or_families():
