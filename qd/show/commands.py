@@ -55,16 +55,16 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
 
     def _source(self) -> Any:
         from qd.show.elites import open_run
-        from qd.show.replay import source_of_map, source_of_run
+        from qd.show.replay import select_elites, select_map
 
         crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
             opened_run = open_run(self.robot, self.run, space=self.space)
-            return source_of_run(opened_run, self.elite, self.minimal, **crossing)
+            return select_elites(opened_run, self.elite, self.minimal, **crossing)
         if self.run is not None:
             raise ValueError("give one of --run and --terrain")
         robot, how = get_robot(self.robot or "anymal"), {"size_m": self.size, "scale_m": self.scale}
-        return source_of_map(self.terrain, robot, offset_m=self.offset, **how, **crossing)
+        return select_map(self.terrain, robot, offset_m=self.offset, **how, **crossing)
 
 
 @dataclass(frozen=True, kw_only=True)

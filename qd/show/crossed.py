@@ -43,7 +43,7 @@ ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
 """The good way in words, and the others."""
 
 
-def ending_of(outcome: int) -> Ending:
+def get_ending(outcome: int) -> Ending:
     """How an episode of an outcome ended, a valid one or not."""
     return ENDINGS.get(Outcome(outcome), Ending("invalid: the simulation broke"))
 
@@ -63,7 +63,7 @@ class Rate(NamedTuple):
         return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in wilson_interval(self.hits, self.count)))
 
 
-def rates_of(recording: Recording) -> dict[str, Rate]:
+def count_rates(recording: Recording) -> dict[str, Rate]:
     """How often valid episodes of one terrain ended in each way, by the words of :data:`ENDINGS`, and ``fallen``."""
     outcome, valid = recording.outcome[0], recording.outcome[0] != Outcome.INVALID
     hits = {ending.words: outcome == end for end, ending in ENDINGS.items()}
@@ -81,7 +81,7 @@ def leans(recording: Recording, episode: int) -> NDArray[np.bool_]:
     return cosine < np.cos(np.deg2rad(FALLEN_TILT_DEG))
 
 
-def moment_of_failure(recording: Recording, episode: int) -> float:
+def find_failure_time(recording: Recording, episode: int) -> float:
     """When an episode of one terrain went wrong [s]: at its base collision, or at a fall before that.
 
     A robot that ran out of time without a fall got stuck when it first came within 0.3 m of where it ended. Of every
@@ -100,7 +100,7 @@ def moment_of_failure(recording: Recording, episode: int) -> float:
     return frame * recording.dt
 
 
-def typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
+def find_typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
     """The episode to show: of those with the typical outcome, or a given one, that of middle cost."""
     outcome = recording.outcome[0]
     candidates = np.flatnonzero(outcome == (typical_outcome(outcome) if ending is None else ending))
@@ -112,16 +112,16 @@ def typical_episode(recording: Recording, scales: dict[str, float], ending: int 
     return int(candidates[order[(len(candidates) - 1) // 2]])
 
 
-def episode_beside(recording: Recording, episode: int, scales: dict[str, float]) -> int:
+def find_ghost_episode(recording: Recording, episode: int, scales: dict[str, float]) -> int:
     """The episode of another controller to show beside one: that from the same start, else a typical one that arrives.
 
     If it arrives in none, it is that from the same start.
     """
     arrived = recording.outcome[0] == Outcome.GOAL
-    return episode if arrived[episode] or not arrived.any() else typical_episode(recording, scales, Outcome.GOAL)
+    return episode if arrived[episode] or not arrived.any() else find_typical_episode(recording, scales, Outcome.GOAL)
 
 
-def title_of(recording: Recording, controller: str = "") -> str:
+def make_title(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
     who = robot_label(recording.robot) + (f" with {controller}" if controller else "")
     outcome, most = recording.outcome[0], int(typical_outcome(recording.outcome[0]))

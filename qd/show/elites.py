@@ -24,7 +24,7 @@ from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space
 
 
-class Terrain(NamedTuple):
+class EliteTerrain(NamedTuple):
     """The terrain of an elite, by its number, or its minimal terrain."""
 
     number: int
@@ -118,7 +118,7 @@ class OpenedRun:
             raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
         return minima
 
-    def terrains(self, elite: str = "", minimal: str | None = None) -> list[Terrain]:
+    def terrains(self, elite: str = "", minimal: str | None = None) -> list[EliteTerrain]:
         """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
 
         Without a number it is the worst elite. Labels name what stops the robot, where that is known.
@@ -135,7 +135,7 @@ class OpenedRun:
             known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
         causes = rank(archive, self.space, minima, numbers=numbers).causes
         return [
-            Terrain(n, genes, stem, label if cause in ("", UNCLEAR) else f"{label} ({cause})", entry)
+            EliteTerrain(n, genes, stem, label if cause in ("", UNCLEAR) else f"{label} ({cause})", entry)
             for n, (genes, stem, label, entry), cause in zip(numbers, known, causes, strict=True)
         ]
 

@@ -50,14 +50,14 @@ _PENALTY_LOOKS = {
 }
 
 
-def look_of(penalty: str) -> PenaltyLook:
+def get_penalty_look(penalty: str) -> PenaltyLook:
     """How a penalty is shown; one that the figures do not know by its name, in grey."""
     return _PENALTY_LOOKS.get(penalty, PenaltyLook(penalty))
 
 
-def label_of(penalty: str) -> str:
+def get_penalty_label(penalty: str) -> str:
     """A penalty in words, on one line; a word broken at a hyphen stays one."""
-    return look_of(penalty).label.replace("-\n", "-").replace("\n", " ")
+    return get_penalty_look(penalty).label.replace("-\n", "-").replace("\n", " ")
 
 
 def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
@@ -138,7 +138,7 @@ def draw_archive(archive: Archive) -> Figure:
     axes.add_collection(lines)
     for place in places:
         axes.axvline(float(place), color="0.25", linewidth=1.0)
-    axes.set_xticks(places, [look_of(name).label for name in archive.penalties])
+    axes.set_xticks(places, [get_penalty_look(name).label for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
     axes.set_xlim(-0.15, count - 0.85)
     axes.set_ylim(-0.02, 1.02)

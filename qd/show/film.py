@@ -19,8 +19,8 @@ from kernels.episode import Outcome
 from qd.faults.families import way_to_end
 from qd.faults.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
-from qd.show.crossed import ARRIVED, ending_of, moment_of_failure, rates_of, title_of, typical_episode
-from qd.show.replay import Source, save
+from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
+from qd.show.replay import ReplaySource, save
 from qd.workers.evaluator import check_policy
 from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
 from sim.crossing import CrossingCfg
@@ -67,7 +67,7 @@ class Shot:
     def moment(self) -> float | None:
         """When the robot fails [s]; None if it does not."""
         outcome = self.recording.outcome[0, self.episode]
-        return None if outcome == Outcome.GOAL else moment_of_failure(self.recording, self.episode)
+        return None if outcome == Outcome.GOAL else find_failure_time(self.recording, self.episode)
 
     def times(
         self, fps: float, *, whole: bool = False, before_s: float = 3.0, after_s: float = 1.0, slowness: float = 4.0
@@ -84,7 +84,7 @@ class Shot:
         return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, [begin, slow, moment, stop])
 
 
-def pose_at(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
+def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
     """Between two poses in proportion, MuJoCo's coordinates, shape (7 + num_joints,); past the last one the last."""
     low = min(int(frame), len(poses) - 1)
     first, last, share = poses[low], poses[min(low + 1, len(poses) - 1)].copy(), frame - int(frame)
@@ -117,7 +117,7 @@ def clear_elevation(heights: NDArray[np.floating], targets: NDArray[np.floating]
     return _ELEVATIONS[-1]
 
 
-def pictures_of(
+def render_pictures(
     shot: Shot,
     robot: RobotCfg,
     times: NDArray[np.float64],
@@ -132,7 +132,7 @@ def pictures_of(
     """
     recording, dt = shot.recording, shot.recording.dt
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
-    poses, chart = recording.qpos(0, shot.episode), map_of(shot, size[0] // 5)
+    poses, chart = recording.qpos(0, shot.episode), draw_map(shot, size[0] // 5)
     name, beside = ("", None) if shot.beside is None else (shot.beside[0], shot.beside[1].qpos(0, shot.episode))
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
@@ -141,8 +141,8 @@ def pictures_of(
     with Renderer(robot, recording.heights[0], **look) as renderer:
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
             frame = min(time_s / dt, float(len(poses) - 1))
-            pose, here = pose_at(poses, frame), (0, shot.episode, int(frame + 0.5))
-            ghost = None if beside is None else pose_at(beside, time_s / dt)
+            pose, here = interpolate_pose(poses, frame), (0, shot.episode, int(frame + 0.5))
+            ghost = None if beside is None else interpolate_pose(beside, time_s / dt)
             touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
             picture = Image.fromarray(renderer.render(pose, camera, ghost=ghost, ghost_name=name, **touch))
             picture = picture.resize(size, Image.Resampling.BOX)
@@ -167,18 +167,18 @@ def _letter(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> N
 
     write((10, 32), shot.title, 28, "black")
     if shot.beside is None:
-        write((10, 62), f"reached the goal: {rates_of(shot.recording)[ARRIVED]}", 24, "#303030")
+        write((10, 62), f"reached the goal: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
     else:
-        write((10, 62), f"{shot.beside[0]} {title_of(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
+        write((10, 62), f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
     speed = f"  1/{slowness} speed" if slowness > 1 else ""
     write((width - 10, 528), f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
         outcome, fallen = shot.recording.outcome[0, shot.episode], shot.recording.fallen[0, shot.episode]
         words = f"{way_to_end(outcome, bool(fallen))} at {shot.moment:.1f} s"
-        write((10, 528), words, 30, ending_of(outcome).color)
+        write((10, 528), words, 30, get_ending(outcome).color)
 
 
-def map_of(shot: Shot, width: int) -> Image.Image:
+def draw_map(shot: Shot, width: int) -> Image.Image:
     """The terrain from above with all paths, that of the film in the colour of how it ended; ``width`` [pixels]."""
     recording = shot.recording
     colors = np.rint(255.0 * height_colors(recording.heights[0])[::-1]).astype(np.uint8)
@@ -187,7 +187,7 @@ def map_of(shot: Shot, width: int) -> Image.Image:
     for k in [*(k for k in range(recording.num_episodes) if k != shot.episode), shot.episode]:
         path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
         shown = k == shot.episode
-        draw.line(_on_map(image, path), ending_of(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
+        draw.line(_on_map(image, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
     draw.circle(_on_map(image, np.array([CrossingCfg.goal]))[0], width / 60, "#009e73", "white")
     return image
 
@@ -217,10 +217,10 @@ def film(
     or the ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is another with its
     recording from the same starts. ``progress`` is called with the share that is done.
     """
-    episode, gif = typical_episode(recording, scales) if episode is None else episode, out.suffix == ".gif"
-    shot = Shot(recording=recording, episode=episode, title=title_of(recording, by), beside=beside)
+    episode, gif = find_typical_episode(recording, scales) if episode is None else episode, out.suffix == ".gif"
+    shot = Shot(recording=recording, episode=episode, title=make_title(recording, by), beside=beside)
     fps, size = (GIF_FPS, GIF_SIZE) if gif else (FPS, SIZE)
-    pictures = pictures_of(shot, robot, shot.times(fps, whole=whole), size, shadows=shadows, progress=progress)
+    pictures = render_pictures(shot, robot, shot.times(fps, whole=whole), size, shadows=shadows, progress=progress)
     save(out, as_gif([*pictures]) if gif else as_mp4(pictures, size, FPS), "Film")
 
 
@@ -253,7 +253,7 @@ def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def film_source(
-    source: Source,
+    source: ReplaySource,
     *,
     episode: int | None = None,
     gif: bool = False,

@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from qd.faults.judge import controllers_in
-from qd.show.crossed import title_of, typical_episode
+from qd.show.crossed import find_typical_episode, make_title
 from qd.show.elites import open_run
 from qd.show.figures import save_figure
-from qd.show.film import GIF_FPS, Picture, Shot, as_gif, pictures_of
-from qd.show.replay import Source, save, source_of_map, source_of_run
+from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
+from qd.show.replay import ReplaySource, save, select_elites, select_map
 from results.make.common import runs_of_today
 from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
 from results.make.search_noise import DESIGNS
@@ -38,38 +38,39 @@ CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "h
 def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]:
     """Four seconds about the failure of a robot's typical episode: 1.5 s, one at half speed, and half a second."""
     robot = get_robot(named)
-    source = source_of_map(FOLDER / file, robot)
+    source = select_map(FOLDER / file, robot)
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", controllers_in(robot.panel)[beside])[0]) if beside else None
-    episode, title = typical_episode(recording, source.scales), title_of(replace(recording, labels=(words,)))
+    episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
     shot = Shot(recording=recording, episode=episode, title=title, beside=other)
-    return [*pictures_of(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
+    return [*render_pictures(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
 
 
-def take_still(source: Source, name: str) -> None:
+def take_still(source: ReplaySource, name: str) -> None:
     """The moment at which the robot fails on a terrain: needs no GPU, but a renderer."""
     (recording,) = source.record("cpu")
-    shot = Shot(recording=recording, episode=typical_episode(recording, source.scales), title=title_of(recording))
+    episode = find_typical_episode(recording, source.scales)
+    shot = Shot(recording=recording, episode=episode, title=make_title(recording))
     moment = shot.end if shot.moment is None else shot.moment
-    (picture,) = pictures_of(shot, source.robot, np.array([moment]), STILL_SIZE)
+    (picture,) = render_pictures(shot, source.robot, np.array([moment]), STILL_SIZE)
     Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
 
 
-def payload_source() -> Source | None:
+def payload_source() -> ReplaySource | None:
     """The smallest minimal terrain of the published search under conditions that needs a payload; None without any."""
     least = least_minimum("anymal", "payload")
     if least is None:
         return None
-    return source_of_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
+    return select_elites(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
 
-def course_source() -> Source | None:
+def course_source() -> ReplaySource | None:
     """The worst terrain of ANYmal's search of courses by today's sources; None if it is not on this machine."""
     run = runs_of_today() / "anymal/spaces/course"
     if not (run / "archive.npz").exists():
         print(f"{run} is not here: the picture of a course stays as it is.")
         return None
-    return source_of_run(open_run("anymal", run))
+    return select_elites(open_run("anymal", run))
 
 
 def draw_noise() -> Figure:

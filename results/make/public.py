@@ -22,7 +22,7 @@ from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import preset
 from qd.show.elites import open_run
-from qd.show.replay import source_of_run
+from qd.show.replay import select_elites
 from qd.workers.cross import Crossings, How
 from qd.workers.evaluator import Compute
 from results.make.common import agreement, crossing_rates, read_alike, runs_of_today
@@ -182,7 +182,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     if args.pictures:
         for name in set(args.only) & set(PICTURES):
             opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
-            take_still(source_of_run(opened), name)
+            take_still(select_elites(opened), name)
         return {}
     prepare_output(out)
     origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()

@@ -20,7 +20,7 @@ MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward"
 """Measures shown, in words; the first two are fractions."""
 
 
-def compared_of(tables: Mapping[str, Any], *, file: str = "", searched: str | None = None) -> dict[str, Any]:
+def compare_controllers(tables: Mapping[str, Any], *, file: str = "", searched: str | None = None) -> dict[str, Any]:
     """Tables as ``tables.json`` has them, and their file; ``searched`` is the hash of the controller of the page.
 
     What the template takes: episodes a terrain, whether the searched controller is among them or nobody knows, measures
@@ -118,7 +118,7 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
             SETS.get(name, f"{name}, held out"): {who: 100.0 * rate for who, rate in rates.items() if rate is not None}
             for name, rates in content["tables"]["goal"].items()
         },
-        compared=compared_of(content["tables"]),
+        compared=compare_controllers(content["tables"]),
         choices=content.get("choices", {}),
         origin=origin_rows(content),
         reports=[command_line("report", robot=robot, run=run / row["search"]) for row in rounds],

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.show.crossed import episode_beside, moment_of_failure, typical_episode
+from qd.show.crossed import find_failure_time, find_ghost_episode, find_typical_episode
 from qd.show.figures import relief
 from qd.show.film import clear_elevation
 from qd.show.report.page import picture_source
@@ -28,7 +28,7 @@ _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of
 _DISTANCE = 3.0  # of the camera [m]
 
 
-def sheet_of(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
+def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
     """The terrains of genes, shape (T, num_genes), at least one, from above: blue is low, brown high.
 
     They are small pictures in one image, so that a page of a thousand is light: its ``source``, and the ``offsets`` of
@@ -60,21 +60,21 @@ class Moment(NamedTuple):
         return self.frame * self.recording.dt
 
 
-def failure_of(recording: Recording, scales: dict[str, float]) -> Moment | None:
+def find_failure(recording: Recording, scales: dict[str, float]) -> Moment | None:
     """The moment at which the typical episode goes wrong, or its end; None if all episodes are invalid."""
     if (recording.outcome[0] == Outcome.INVALID).all():
         return None
-    episode = typical_episode(recording, scales)
-    return Moment(recording, episode, round(moment_of_failure(recording, episode) / recording.dt))
+    episode = find_typical_episode(recording, scales)
+    return Moment(recording, episode, round(find_failure_time(recording, episode) / recording.dt))
 
 
-def same_moment(moment: Moment, other: Recording, scales: dict[str, float]) -> Moment:
+def find_same_moment(moment: Moment, other: Recording, scales: dict[str, float]) -> Moment:
     """Another controller on the same terrain at that time, from the same start if it reaches the goal from there."""
-    episode = episode_beside(other, moment.episode, scales)
+    episode = find_ghost_episode(other, moment.episode, scales)
     return Moment(other, episode, min(moment.frame, int(other.num_frames[0, episode]) - 1))
 
 
-def why_no_pictures() -> str:
+def explain_missing_pictures() -> str:
     """Why close pictures cannot be taken here, in a sentence; empty if they can."""
     try:
         open_context(8, 8).free()
@@ -83,7 +83,7 @@ def why_no_pictures() -> str:
     return ""
 
 
-def close_pictures(robot: RobotCfg, moments: Sequence[Moment]) -> list[str]:
+def render_close_pictures(robot: RobotCfg, moments: Sequence[Moment]) -> list[str]:
     """Pictures of moments on one terrain, each from 3 m away; they need OpenGL."""
     (width, height), recording = _SIZE, moments[0].recording
     heights, sources = recording.heights[0], []

@@ -11,13 +11,13 @@ from qd.faults.numbers import further_rates
 from qd.search.archive import Archive
 from qd.search.directory import ROUNDS_FILE, folder_for
 from qd.search.progress import Bar
-from qd.show.crossed import ARRIVED, Rate, draw_crossing, rates_of
+from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Cross, Recordings, on_elite
-from qd.show.report.evaluation import compared_of, write_rounds
+from qd.show.report.evaluation import compare_controllers, write_rounds
 from qd.show.report.page import Table, check_page, figure_source, publish_page
-from qd.show.report.pictures import close_pictures, failure_of, same_moment, why_no_pictures
-from qd.show.report.search import content_of
+from qd.show.report.pictures import explain_missing_pictures, find_failure, find_same_moment, render_close_pictures
+from qd.show.report.search import collect_content
 from qd.workers.evaluator import check_policy, resolve_device
 from sim.controllers.spec import resolve_policy
 from sim.files.provenance import without_machine
@@ -59,8 +59,8 @@ def write_report(
     compared = None
     if tables is not None:
         about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
-        compared = compared_of(read_tables(tables, opened_run.robot), **about)
-    content = content_of(opened_run, ranking, minima, crosser, is_searched=not suffix)
+        compared = compare_controllers(read_tables(tables, opened_run.robot), **about)
+    content = collect_content(opened_run, ranking, minima, crosser, is_searched=not suffix)
     heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
     heads = heads or ranking.worst(num_elites)
     causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}
@@ -69,7 +69,7 @@ def write_report(
     if reason := _why_not_crossed(opened_run, policy, device):
         missing.append(reason)
     else:
-        no_pictures = why_no_pictures()
+        no_pictures = explain_missing_pictures()
         recordings = Recordings(opened_run.robot, device=resolve_device(device), cross=cross)
         cases = cross_cases(
             opened_run, ranking, crosser, heads, others, recordings, episodes=episodes, pictured=not no_pictures
@@ -141,15 +141,15 @@ def _case(
 ) -> dict[str, Any] | None:
     archive = opened_run.archive
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
-    if (failure := failure_of(recording, scales)) is None:
+    if (failure := find_failure(recording, scales)) is None:
         return None
-    moments = [failure] if other is None else [failure, same_moment(failure, other[1], scales)]
-    sources = close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
+    moments = [failure] if other is None else [failure, find_same_moment(failure, other[1], scales)]
+    sources = render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if other is not None:
-        rate = rates_of(other[1])[ARRIVED]
+        rate = count_rates(other[1])[ARRIVED]
         beside = {"name": other[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
-    arrived, row = rates_of(recording)[ARRIVED], ranking.elites.place_of(number)
+    arrived, row = count_rates(recording)[ARRIVED], ranking.elites.place_of(number)
     title = f"{archive.robot}, elite {number} of {len(archive):,}: {arrived.count} crossings"
     return {
         "number": number,

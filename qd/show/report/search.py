@@ -15,7 +15,7 @@ from qd.show.crossed import Rate
 from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.report.page import figure_source, origin_rows, percent
-from qd.show.report.pictures import sheet_of
+from qd.show.report.pictures import draw_sheet
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
@@ -26,7 +26,7 @@ _MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # that an interval of a mean is resampled from
 
 
-def content_of(
+def collect_content(
     opened_run: OpenedRun, ranking: Ranking, minima: MinimalTerrains | None, policy: str, *, is_searched: bool
 ) -> dict[str, Any]:
     """What the template takes, beside the terrains that a controller crossed for the page."""
@@ -50,11 +50,11 @@ def content_of(
         "certifiers": " or ".join(archive.counts.certifiers),
         "numbers": fault_numbers(archive),
         "fault_families": len(np.unique(ranking.families[elites.verdict == _FAULT])),
-        "means": {name: mean_words(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},
+        "means": {name: format_mean(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},
         "causes": causes_of(ranking),
-        "tiles": sheet_of(archive.genes[elites.numbers], space),
+        "tiles": draw_sheet(archive.genes[elites.numbers], space),
         "elites": _listed_elites(ranking),
-        "minimal_tiles": None if minima is None else sheet_of(np.array([*minima.genes.values()]), space),
+        "minimal_tiles": None if minima is None else draw_sheet(np.array([*minima.genes.values()]), space),
         "minimal": None if minima is None else _listed_minima(minima),
         "curves": figure_source(draw_curves(archive, metrics)) if metrics else "",
         "parallel": figure_source(draw_archive(archive)),
@@ -75,7 +75,7 @@ def _metrics_of(run: RunDirectory, archive: Archive) -> Metrics:
     return rows
 
 
-def mean_words(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
+def format_mean(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
     """Mean over terrains, with its interval over families where they are not few."""
     limits = bootstrap_interval(rates, 0, families=families, bounds=RATES) if len(rates) >= _MIN_TERRAINS else None
     return percent(float(rates.mean())) + (f" ({percent(limits[0])} to {percent(limits[1])})" if limits else "")

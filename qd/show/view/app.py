@@ -15,7 +15,7 @@ from qd.show.view.bar import Bar
 from qd.show.view.crosser import Common
 from qd.show.view.meshes import robot_parts
 from qd.show.view.recorder import Recorder, Report
-from qd.show.view.scene import SKY, first_view_of
+from qd.show.view.scene import SKY, compute_first_view
 from qd.show.view.show import Show
 from qd.show.view.tab import Tab
 from sim.files.atomic import prepare_output
@@ -59,7 +59,7 @@ class App:
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
         self.page.scene.set_background_image(SKY)
-        self.page.initial_camera.position, self.page.initial_camera.look_at = first_view_of(*_WINDOW)
+        self.page.initial_camera.position, self.page.initial_camera.look_at = compute_first_view(*_WINDOW)
         self.page.on_client_connect(self._come)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 

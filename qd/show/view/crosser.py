@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from qd.show.recordings import Recordings, Wanted
 from qd.show.view.meshes import Part
-from qd.show.view.playing import Crossing, crossing_of
+from qd.show.view.playing import Crossing, trace_crossing
 from qd.show.view.recorder import Recorder, Report
 from qd.show.view.show import Show
 from sim.recording.recorder import Recording
@@ -62,4 +62,4 @@ class Crosser:
         self.crossing = None
         if self.recording is not None:
             skeleton = self._common.skeleton
-            self.crossing = crossing_of(self.recording, replica, skeleton, archive.penalties, archive.scales)
+            self.crossing = trace_crossing(self.recording, replica, skeleton, archive.penalties, archive.scales)

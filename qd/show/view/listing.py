@@ -12,7 +12,7 @@ from qd.faults.families import ORDERS, VERDICTS, Ranking, rank
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.faults.numbers import certifier_of, elite_words
 from qd.search.archive import Archive
-from qd.show.crossed import ARRIVED, FAILED, rates_of
+from qd.show.crossed import ARRIVED, FAILED, count_rates
 from sim.crossing import CrossingCfg
 from sim.files.intervals import format_rate
 from sim.recording.recorder import Recording
@@ -103,9 +103,9 @@ class Listing:
         return "\n\n".join(parts)
 
 
-def column_of(head: str, recording: Recording) -> Column:
+def count_endings(head: str, recording: Recording) -> Column:
     """What was recorded of a controller."""
-    rates = rates_of(recording)
+    rates = count_rates(recording)
     hits = {words: rate.hits for words, rate in rates.items()}
     counts = {
         "goal_rate": hits[ARRIVED], "collision_rate": hits[FAILED[0]], "other_rate": sum(hits[w] for w in FAILED[1:]),

@@ -17,10 +17,10 @@ from viser import uplot
 
 from qd.faults.families import ORDERS, summary_of
 from qd.show.crossed import ENDINGS
-from qd.show.figures import label_of, look_of
+from qd.show.figures import get_penalty_label, get_penalty_look
 from qd.show.view.listing import FITNESS_WORDS, Column, Listing, map_svg, table_html
 from qd.show.view.playing import Crossing
-from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, first_view_of
+from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
 from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
@@ -151,12 +151,15 @@ class CrossingPanel:
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
         names = tab.common.show.opened_run.archive.penalties
-        series = [uplot.Series(label=label_of(name), stroke=look_of(name).color, width=2.0) for name in names]
+        series = [
+            uplot.Series(label=get_penalty_label(name), stroke=get_penalty_look(name).color, width=2.0)
+            for name in names
+        ]
         with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):
             look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
             nothing = (np.zeros(2),) * (1 + len(names))
             self._curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
-        _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, first_view_of)}, post)
+        _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, compute_first_view)}, post)
         _add_buttons(gui, "Share", {"copy command": (tab.copy_command,)}, post)
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.filming.cancel,)}, post)
         self.film_status = gui.add_html("")

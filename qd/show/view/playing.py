@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 
 from kernels.episode import Outcome
-from qd.show.crossed import ending_of, leans, moment_of_failure
+from qd.show.crossed import find_failure_time, get_ending, leans
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
@@ -43,7 +43,7 @@ class Crossing:
     marks: tuple[tuple[float, str], ...]
     """When something happens [s], and what."""
     moment_s: float
-    """When it went wrong [s], as :func:`qd.show.crossed.moment_of_failure` has it."""
+    """When it went wrong [s], as :func:`qd.show.crossed.find_failure_time` has it."""
 
     @property
     def num_frames(self) -> int:
@@ -51,7 +51,7 @@ class Crossing:
         return len(self.positions)
 
 
-def crossing_of(
+def trace_crossing(
     recording: Recording, replica: int, skeleton: Skeleton, penalties: Sequence[str], scales: Sequence[float]
 ) -> Crossing | None:
     """One episode of a recording of one terrain; None if it broke before its first frame.
@@ -74,25 +74,25 @@ def crossing_of(
     return Crossing(
         dt=recording.dt,
         duration_s=duration_s,
-        ending=ending_words(recording, replica, after=f" after {duration_s:.1f} s"),
+        ending=describe_ending(recording, replica, after=f" after {duration_s:.1f} s"),
         positions=positions,
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
         command=_command_arrows(qpos, command),
         penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
         touching=recording.touching[0, replica, :frames],
-        marks=marks_of(recording, replica),
-        moment_s=moment_of_failure(recording, replica),
+        marks=find_marks(recording, replica),
+        moment_s=find_failure_time(recording, replica),
     )
 
 
-def ending_words(recording: Recording, replica: int, after: str = "") -> str:
+def describe_ending(recording: Recording, replica: int, after: str = "") -> str:
     """How an episode of one terrain ended, and whether the robot had fallen then."""
     fallen = " · fallen" if recording.fallen[0, replica] else ""
-    return ending_of(recording.outcome[0, replica]).words + after + fallen
+    return get_ending(recording.outcome[0, replica]).words + after + fallen
 
 
-def marks_of(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
+def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
     """First stumble, first collision, fall, stuck and end of an episode that has frames, in the order of time.
 
     Stumbles and collisions are those that the penalties count; a robot without a penalty for collisions has one
@@ -106,8 +106,8 @@ def marks_of(recording: Recording, replica: int) -> tuple[tuple[float, str], ...
     }
     marks = [(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
     if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
-        marks.append((moment_of_failure(recording, replica), "stuck"))
-    marks.append((recording.dt * (frames - 1), f"end: {ending_of(recording.outcome[0, replica]).words}"))
+        marks.append((find_failure_time(recording, replica), "stuck"))
+    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording.outcome[0, replica]).words}"))
     return tuple(sorted(marks, key=lambda mark: mark[0]))
 
 
@@ -130,11 +130,15 @@ def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
 
 def episodes_by_ending(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
     """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
-    endings = list(map(ending_of, recording.outcome[0].tolist()))
+    endings = list(map(get_ending, recording.outcome[0].tolist()))
     return [
         (
             f"{count} of {len(endings)}: {ending.words}",
-            [(k + 1, f"episode {k + 1}: {ending_words(recording, k)}") for k, e in enumerate(endings) if e == ending],
+            [
+                (k + 1, f"episode {k + 1}: {describe_ending(recording, k)}")
+                for k, other in enumerate(endings)
+                if other == ending
+            ],
         )
         for ending, count in Counter(endings).most_common()
     ]
@@ -157,12 +161,12 @@ def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> 
     return np.stack([begin, begin + np.stack([x, y, np.zeros_like(x)], axis=1)], axis=1)
 
 
-def paths_of(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
+def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
     """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
     paths = []
     for frames, outcome, positions in zip(
         recording.num_frames[0].tolist(), recording.outcome[0], recording.base_position[0], strict=True
     ):
         chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
-        paths.append((positions[chosen], ImageColor.getrgb(ending_of(outcome).color)))
+        paths.append((positions[chosen], ImageColor.getrgb(get_ending(outcome).color)))
     return paths

@@ -36,7 +36,7 @@ View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Where the camera stands and what it looks at [m]."""
 
 
-def overview_of(width: int, height: int) -> View:
+def compute_overview(width: int, height: int) -> View:
     """A view of the whole terrain, for a picture of that size [pixels]."""
     if width < PHONE:
         return (-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)
@@ -45,7 +45,7 @@ def overview_of(width: int, height: int) -> View:
     return (8.0, -6.3, 10.5), (8.0, 3.4, 0.0)
 
 
-def first_view_of(width: int, height: int) -> View:
+def compute_first_view(width: int, height: int) -> View:
     """The view at first, over the robot's start along its way, for a picture of that size [pixels]."""
     if width < PHONE:
         return (-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)

@@ -9,17 +9,17 @@ from typing import Any
 
 import viser
 
-from qd.show.crossed import episode_beside, typical_episode
+from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.recordings import Wanted
 from qd.show.view.address import Address, read_address
 from qd.show.view.bar import Bar
 from qd.show.view.crosser import Common, Crosser
 from qd.show.view.filming import Filming
-from qd.show.view.listing import column_of
+from qd.show.view.listing import count_endings
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.playing import episodes_by_ending, paths_of
+from qd.show.view.playing import episodes_by_ending, trace_paths
 from qd.show.view.recorder import Report
-from qd.show.view.scene import Points, Scene, View, first_view_of, overview_of
+from qd.show.view.scene import Points, Scene, View, compute_first_view, compute_overview
 from qd.show.view.show import SEARCHED
 from sim.recording.recorder import Recording
 from sim.terrains.bank import terrains_of
@@ -100,7 +100,7 @@ class Tab:
         if address.episode is not None:
             self.choose_replica(address.episode - 1, address.time_s, playing=self.clock.playing)
         if address.camera is None:
-            self.look(first_view_of)
+            self.look(compute_first_view)
         self.selection.picked = elite
         self.list.show()
         self._show_elite()
@@ -199,7 +199,7 @@ class Tab:
     def overview(self) -> None:
         """Show the whole terrain, and stop following."""
         self.set_follow(False)
-        self.look(overview_of)
+        self.look(compute_overview)
 
     def step(self, by: int) -> None:
         """Show the next (1) or previous (-1) elite of the list."""
@@ -306,7 +306,7 @@ class Tab:
         columns = [] if self.minimal else [*self.common.show.listing.columns(self.selection.picked)]
         for crosser in crossers:
             if crosser.recording is not None:
-                columns.append(column_of(str(crosser.name), crosser.recording))
+                columns.append(count_endings(str(crosser.name), crosser.recording))
         self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
@@ -323,7 +323,7 @@ class Tab:
     def _show_ghost(self, words: str = "") -> None:
         """Show the ghost beside the robot, in the same episode or in one that arrives; the longer one says how long."""
         replica, recording = self.replica or 0, self.ghost.recording
-        beside = replica if recording is None else episode_beside(recording, replica, self._scales)
+        beside = replica if recording is None else find_ghost_episode(recording, replica, self._scales)
         self.ghost.show_episode(beside)
         crossing, ghost = self.robot.crossing, self.ghost.crossing
         self.scene.ghost.visible = False
@@ -359,10 +359,10 @@ class Tab:
             self._show_progress("", 0.0)
 
     def _show_recording(self, recording: Recording) -> None:
-        self.replica = typical_episode(recording, self._scales) if self.replica is None else self.replica
+        self.replica = find_typical_episode(recording, self._scales) if self.replica is None else self.replica
         self.bar.show({"share": None, "episodes": episodes_by_ending(recording)})
         self._show_rates()
-        self.scene.set_paths(paths_of(recording))
+        self.scene.set_paths(trace_paths(recording))
         self._show_episode()
 
     def _show_episode(self) -> None:

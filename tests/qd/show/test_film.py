@@ -12,8 +12,8 @@ from PIL import Image
 
 from kernels.episode import Outcome
 from qd.show.commands import FilmCommand
-from qd.show.crossed import moment_of_failure, title_of, typical_episode
-from qd.show.film import Shot, as_gif, follow, pictures_of, pose_at
+from qd.show.crossed import find_failure_time, find_typical_episode, make_title
+from qd.show.film import Shot, as_gif, follow, interpolate_pose, render_pictures
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import open_context
@@ -42,19 +42,19 @@ def shot_of(recording, episode=4, **fields):
 
 def test_the_typical_episode_ends_like_most_and_costs_the_middle(recording):
     # Out of time are 0, 2 and 3; scaled sums 1/2 + 1, 3/2 + 3 and 2/2 + 6.
-    assert typical_episode(recording, SCALES) == 2
-    assert typical_episode(recording, {"yaw_rate": 1.0}) == 3
+    assert find_typical_episode(recording, SCALES) == 2
+    assert find_typical_episode(recording, {"yaw_rate": 1.0}) == 3
     # Two of five arrive, more than end in any other way, and under half: one of the others is shown.
     ends = np.array([[Outcome.GOAL, Outcome.GOAL, Outcome.OUT, LATE, Outcome.BASE_COLLISION]], np.uint8)
     failing = replace(recording, outcome=ends)
-    assert ends[0, typical_episode(failing, SCALES)] != Outcome.GOAL
+    assert ends[0, find_typical_episode(failing, SCALES)] != Outcome.GOAL
     ends[0, 3] = Outcome.GOAL
-    assert typical_episode(failing, SCALES) in (0, 1, 3)
+    assert find_typical_episode(failing, SCALES) in (0, 1, 3)
 
 
 def test_the_moment_of_failure_by_hand(recording):
     def moment(**fields):
-        return moment_of_failure(replace(recording, **fields), 4)
+        return find_failure_time(replace(recording, **fields), 4)
 
     # 251 frames of 0.02 s from x = 2 to 6 m, 0.016 m apart
     assert moment() == pytest.approx(5.0)  # the base collision ends the episode
@@ -73,14 +73,14 @@ def test_the_moment_of_failure_by_hand(recording):
 def test_the_title_names_the_commonest_ending(recording):
     def title(outcomes, fallen):
         made = replace(recording, outcome=np.array([outcomes], np.uint8), fallen=np.array([fallen]))
-        return title_of(replace(made, labels=("elite 313",)))
+        return make_title(replace(made, labels=("elite 313",)))
 
     hit, never = Outcome.BASE_COLLISION, [False] * 5
     assert title([LATE, Outcome.GOAL, LATE, LATE, hit], never) == "ANYmal C, elite 313: gets stuck, 3 of 5"
     assert title([hit, hit, hit, LATE, Outcome.INVALID], [True, True, False, False, True]).endswith("topples, 2 of 4")
     assert title([LATE, LATE, LATE, hit, hit], [True, True, False, True, False]).endswith("topples, 3 of 5")
     assert title([hit, hit, hit, LATE, LATE], [True, False, False, True, True]).endswith("hits the ground, 3 of 5")
-    assert title_of(replace(recording, robot="dog", labels=("a hill",)), "C-G").startswith("dog with C-G, a hill: ")
+    assert make_title(replace(recording, robot="dog", labels=("a hill",)), "C-G").startswith("dog with C-G, a hill: ")
 
 
 def test_a_film_begins_three_seconds_before_the_failure_slows_down_and_ends_one_after(recording):
@@ -99,9 +99,9 @@ def test_a_film_begins_three_seconds_before_the_failure_slows_down_and_ends_one_
 def test_poses_lie_between_those_recorded():
     turned = [np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)]
     poses = np.array([[0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0, 0.2], [0.4, 0.0, 0.5, *(-np.array(turned)), 0.4]])
-    half = pose_at(poses, 0.5)  # the same turn by a quaternion of the other sign: 45 degrees of 90
+    half = interpolate_pose(poses, 0.5)  # the same turn by a quaternion of the other sign: 45 degrees of 90
     np.testing.assert_allclose(half, [0.2, 0.0, 0.5, np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8), 0.3])
-    np.testing.assert_array_equal(pose_at(poses, 7.3)[:3], poses[1, :3])
+    np.testing.assert_array_equal(interpolate_pose(poses, 7.3)[:3], poses[1, :3])
 
 
 def test_the_camera_follows_and_rises_where_the_ground_would_hide_the_robot(recording):
@@ -138,14 +138,14 @@ def test_pictures_show_poses_ghosts_and_touch_of_their_times(recording, anymal, 
     for beside in (None, ("C-G", other)):
         rendered.clear()
         shot, times = shot_of(recording, beside=beside), np.array([0.0, 1.0, 1.01, 9.0])
-        pictures = list(pictures_of(shot, anymal, times, (160, 90)))
+        pictures = list(render_pictures(shot, anymal, times, (160, 90)))
         assert {picture.shape for picture in pictures} == {(90, 160, 3)} and len(pictures) == 4
         for frame, (qpos, camera, ghost, name, forces) in zip((0, 50, 50.5, 250), rendered, strict=True):
-            np.testing.assert_allclose(qpos, pose_at(recording.qpos(0, 4), frame))
+            np.testing.assert_allclose(qpos, interpolate_pose(recording.qpos(0, 4), frame))
             np.testing.assert_array_equal(forces, recording.foot_force[0, 4, int(frame + 0.5)])
             assert abs(camera.target[0] - qpos[0]) < 0.4 and name == ("C-G" if beside else "")
             if beside:
-                np.testing.assert_allclose(ghost, pose_at(other.qpos(0, 4), frame))
+                np.testing.assert_allclose(ghost, interpolate_pose(other.qpos(0, 4), frame))
 
 
 def test_a_gif_has_as_many_colours_as_its_size_allows():

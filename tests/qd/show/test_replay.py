@@ -18,7 +18,7 @@ from qd.show.commands import ExportCommand, ReplayCommand
 from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
-from qd.show.replay import describe, numbers_of, replay, source_of_map, source_of_run
+from qd.show.replay import compute_numbers, describe, replay, select_elites, select_map
 from qd.show.view.show import find_show
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
@@ -66,7 +66,7 @@ def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_pa
 
 
 def lines_of(opened_run, recording, policy=None):
-    lines = describe(source_of_run(opened_run, policy=policy), 0, recording).splitlines()
+    lines = describe(select_elites(opened_run, policy=policy), 0, recording).splitlines()
     assert max(map(len, lines)) <= 80
     return [" ".join(line.split()) for line in lines]
 
@@ -122,7 +122,7 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     made = dataclasses.replace(
         made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
     )
-    numbers = numbers_of(made)
+    numbers = compute_numbers(made)
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
     assert numbers["duration_s"] == 10.0  # of 4 and 16
@@ -144,17 +144,17 @@ def test_a_map_is_never_overwritten(anymal):
         Path(folder).mkdir()
         np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
         with pytest.raises(ValueError, match="size"):
-            source_of_map(Path(folder) / "hill.npz", anymal)
-        assert source_of_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
+            select_map(Path(folder) / "hill.npz", anymal)
+        assert select_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
             f"{folder}-hill.npz-anymal"
         ]
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}
     with pytest.raises(ValueError, match="out"):
-        replay(source_of_map(Path("hill.png"), anymal), out=Path("hill.png"))
+        replay(select_map(Path("hill.png"), anymal), out=Path("hill.png"))
     with pytest.raises(ValueError, match=r"none\.pt"):
-        replay(source_of_map(Path("hill.png"), anymal, policy="none.pt"))
+        replay(select_map(Path("hill.png"), anymal, policy="none.pt"))
     assert {path.name: path.read_bytes() for path in Path().glob("hill.*")} == before
 
 
@@ -204,7 +204,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
         ]
 
     monkeypatch.setattr(Recordings, "all_of", all_of)
-    source = source_of_run(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
+    source = select_elites(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
     (report,) = replay(source)
     np.testing.assert_array_equal(wanted[0].terrain, genes[number])
     assert (wanted[0].policy, wanted[0].replicas, wanted[0].seed) == (str(opened_run.robot.policy_file), 2, 3)

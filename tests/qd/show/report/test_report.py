@@ -15,7 +15,7 @@ from qd.faults.families import VERDICTS, Ranking, elites_of, rank, summary_of
 from qd.search.archive import FaultCounts, read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.page import percent
-from qd.show.report.pictures import TILE, failure_of, same_moment, sheet_of
+from qd.show.report.pictures import TILE, draw_sheet, find_failure, find_same_moment
 from qd.show.report.search import causes_of
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
@@ -98,18 +98,18 @@ def test_the_controller_that_crosses_a_terrain_is_shown_beside(reported, run):
 
 def test_the_other_controller_is_shown_at_the_same_moment_from_the_same_start():
     ends = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT]
-    failure = failure_of(recording_of(ends, [7.0, 14.0, 7.0]), {})
+    failure = find_failure(recording_of(ends, [7.0, 14.0, 7.0]), {})
     # from x = 2 m to 7 m in 20 frames of 0.02 s, 0.25 m each: within 0.3 m of the end from the 19th on
     assert failure is not None and (failure.episode, failure.frame, failure.time_s) == (0, 19, 0.38)
-    beside = same_moment(failure, recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11), {})
+    beside = find_same_moment(failure, recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11), {})
     assert (beside.episode, beside.frame) == (0, 10)  # it has arrived by then
-    assert same_moment(failure, recording_of([ends[0], ends[1], ends[1]], [8.0, 14.0, 14.0]), {}).episode == 1
-    assert failure_of(recording_of([Outcome.INVALID] * 2, [8.0] * 2), {}) is None
+    assert find_same_moment(failure, recording_of([ends[0], ends[1], ends[1]], [8.0, 14.0, 14.0]), {}).episode == 1
+    assert find_failure(recording_of([Outcome.INVALID] * 2, [8.0] * 2), {}) is None
 
 
 def test_small_pictures_stand_in_one_image():
     genes = np.stack([np.full(64, value, np.float32) for value in (-1.0, 0.0, 0.5, 1.0, 0.2)])
-    sheet = sheet_of(genes, SUPER_GAUSSIAN)
+    sheet = draw_sheet(genes, SUPER_GAUSSIAN)
     image = Image.open(io.BytesIO(base64.b64decode(re.fullmatch(SOURCE, sheet["source"])[1])))
     assert image.size == (2 * TILE[0], 3 * TILE[1])  # the root of 5 / 2 is 1.6
     assert sheet["offsets"] == [(0, 0), (96, 0), (0, 48), (96, 48), (0, 96)]

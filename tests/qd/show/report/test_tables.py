@@ -1,6 +1,6 @@
 """The tables of an evaluation on the page of a search."""
 
-from qd.show.report.evaluation import compared_of
+from qd.show.report.evaluation import compare_controllers
 from sim.files.atomic import to_json
 from sim.robots.identity import robot_identity
 from tests.qd.evaluate.made import make_report
@@ -39,7 +39,7 @@ def test_of_several_trainings_each_is_shown_and_the_mean_over_their_seeds():
         "intervals": {measure: {"near": limits} for measure in MEASURES},
         "over_seeds": {measure: {"near": {"C-G": over}} for measure in MEASURES},
     }  # fmt: skip
-    compared = compared_of(several, searched="1")
+    compared = compare_controllers(several, searched="1")
     words, goals = compared["measures"][0]
     assert not compared["of_searched"] and words == "goal reached" and goals.head == ["controller", "near (4)"]
     expected = [["base", "50 % (40 to 60)"], ["C-G", "60 % (50 to 70)"], ["C-G@1", "80 %"], ["C-G, mean of 2", "70 %"]]

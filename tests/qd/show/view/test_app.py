@@ -10,7 +10,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.faults.minimise.minimise import MinimalTerrains
-from qd.show.crossed import moment_of_failure, typical_episode
+from qd.show.crossed import find_failure_time, find_typical_episode
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
 from qd.show.view.recorder import Report
@@ -108,8 +108,8 @@ def notes(client):
 def test_an_elite_opens_a_second_before_the_robot_fails_and_plays(shown, show, worst_crossed):
     tab, (_, recording) = shown.tab, worst_crossed
     archive = show.opened_run.archive
-    typical = typical_episode(recording, dict(zip(archive.penalties, archive.scales, strict=True)))
-    moment = moment_of_failure(recording, typical)
+    typical = find_typical_episode(recording, dict(zip(archive.penalties, archive.scales, strict=True)))
+    moment = find_failure_time(recording, typical)
     assert tab.replica == typical and tab.bar.shown["episode"] == typical + 1
     assert tab.clock.time_s == pytest.approx(max(0.0, moment - 1.0)) and tab.playing and tab.scene.follow
     name = show.listing.ranking.name(0)
@@ -118,7 +118,7 @@ def test_an_elite_opens_a_second_before_the_robot_fails_and_plays(shown, show, w
     assert status(tab).startswith("base collision") and tab.bar.shown["episodes"][0][0] == "19 of 20: base collision"
     shown.do((tab.choose_replica, 0))
     assert tab.clock.duration_s == pytest.approx(6.19) and tab.bar.shown["duration"] == tab.clock.duration_s
-    assert tab.clock.time_s == pytest.approx(max(0.0, moment_of_failure(recording, 0) - 1.0)) and tab.playing
+    assert tab.clock.time_s == pytest.approx(max(0.0, find_failure_time(recording, 0) - 1.0)) and tab.playing
     shown.do((tab.choose_replica, 16), (tab.pick, 7), (tab.pick, 0))
     assert tab.replica == typical and tab.playing  # as at first
 

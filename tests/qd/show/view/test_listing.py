@@ -3,7 +3,7 @@ import re
 
 import numpy as np
 
-from qd.show.view.listing import Listing, column_of, table_html
+from qd.show.view.listing import Listing, count_endings, table_html
 from qd.show.view.panels import Clock, Selection
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
@@ -44,7 +44,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
     assert resolved == ("finer contact", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
     assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
     recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
-    recorded = column_of("here", recording)
+    recorded = count_endings("here", recording)
     assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
     table = table_html([resolved, recorded])
     assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.show.view.playing import crossing_of, episodes_by_ending, marks_of, paths_of
+from qd.show.view.playing import episodes_by_ending, find_marks, trace_crossing, trace_paths
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
@@ -35,7 +35,7 @@ def recording():
 
 def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     names = recording.penalty_names[::-1]
-    crossing = crossing_of(recording, 0, skeleton, names, [2.0] * len(names))
+    crossing = trace_crossing(recording, 0, skeleton, names, [2.0] * len(names))
     assert (crossing.num_frames, crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
     np.testing.assert_allclose(crossing.positions[3, 0], [2.3, 4.0, 0.0], atol=1e-6)
     # penalty j sums j + 1 a frame; shown in the order asked for, divided by 2
@@ -44,11 +44,11 @@ def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     assert (first[:, 0] == first[:, 1]).all()  # none at the start
     np.testing.assert_allclose(last[0, 1] - last[0, 0], [0.0, 0.0, 0.5])  # 500 N
     assert (last[1:, 0] == last[1:, 1]).all()
-    assert crossing_of(recording, 2, skeleton, (), ()) is None  # it broke at once
+    assert trace_crossing(recording, 2, skeleton, (), ()) is None  # it broke at once
 
 
 def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
-    crossing = crossing_of(recording, 0, skeleton, (), ())
+    crossing = trace_crossing(recording, 0, skeleton, (), ())
     begin, end = crossing.command[0]
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
@@ -56,7 +56,7 @@ def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
 
 
 def test_paths_of_all_episodes(recording):
-    paths = paths_of(recording, every=2)
+    paths = trace_paths(recording, every=2)
     assert [len(points) for points, _ in paths] == [4, 3, 0]  # frames 0 2 4 5, and 0 2 3
     np.testing.assert_allclose(paths[1][0][:, 0], [2.0, 2.2, 2.3], atol=1e-6)
 
@@ -70,16 +70,16 @@ def test_marks_stand_where_things_happen_first():
     tilts = np.deg2rad(np.where(np.arange(21) < 15, 59.0, 61.0))
     quaternion[0, 0] = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
     made = dataclasses.replace(made, penalties=sums, base_quaternion=quaternion)
-    marks = marks_of(made, 0)
+    marks = find_marks(made, 0)
     assert [words for _, words in marks] == ["first stumble", "first collision", "fall", "end: base collision"]
     np.testing.assert_allclose([time_s for time_s, _ in marks], [0.16, 0.24, 0.30, 0.40])
-    assert marks_of(made, 1) == ((pytest.approx(0.4), "end: reached the goal"),)
+    assert find_marks(made, 1) == ((pytest.approx(0.4), "end: reached the goal"),)
 
 
 def test_a_robot_that_gets_stuck_has_a_mark_where_it_stays():
     made = recording_of([Outcome.TIME_OUT], [6.0], penalties=np.zeros((1, 6)))  # 0.2 m a frame, from 2 m to 6 m
     # frame 19 lies within 0.3 m of the end
-    assert marks_of(made, 0) == ((pytest.approx(0.38), "stuck"), (pytest.approx(0.40), "end: out of time"))
+    assert find_marks(made, 0) == ((pytest.approx(0.38), "stuck"), (pytest.approx(0.40), "end: out of time"))
 
 
 def test_episodes_are_offered_by_how_they_ended():
