@@ -262,9 +262,9 @@ class ViewCommand(RobotFlag, EliteFlags):
         try:
             gc.disable()  # else it takes a third of the time
             from qd.show.view.app import serve
-            from qd.show.view.show import find_show
+            from qd.show.view.viewed import open_viewed_run
 
-            show = find_show(
+            show = open_viewed_run(
                 self.run, robot=self.robot, elite=self.elite, minimal=self.minimal, policies=self.policies,
                 space=self.space,
             )  # fmt: skip

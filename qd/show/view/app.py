@@ -1,4 +1,4 @@
-"""Serves the viewer: one thread does everything that visitors and the recorder ask for, in turn."""
+"""Serves the viewer: one thread does everything that visitors and the recorder post, in turn."""
 
 import queue
 import socket
@@ -11,48 +11,48 @@ from typing import Any
 import viser
 
 from qd.show.recordings import Recordings
-from qd.show.view.bar import Bar
-from qd.show.view.crosser import Common
 from qd.show.view.meshes import robot_parts
-from qd.show.view.recorder import Recorder, Report
+from qd.show.view.player import PlayerBar
+from qd.show.view.recorder import Progress, Recorder
 from qd.show.view.scene import SKY, compute_first_view
-from qd.show.view.show import Show
+from qd.show.view.shown import Shared
 from qd.show.view.tab import Tab
+from qd.show.view.viewed import ViewedRun
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
 
 _FRAME_S = 0.04  # real time from one shown frame to the next
 _IDLE_S = 0.5  # real time from one look at the cameras to the next while nothing plays
-_WINDOW = (1400, 900)  # one that is not known yet [pixels]
+_WINDOW = (1400, 900)  # of a visitor who has not sent a size yet [pixels]
 
 
 class Page(viser.ViserServer):
     """A viser page that never tunnels itself to the internet, whatever a visitor sends."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Nothing: an archive and its controllers are the user's own."""
+        """Nothing: an archive and its controllers are the user's."""
         return None
 
 
 class App:
     """The page and its tabs."""
 
-    def __init__(self, show: Show, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
+    def __init__(self, show: ViewedRun, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
         """Open the page; the recorder is closed with it."""
         self.tabs: dict[int, Tab] = {}
-        self.bars: dict[int, Bar] = {}
+        self.bars: dict[int, PlayerBar] = {}
         self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
-        self._recorders, self._show = [recorder], show
-        self._adopt(recorder)
+        recorder.robot = show.robot
+        recorder.report = partial(self.post, self.show_progress)
         first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
-        wanted = show.wanted(first, next(iter(show.controllers), None), minimal=show.minimal)
+        wanted = show.request(first, next(iter(show.controllers), None), minimal=show.minimal)
         if wanted is not None and recordings.read(wanted) is None:
-            recorder.record(wanted, tab="first")  # before a page is open
+            recorder.request(wanted, key="first")  # before a page is open
         skeleton = Skeleton(show.robot)
-        self._common = Common(
+        self._shared = Shared(
             show=show, skeleton=skeleton, parts=robot_parts(skeleton, show.robot), recordings=recordings,
-            recorder=recorder, films=self._films, post=self.post,
+            recorder=recorder, post=self.post,
         )  # fmt: skip
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -60,27 +60,18 @@ class App:
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
         self.page.scene.set_background_image(SKY)
         self.page.initial_camera.position, self.page.initial_camera.look_at = compute_first_view(*_WINDOW)
-        self.page.on_client_connect(self._come)  # viser calls it in a thread
+        self.page.on_client_connect(self._connect)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 
-    def _adopt(self, recorder: Recorder) -> None:
-        recorder.robot, recorder.report = self._show.robot, lambda report: self.post(self.show_report, report)
-
-    def _films(self) -> Recorder:
-        if len(self._recorders) == 1:
-            self._recorders.append(Recorder())
-            self._adopt(self._recorders[1])
-        return self._recorders[1]
-
-    def _come(self, client: viser.ClientHandle) -> None:
-        self.bars[client.client_id] = Bar(client, partial(self.post, self.act, client))
+    def _connect(self, client: viser.ClientHandle) -> None:
+        self.bars[client.client_id] = PlayerBar(client, partial(self.post, self.act, client))
 
     def post(self, act: Callable[..., None], *args: Any) -> None:
         """Have the loop call ``act(*args)``; from any thread."""
         self._tasks.put((act, args))
 
     def act(self, client: viser.ClientHandle, name: str, value: Any) -> None:
-        """Do what a visitor did on the bar; at first it says its address and the size of its window."""
+        """Do an action of a visitor; the first one brings the address and the size of the window."""
         number = client.client_id
         if number in self.tabs:
             self.tabs[number].act(name, value)
@@ -88,9 +79,9 @@ class App:
             try:
                 query, width, height = value
                 window = (int(width), int(height))
-            except (TypeError, ValueError, OverflowError):  # anybody may write it; the page's own comes, too
+            except (TypeError, ValueError, OverflowError):  # anybody may send it; the page's own comes, too
                 return
-            self.tabs[number] = Tab(client, self.bars[number], self._common, window, str(query))
+            self.tabs[number] = Tab(client, self.bars[number], self._shared, window, str(query))
 
     def leave(self, number: int) -> None:
         """Forget a closed tab."""
@@ -99,18 +90,17 @@ class App:
         if tab is not None:
             tab.leave()
 
-    def show_report(self, report: Report) -> None:
-        """Store a recording, and tell all tabs how far it is."""
-        if isinstance(report.result, Recording):
-            self._common.recordings.keep(report.wanted, report.result)
-            self._common.recorder.cancel(report.wanted)  # a tab may have asked for it just before
+    def show_progress(self, progress: Progress) -> None:
+        """Store a recording, and show all tabs how far it is."""
+        if isinstance(progress.result, Recording):
+            self._shared.recordings.keep(progress.task, progress.result)
+            self._shared.recorder.cancel(progress.task)  # a tab may have requested it just before
         for tab in self.tabs.values():
-            tab.show_report(report)
+            tab.show_progress(progress)
 
     def close(self) -> None:
-        """End the processes and the page."""
-        for recorder in self._recorders:
-            recorder.stop()
+        """End process and page."""
+        self._shared.recorder.stop()
         self.page.stop()
 
     def run(self) -> None:
@@ -128,11 +118,11 @@ class App:
         return any(tab.playing for tab in self.tabs.values())
 
     def do_tasks(self, wait_s: float) -> None:
-        """Do what was posted, or wait for it; while a tab plays, the whole time."""
-        until = time.perf_counter() + wait_s
-        while (left := until - time.perf_counter()) > 0.0:
+        """Do posted tasks, or wait for one; while a tab plays, the whole time."""
+        deadline = time.perf_counter() + wait_s
+        while (remaining_s := deadline - time.perf_counter()) > 0.0:
             try:
-                act, args = self._tasks.get(timeout=left)
+                act, args = self._tasks.get(timeout=remaining_s)
             except queue.Empty:
                 return
             act(*args)
@@ -140,7 +130,7 @@ class App:
                 return
 
 
-def serve(show: Show, recorder: Recorder, *, host: str, port: int, cache: Path) -> None:
+def serve(show: ViewedRun, recorder: Recorder, *, host: str, port: int, cache: Path) -> None:
     """Serves the page until Ctrl-C; recordings are stored in the folder ``cache``."""
     prepare_output(cache / "recording.npz")
     check_port(host, port)

@@ -1,6 +1,6 @@
-"""The panels of a tab, the archive left and the crossing right, and what they stand at.
+"""The panels of a tab, the archive left and the crossing right, with its selection and clock.
 
-They hand on what a visitor does to the :class:`qd.show.view.tab.Tab`, by the viewer's loop.
+A panel posts what a visitor does to the viewer's loop, which calls the :class:`qd.show.view.tab.Tab`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,14 +18,15 @@ from viser import uplot
 from qd.faults.families import ORDERS, summary_of
 from qd.show.crossed import ENDINGS
 from qd.show.figures import get_penalty_label, get_penalty_look
-from qd.show.view.listing import FITNESS_WORDS, Column, Listing, map_svg, table_html
+from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
 from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
-_WIDTH, _NARROW_WIDTH = 360, 300  # of a panel [pixels]
-_WIDE = 1300  # a window from here on has room for two wide panels; in a narrower one the archive is folded [pixels]
+_WIDTH = 360  # of a panel [pixels]
+_NARROW_WIDTH = 300
+_WIDE = 1300  # a narrower window has no room for two wide panels, and the archive is folded [pixels]
 _TERRAINS = ("whole", "minimal")
 _CURVE_POINTS = 300
 _HOLD_S = 1.5  # real time from the end of a crossing that plays to its next begin
@@ -37,11 +38,12 @@ _KEYS = """- **Space** play or pause
 
 
 class Selection:
-    """Which elites are listed in which order, and which of them is picked; at first all, and the first of them."""
+    """The listed elites in their order, and the picked one: at first all, and the first."""
 
     def __init__(self, listing: Listing) -> None:
-        self._listing, self._choice = listing, dict[str, str]()
-        self.matching: NDArray[np.int64] = listing.listed()
+        self._listing = listing
+        self._choice: dict[str, str] = {}
+        self.matching: NDArray[np.int64] = listing.list_elites()
         """Numbers of the elites of the list, in their order."""
         self.picked = int(self.matching[0])
         """Number of the elite that is shown; it stays when it is not listed any more."""
@@ -49,15 +51,15 @@ class Selection:
     def choose(self, **changes: str) -> None:
         """List the elites of another ``cause``, or in another ``order``, as :class:`Listing` has them."""
         self._choice |= changes
-        self.matching = self._listing.listed(**self._choice)
+        self.matching = self._listing.list_elites(**self._choice)
 
     def step(self, by: int) -> int:
         """Number of the next (1) or previous (-1) elite of the list; the picked one at the end of the list.
 
-        If the picked one is not listed any more, its neighbours are those of its place among all elites.
+        A picked elite that is not listed has the neighbours of its position among all elites.
         """
-        place = np.argsort(self._listing.listed(**self._choice | {"cause": ""}))  # of each elite by its number
-        ahead = place[self.matching] - place[self.picked]
+        positions = np.argsort(self._listing.list_elites(**self._choice | {"cause": ""}))  # of each elite
+        ahead = positions[self.matching] - positions[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
         return int(near[0]) if len(near) else self.picked
 
@@ -95,12 +97,13 @@ class Clock:
 
 
 class ArchivePanel:
-    """What the archive says, the list of elites that are chosen, and a map of where their episodes end."""
+    """The archive's summary, the list of the chosen elites, and a map of where their episodes end."""
 
     def __init__(self, client: viser.ClientHandle, selection: Selection, title: str, tab: Any) -> None:
-        """Lay it out; the ``tab`` does what a visitor asks for."""
-        self._selection, gui = selection, client.gui
-        self._listing = listing = tab.common.show.listing
+        """Add the panel; a visitor's choices are posted to the ``tab``."""
+        gui = client.gui
+        self._selection = selection
+        self._listing = listing = tab.shared.show.listing
         panel = gui.add_panel()
         panel.dock_left()
         panel.set_width(_WIDTH)
@@ -108,49 +111,44 @@ class ArchivePanel:
             panel.minimize()
         with panel.add_tab("Archive"):
             gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary_of(listing.ranking, listing.archive))}.</b>"))
-            orders = {words: name for name, words in ORDERS.items()}
-            choose = partial(tab.common.post, self._choose)
+            orders = {label: name for name, label in ORDERS.items()}
+            choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", listing.causes(), partial(choose, "cause"))
-            _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_WORDS}.")
-            self.list, self._map = gui.add_html(""), gui.add_html("")
+            _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_TEXT}.")
+            self.list = gui.add_html("")
+            self._map = gui.add_html("")
 
     def _choose(self, name: str, value: str) -> None:
         self._selection.choose(**{name: value})
         self.show()
 
     def show(self) -> None:
-        """Draw list and map anew."""
-        selection, listing = self._selection, self._listing
-        matching, picked = selection.matching.tolist(), selection.picked
-        self._map.content = _small(
-            f"Where the typical episode of each ends:{map_svg(listing, selection.matching, picked)}"
-        )
-        count = f"<b>{len(matching):,}</b> of {len(listing.archive):,} elites"
-        number = '<input class="faultline-number" placeholder="number, Enter" size="14" aria-label="Number">'
-        shown = "" if picked in matching else f"Shown, but not in this list:{listing.rows_html([picked])}"
-        rows = listing.rows_html(matching)
-        self.list.content = _small(f'{count} {number}{shown}<div class="faultline-list">{rows}</div>')
+        """Draw list and map."""
+        selection = self._selection
+        self._map.content = _small(self._listing.render_map(selection.matching, selection.picked))
+        self.list.content = _small(self._listing.render_list(selection.matching, selection.picked))
 
 
 class CrossingPanel:
-    """The picked elite, who crosses it, and what is known of it; time is on the player bar."""
+    """The picked elite, its controllers, rates and penalties. Time is on the player bar."""
 
     def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: Any) -> None:
-        """Lay it out; the ``tab`` does what a visitor asks for."""
-        gui, post = client.gui, tab.common.post
+        """Add the panel; a visitor's choices are posted to the ``tab``."""
+        gui = client.gui
+        post = tab.shared.post
         if tab.window[0] >= PHONE:  # in a narrower window viser makes a sheet of all panels
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
         self.head = gui.add_html("")
         names = {name: name for name in controllers or ("none",)}
         self.controller = _add_choice(gui, "Controller", names, partial(post, tab.choose_controller))
-        ghosts = {name: name for name in tab.choices}
+        ghosts = {name: name for name in tab.ghost_choices}
         self.ghost = _add_choice(gui, "Ghost", ghosts, partial(post, tab.choose_ghost))
         self.controller.disabled = self.ghost.disabled = not controllers
-        whole = {words: bool(k) for k, words in enumerate(_TERRAINS)}
+        whole = {label: bool(k) for k, label in enumerate(_TERRAINS)}
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
-        names = tab.common.show.opened_run.archive.penalties
+        names = tab.shared.show.opened_run.archive.penalties
         series = [
             uplot.Series(label=get_penalty_label(name), stroke=get_penalty_look(name).color, width=2.0)
             for name in names
@@ -161,28 +159,29 @@ class CrossingPanel:
             self._curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, compute_first_view)}, post)
         _add_buttons(gui, "Share", {"copy command": (tab.copy_command,)}, post)
-        _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.filming.cancel,)}, post)
+        _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
         with gui.add_folder("Legend", expand_by_default=False):
-            gui.add_html(_legend_html())
+            gui.add_html(_render_legend())
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
     def show_elite(self, head: str, details: str, *, has_minimal: bool, minimal: bool) -> None:
-        """Say which elite is shown in HTML, what is known of it in Markdown, and which of its terrains is shown."""
-        self.head.content, self.details.content = f'<div style="padding:0 0.6em 0.4em">{head}</div>', details
+        """Show an elite: its head in HTML, its details in Markdown, and which of its terrains is shown."""
+        self.head.content = f'<div style="padding:0 0.6em 0.4em">{head}</div>'
+        self.details.content = details
         self.terrain.visible = has_minimal
         self.terrain.value = _TERRAINS[minimal]
 
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""
-        self.rates.content = _small(table_html(columns)) if columns else ""
+        self.rates.content = _small(render_rates(columns)) if columns else ""
 
-    def show_film(self, words: str) -> None:
-        """Say how far a film is."""
-        self.film_status.content = _small(escape(words))
+    def show_film(self, text: str) -> None:
+        """Show the progress of a film."""
+        self.film_status.content = _small(escape(text))
 
     def show_curves(self, crossing: Crossing | None) -> None:
         """Show the penalties of a crossing over its time; ``page.js`` draws the line of the present."""
@@ -204,7 +203,7 @@ def _small(text: str) -> str:
 def _add_choice(
     gui: Any, label: str, options: Mapping[str, Any], act: Callable[[Any], None], hint: str | None = None
 ) -> Any:
-    """A choice among values by their words."""
+    """A choice among values by their label."""
     chooser = gui.add_dropdown(label, tuple(options), hint=hint)
     # Only what a visitor sets, and not what this program sets.
     chooser.on_update(lambda event: act(options[event.target.value]) if event.client is not None else None)
@@ -217,31 +216,14 @@ def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: 
     buttons.on_click(lambda event: post(*tasks[event.target.value]))
 
 
-def _legend_html() -> str:
+def _render_legend() -> str:
     """What the colours of the page mean."""
-    ramp = ", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))))
-    bar = f'<span style="display:inline-block;width:7em;height:0.8em;background:linear-gradient(90deg, {ramp})"></span>'
-    rows = {
-        "Ground": f"low {bar} high; grey is the level of the start, and a line stands every metre; "
-        + _swatches({"slippery": SLIPPERY}, "repeating-linear-gradient(-45deg, {} 0 2px, transparent 2px 5px)")
-        + _swatches({"soft": SOFT}, "repeating-linear-gradient(90deg, {} 0 2px, transparent 2px 5px)")
-        + "the stronger the worse, crossed where ground is both",
-        "Paths": "of all episodes, by how they ended: "
-        + _swatches({ending.words: ending.color for ending in ENDINGS.values()}),
-        "Touching": _swatches({"base or limb": TOUCH, "foot": FOOT_TOUCH}),
-        "Arrows": _swatches(
-            {"force on a foot, 1 m is 1,000 N": FORCE_COLOR, "commanded velocity, 1 m is 1 m/s": COMMAND_COLOR}
-        ),
-        "Ghost": _swatches({"a second controller at the same time": OTHER_CONTROLLER}),
-    }
-    return "".join(_small(f"<b>{name}</b>: {words}") for name, words in rows.items())
-
-
-def _swatches(colors: Mapping[str, Any], fill: str = "{}") -> str:
-    """A small square a colour, with its words."""
-    box = "display:inline-block;width:0.8em;height:0.8em;border-radius:2px;background:"
-    return " ".join(
-        f'<span style="white-space:nowrap;margin-right:0.6em"><span style="{box}{fill.format(to_hex(color))}"></span> '
-        f"{escape(words)}</span>"
-        for words, color in colors.items()
+    colors = {
+        "slippery": SLIPPERY, "soft": SOFT, "touch": TOUCH, "foot": FOOT_TOUCH, "force": FORCE_COLOR,
+        "command": COMMAND_COLOR, "ghost": OTHER_CONTROLLER,
+    }  # fmt: skip
+    return TEMPLATES.get_template("legend.html").render(
+        ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
+        endings=[(ending.words, ending.color) for ending in ENDINGS.values()],
+        **{name: to_hex(color) for name, color in colors.items()},
     )

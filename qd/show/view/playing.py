@@ -42,8 +42,8 @@ class Crossing:
     """Whether each recorded geom touches something, shape (F, num_geoms)."""
     marks: tuple[tuple[float, str], ...]
     """When something happens [s], and what."""
-    moment_s: float
-    """When it went wrong [s], as :func:`qd.show.crossed.find_failure_time` has it."""
+    failure_s: float
+    """When it went wrong [s] (:func:`qd.show.crossed.find_failure_time`)."""
 
     @property
     def num_frames(self) -> int:
@@ -82,7 +82,7 @@ def trace_crossing(
         penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
         touching=recording.touching[0, replica, :frames],
         marks=find_marks(recording, replica),
-        moment_s=find_failure_time(recording, replica),
+        failure_s=find_failure_time(recording, replica),
     )
 
 

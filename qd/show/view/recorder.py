@@ -1,6 +1,6 @@
 """Records and films crossings on the CPU in a process of its own, while the page goes on answering.
 
-The process takes seconds to load the simulation. So it is begun before the page, and only the process loads that.
+The process takes seconds to load the simulation, so it starts before the page, and the page never loads it.
 """
 
 import threading
@@ -17,91 +17,92 @@ _PREPARING = "the simulation is built; the very first one compiles its kernels, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
-    """How a task goes on."""
+class Progress:
+    """How far a task is."""
 
-    wanted: Any
-    """The task: :class:`qd.show.recordings.Wanted`, or a film."""
+    task: Any
+    """A :class:`qd.show.recordings.Wanted`, or a film: a partial call of :func:`qd.show.film.film`."""
     text: str = ""
-    """In words, where its share does not say it."""
+    """An error, or what the process does where its share does not say it."""
     share: float = 0.0
     result: Any = None
-    """The recording or the film's file, when it is done."""
+    """The recording, or the film's file, when it is done."""
     failed: bool = False
 
 
-class _DroppedError(Exception):
-    """Nobody waits for it any more."""
+class _CancelledError(Exception):
+    """The task was cancelled."""
 
 
 class Simulator:
-    """What works in the process: it does the task that is put in, and drops it where ``drop`` is set."""
+    """Works in the process: it does the task that is put in, and drops it when ``cancelled`` is set."""
 
-    def __init__(self, drop: Event, num_terrains: int) -> None:
+    def __init__(self, cancelled: Event, num_terrains: int) -> None:
         import sim.simulation  # noqa: F401  Newton takes seconds to load: now, and not when somebody waits
         from qd.show.recordings import Simulation
 
-        self._drop, self._simulation_of = drop, Simulation
+        self._cancelled = cancelled
+        self._make_simulation = Simulation
         self._simulation: Simulation | None = None
 
-    def put(self, wanted: Any, robot: Any) -> None:
-        """Take on a :class:`qd.show.recordings.Wanted`, or a film as :func:`qd.show.film.film` makes it."""
-        self._task = wanted, robot
+    def put(self, task: Any, robot: Any) -> None:
+        """Accept a task of a robot."""
+        self._task = task
+        self._robot = robot
 
     def take(self, progress: Callable[[float], None]) -> Any:
-        """The recording or the file of the task; an error of it; None if it was dropped."""
-        wanted, robot = self._task
+        """The recording or the film's file; an error of the task; None if it was cancelled."""
 
         def report(share: float) -> None:
             progress(share)
-            if self._drop.is_set():
-                raise _DroppedError
+            if self._cancelled.is_set():
+                raise _CancelledError
 
         try:
-            if isinstance(wanted, partial):
-                wanted(progress=report)
-                return wanted.keywords["out"]
-            self._simulation = self._simulation or self._simulation_of(robot, "cpu")
-            return self._simulation([wanted], report)[0]
-        except _DroppedError:
+            if isinstance(self._task, partial):
+                self._task(progress=report)
+                return self._task.keywords["out"]
+            self._simulation = self._simulation or self._make_simulation(self._robot, "cpu")
+            return self._simulation([self._task], report)[0]
+        except _CancelledError:
             return None
         except (ValueError, OSError) as error:
             return error
 
 
 class Recorder:
-    """Does the tasks that each tab asked for last, the oldest first; earlier ones that are not begun are dropped."""
+    """Does the last request of each key, the oldest first; requests that are not begun are replaced."""
 
     def __init__(self, *, build: Callable[[Event, int], Any] = Simulator) -> None:
-        """The process imports by its name what ``build`` is, and has it make what works there."""
+        """The process imports ``build`` by its name, and calls it for what works there."""
         self.robot: Any = None
-        """Whose crossings they are; set before the first task."""
-        self.report: Callable[[Report], None] = lambda report: None
-        """Called in another thread, with every step forward."""
+        """Robot of all tasks; set before the first one."""
+        self.report: Callable[[Progress], None] = lambda progress: None
+        """Called in another thread, at every step forward."""
         self._build = build
-        self._drop = get_context("spawn").Event()
-        self._wishes: dict[Hashable, Any] = {}  # by tab, the oldest first
-        self._now: Any = None  # the task that is worked on
+        self._cancelled = get_context("spawn").Event()
+        self._requests: dict[Hashable, Any] = {}  # by key, the oldest first
+        self._current: Any = None
         self._stopped = False
         self._changed = threading.Condition()
-        self._worker, self._is_ready = self._begin(), False
+        self._worker = self._start_process()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, wanted: Any, *, tab: Hashable = 0) -> None:
-        """Do a task for a tab when its turn comes; with None, nothing more for it."""
+    def request(self, task: Any, *, key: Hashable = 0) -> None:
+        """Do a task when its turn comes; None withdraws the request of the key."""
         with self._changed:
-            self._wishes.pop(tab, None)
-            if wanted is not None and wanted != self._now:
-                self._wishes[tab] = wanted
+            self._requests.pop(key, None)
+            if task is not None and task != self._current:
+                self._requests[key] = task
             self._changed.notify()
 
-    def cancel(self, wanted: Any) -> None:
-        """Drop a task, also while it is worked on."""
+    def cancel(self, task: Any) -> None:
+        """Drop a task, even while it runs."""
         with self._changed:
-            self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
-            if self._now is not None and self._now == wanted:
-                self._drop.set()
+            self._withdraw(task)
+            if self._current is not None and self._current == task:
+                self._cancelled.set()
 
     def stop(self) -> None:
         """End process and thread at once."""
@@ -111,43 +112,48 @@ class Recorder:
             self._changed.notify()
         self._thread.join(timeout=10)
 
-    def _begin(self) -> WorkerProcess:
-        return WorkerProcess(1, self._build, self._drop)
+    def _withdraw(self, task: Any) -> None:
+        self._requests = {key: request for key, request in self._requests.items() if request != task}
+
+    def _start_process(self) -> WorkerProcess:
+        self._is_ready = False
+        return WorkerProcess(1, self._build, self._cancelled)
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or bool(self._wishes))
+                self._changed.wait_for(lambda: self._stopped or bool(self._requests))
                 if self._stopped:
                     return
-                wanted = self._now = self._wishes.pop(next(iter(self._wishes)))
+                task = self._current = self._requests.pop(next(iter(self._requests)))
             try:
-                result = self._result_of(wanted)
+                result = self._work_on(task)
             except (EvaluatorError, OSError) as error:
                 with self._changed:
                     if self._stopped:
                         return
                     self._worker.stop()
-                    self._worker, self._is_ready, result = self._begin(), False, error
+                    self._worker = self._start_process()
+                result = error
             with self._changed:
-                self._now = None
-                self._drop.clear()
-                if result is not None:  # others may have asked for the same meanwhile
-                    self._wishes = {tab: wish for tab, wish in self._wishes.items() if wish != wanted}
+                self._current = None
+                self._cancelled.clear()
+                if result is not None:
+                    self._withdraw(task)  # other keys may have requested the same meanwhile
             if isinstance(result, Exception):
-                self.report(Report(wanted=wanted, text=str(result), failed=True))
+                self.report(Progress(task=task, text=str(result), failed=True))
             elif result is not None:
-                self.report(Report(wanted=wanted, share=1.0, result=result))
+                self.report(Progress(task=task, share=1.0, result=result))
 
-    def _result_of(self, wanted: Any) -> Any:
-        """What came of a task: its result, an error, or None of one that is dropped."""
+    def _work_on(self, task: Any) -> Any:
+        """Result of a task, its error, or None if it was cancelled."""
         if not self._is_ready:
-            self.report(Report(wanted=wanted, text=_PREPARING))
-            self._worker.receive()  # that it is ready
+            self.report(Progress(task=task, text=_PREPARING))
+            self._worker.receive()  # it is ready
             self._is_ready = True
-        self._worker.send(wanted, self.robot)
+        self._worker.send(task, self.robot)
         while True:
             message, value = self._worker.receive()
             if message == "result":
                 return value
-            self.report(Report(wanted=wanted, share=float(value)))
+            self.report(Progress(task=task, share=float(value)))

@@ -19,7 +19,7 @@ from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
 from qd.show.replay import compute_numbers, describe, replay, select_elites, select_map
-from qd.show.view.show import find_show
+from qd.show.view.viewed import open_viewed_run
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
 from sim.robots.identity import robot_identity
@@ -221,5 +221,5 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
         np.testing.assert_array_equal(content["genes"], genes[number])
     about = json.loads((tmp_path / "out" / f"minimal-{number}.json").read_text())
     assert about["elite"] == number and about["minimal"]["cause"]["kind"] == "rise"
-    show = find_show(run, minimal=str(number), policies=("base=shipped",))
+    show = open_viewed_run(run, minimal=str(number), policies=("base=shipped",))
     assert show.elite == number and show.minimal

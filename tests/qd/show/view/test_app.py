@@ -13,9 +13,9 @@ from qd.faults.minimise.minimise import MinimalTerrains
 from qd.show.crossed import find_failure_time, find_typical_episode
 from qd.show.recordings import Recordings, on_elite
 from qd.show.view.app import App
-from qd.show.view.recorder import Report
-from qd.show.view.show import find_show
+from qd.show.view.recorder import Progress
 from qd.show.view.tab import Tab
+from qd.show.view.viewed import open_viewed_run
 from sim.recording.file import read_recording
 from tests.builders import free_port
 from tests.qd.show.view.visitor import visit
@@ -24,12 +24,12 @@ from tests.qd.show.view.visitor import visit
 @pytest.fixture(scope="module")
 def show(anymal, run):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return find_show(run, elite="0", policies=policies)
+    return open_viewed_run(run, elite="0", policies=policies)
 
 
 def wanted_of(recorder):
     """What a recorder was asked for."""
-    return [call.args[0] for call in recorder.record.call_args_list]
+    return [call.args[0] for call in recorder.request.call_args_list]
 
 
 class Shown:
@@ -194,7 +194,7 @@ def test_a_frame_has_the_robot_in_its_place_what_touches_in_colour_and_forces(sh
     pushed = (forces[:, :, 1] != forces[:, :, 0]).any(axis=2)
     for frame in (np.argmax(shank), np.argmin(shank), np.argmax(pushed.any(axis=1))):
         shown.do((tab.seek, 0.02 * frame))
-        parts = zip(tab.common.parts, tab.scene.parts, tab.scene.touched, strict=True)
+        parts = zip(tab.shared.parts, tab.scene.parts, tab.scene.touched, strict=True)
         columns = {column for part, _, touched in parts if touched.visible for column in part.touches}
         assert columns == set(np.flatnonzero(touching[frame]).tolist())
         np.testing.assert_allclose(tab.scene.bodies[0].position, tab.robot.recording.base_position[0, 0, frame])
@@ -253,10 +253,10 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
 
 def test_the_ghost_is_who_certifies_it_or_words_say_why_there_is_none(show):
     certified = int(np.flatnonzero(show.opened_run.archive.certified)[0])
-    name, words = show.certifying(certified)
+    name, words = show.find_certifier(certified)
     assert (name, words) == (show.opened_run.certifier(certified), "") and name in ("C-G", "S")
     lost = dataclasses.replace(show, controllers={"base": "shipped"})
-    name, words = lost.certifying(certified)
+    name, words = lost.find_certifier(certified)
     assert name is None and "--policies" in words
 
 
@@ -267,31 +267,30 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
     wanted = shown.asked[-1]
     assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
     assert not tab.scene.robot.visible and not tab.bar.shown["enabled"]
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="", share=0.4)))
+    shown.do((shown.app.show_progress, Progress(task=wanted, text="", share=0.4)))
     assert tab.bar.shown["task"] == "Recording 20 episodes of base: 40%" and tab.bar.shown["share"] == 0.4
     other = dataclasses.replace(wanted, terrain_seed=8)
-    shown.do((shown.app.show_report, Report(wanted=other, text="no", failed=True)))
+    shown.do((shown.app.show_progress, Progress(task=other, text="no", failed=True)))
     assert tab.bar.shown["share"] == 0.4  # of what is not shown nothing is said
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="it <broke>", failed=True)))
+    shown.do((shown.app.show_progress, Progress(task=wanted, text="it <broke>", failed=True)))
     assert status(tab) == "No crossing: it &lt;broke&gt;" and tab.bar.shown["share"] is None
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="", result=recording)))
+    shown.do((shown.app.show_progress, Progress(task=wanted, text="", result=recording)))
     assert status(tab).startswith("base collision") and tab.scene.robot.visible
 
 
 def test_a_film_is_made_and_offered_or_cancelled(shown, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    tab, films = shown.tab, Mock()
-    tab.filming._common = dataclasses.replace(tab.common, films=lambda: films)
+    tab = shown.tab
     shown.do((tab.film,))
-    (wanted,) = wanted_of(films)
+    wanted = wanted_of(shown.recorder)[-1]
     assert wanted.keywords["out"].name == f"elite-0-base-episode-{tab.replica + 1}.mp4"
-    shown.do((shown.app.show_report, Report(wanted=wanted, text="", share=0.4)))
+    shown.do((shown.app.show_progress, Progress(task=wanted, text="", share=0.4)))
     assert "40%" in tab.panel.film_status.content
-    shown.do((tab.filming.cancel,), (tab.film,))
-    films.cancel.assert_called_once_with(wanted)
+    shown.do((tab.cancel_film,), (tab.film,))
+    shown.recorder.cancel.assert_called_once_with(wanted)
     made = tmp_path / "film.mp4"
     made.write_bytes(bytes(1_500_000))
-    shown.do((shown.app.show_report, Report(wanted=wanted_of(films)[1], text="", result=made)))
+    shown.do((shown.app.show_progress, Progress(task=wanted_of(shown.recorder)[-1], text="", result=made)))
     assert "film.mp4 (1.5 MB)" in tab.panel.film_status.content
 
 

@@ -3,7 +3,7 @@ import re
 
 import numpy as np
 
-from qd.show.view.listing import Listing, count_endings, table_html
+from qd.show.view.listing import Listing, count_endings, render_rates
 from qd.show.view.panels import Clock, Selection
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
@@ -30,7 +30,7 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(lis
     members = {cause: len(rows) for cause, rows in listing.ranking.by_cause().items()}
     assert sum(members.values()) == 10  # those with a goal rate below .5
     assert list(listing.causes()) == ["all", *(f"{cause} ({count})" for cause, count in members.items())]
-    rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', listing.rows_html([12, 0]))
+    rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', listing.render_list(np.array([12, 0]), 12))
     assert rows == [("12", "crossed, 12 of 20"), ("0", listing.ranking.name(0))]
 
 
@@ -46,7 +46,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
     recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
     recorded = count_endings("here", recording)
     assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
-    table = table_html([resolved, recorded])
+    table = render_rates([resolved, recorded])
     assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]
     # Wilson, z^2 = 3.8415, of 9 of 20: .4587 +- .1998
     assert "<b>45%</b> <small>26 to 66%</small>" in table

@@ -38,47 +38,47 @@ def last_of(reports):
 
 def begin_slowly(recorder, reports):
     """Asks for a recording that takes its time, and waits until it is crossing."""
-    recorder.record(task := wish(1, "slow"))
+    recorder.request(task := wish(1, "slow"))
     while reports.get(timeout=60).share == 0.0:
         pass
     return task
 
 
 def test_progress_comes_before_the_recording(recorder, reports):
-    recorder.record(wish(2))
+    recorder.request(wish(2))
     received = last_of(reports)
     assert [report.share for report in received] == [0.0, 0.5, 1.0]
     assert "built" in received[0].text and received[-1].result == "spot: fast on 2"
-    recorder.record(wish(3))
+    recorder.request(wish(3))
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
 
 def test_of_several_wishes_the_last_one_counts(recorder, reports):
     begin_slowly(recorder, reports)
     for number in (2, 3, 4):
-        recorder.record(wish(number, "slow"))
+        recorder.request(wish(number, "slow"))
     assert last_of(reports)[-1].result == "spot: slow on 1"
     assert last_of(reports)[-1].result == "spot: slow on 4"
-    recorder.record(wish(5))
-    recorder.record(None)
+    recorder.request(wish(5))
+    recorder.request(None)
     time.sleep(0.5)
-    assert all(reports.get().wanted.terrain_seed == 5 for _ in range(reports.qsize()))
+    assert all(reports.get().task.terrain_seed == 5 for _ in range(reports.qsize()))
 
 
 def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
-    recorder.record(wish(13))
+    recorder.request(wish(13))
     failed = last_of(reports)[-1]
     assert failed.failed and "RuntimeError: broken" in failed.text
-    recorder.record(wish(14))
+    recorder.request(wish(14))
     assert last_of(reports)[-1].result == "spot: fast on 14"
-    recorder.record(wish(1, "refused"))
+    recorder.request(wish(1, "refused"))
     assert last_of(reports)[-1].text == "no such controller"
 
 
 def test_what_is_worked_on_can_be_cancelled(recorder, reports):
     task, began = begin_slowly(recorder, reports), time.perf_counter()
     recorder.cancel(task)
-    recorder.record(wish(2))
+    recorder.request(wish(2))
     assert last_of(reports)[-1].result == "spot: fast on 2" and time.perf_counter() - began < 0.9
 
 

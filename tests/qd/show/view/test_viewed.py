@@ -9,12 +9,12 @@ import pytest
 
 from qd.search.archive import write_archive
 from qd.show.view.app import check_port
-from qd.show.view.show import find_show
+from qd.show.view.viewed import open_viewed_run
 from tests.builders import small_archive
 
 
 def test_the_controller_of_the_search_comes_first_and_certifiers_follow(anymal, run):
-    controllers = find_show(run).controllers
+    controllers = open_viewed_run(run).controllers
     assert next(iter(controllers.items())) == ("searched controller", str(anymal.policy_file)) and "C-G" in controllers
 
 
@@ -23,9 +23,9 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path, 
     settings = json.loads((copied / "config.json").read_text())
     settings["settings"] |= {"policy": "tests.sim.policies:stand", "policy_sha256": None}
     (copied / "config.json").write_text(json.dumps(settings))
-    show = find_show(copied)
+    show = open_viewed_run(copied)
     assert show.controllers == {} and "tests.sim.policies:stand is code" in show.note
-    named = find_show(copied, policies=("mine=tests.sim.policies:stand",))
+    named = open_viewed_run(copied, policies=("mine=tests.sim.policies:stand",))
     assert next(iter(named.controllers.items())) == ("mine", "tests.sim.policies:stand")
 
 
@@ -41,13 +41,13 @@ def test_terrains_are_shown_when_the_controller_of_the_search_is_code(tmp_path, 
 )
 def test_what_is_wrong_is_said_before_a_page_opens(changes, field, run):
     with pytest.raises((ValueError, FileNotFoundError), match=field):
-        find_show(**{"run": run} | changes)
+        open_viewed_run(**{"run": run} | changes)
 
 
 def test_a_run_without_elites_is_refused(tmp_path):
     write_archive(tmp_path / "archive.npz", small_archive(0))
     with pytest.raises(ValueError, match="no elites"):
-        find_show(tmp_path)
+        open_viewed_run(tmp_path)
 
 
 def test_a_port_in_use_is_refused_until_it_is_free():

@@ -1,6 +1,6 @@
-"""The player bar under the scene: what it shows goes to the browser, and what a visitor does there comes back.
+"""The player bar under the scene: it shows values in the browser, and sends back what a visitor does.
 
-The bar is ``page.js``'s own, since viser has no place under the scene for one. It also sends keys and clicks on elites.
+``page.js`` draws the bar, since viser has no element under the scene. It also sends keys and clicks on elites.
 """
 
 import json
@@ -14,47 +14,49 @@ from viser import _messages
 _SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 
 
-class Bar:
+class PlayerBar:
     """The bar of one browser tab."""
 
     def __init__(self, client: viser.ClientHandle, act: Callable[[str, Any], None]) -> None:
-        """Lay it out; ``act`` is called in another thread with the name and the value of what a visitor does."""
-        self._client, self._act = client, act
+        """Add the bar; ``act`` is called in another thread with the name and value of each action of a visitor."""
+        self._client = client
+        self._act = act
         self.shown: dict[str, Any] = {}
-        """What it shows, by the names in ``page.js``."""
-        panel = client.gui.add_panel()  # hidden by the script; a field of another panel is gone while that is folded
+        """Values by their names in ``page.js``."""
+        panel = client.gui.add_panel()  # hidden by the script; the field of a folded panel would be gone
         panel.float(x=0.0, y=0.0)
         panel.expand()
         with panel.add_tab("player bar"):
             client.gui.add_html('<i class="faultline-channel"></i>')
             field = client.gui.add_text("channel", "")
-        field.on_update(lambda event: self._take(field.value) if event.client is not None else None)
+        field.on_update(lambda event: self._receive(field.value) if event.client is not None else None)
         self._run(_SCRIPT)
 
-    def _take(self, text: str) -> None:
+    def _receive(self, text: str) -> None:
         try:
-            _, done = json.loads(text)
-            tasks = list(done.items())
+            _, actions = json.loads(text)
+            for name, value in actions.items():
+                self._act(name, value)
         except (ValueError, TypeError, AttributeError):  # anybody may write into the field
             return
-        for name, value in tasks:
-            self._act(name, value)
 
     def show(self, values: Mapping[str, Any]) -> None:
-        """Show values by their names in ``page.js``; only what has changed is sent."""
+        """Show values by their names in ``page.js``; only changed ones are sent."""
         changed = {name: value for name, value in values.items() if self.shown.get(name, ...) != value}
         if changed:
             self.shown |= changed
             self._run(f"window.faultline?.show({json.dumps(changed)});")
 
     def show_address(self, query: str, *, is_new: bool) -> None:
-        """Have the browser show another address, without loading anything; a new one is an entry in its history."""
+        """Change the browser's address without loading a page; a new one is an entry in its history."""
         self._run(f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
 
     def copy(self, text: str) -> None:
-        """Have the browser copy a text; if it may not, it shows that to be copied by hand."""
-        self._run(f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
-             "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();")  # fmt: skip
+        """Have the browser copy a text; a browser that forbids it shows the text."""
+        self._run(
+            f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
+            "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();"
+        )
 
     def _run(self, script: str) -> None:
         """Run a script in the browser; viser does so for its plots, and has no public name for it."""

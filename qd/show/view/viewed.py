@@ -1,4 +1,4 @@
-"""What to show. What a user may have got wrong is refused before a page opens."""
+"""The run that the viewer shows. What a user may have got wrong is refused before a page opens."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ from sim.controllers.spec import ControllerSpec, parse_controllers
 from sim.robots.robot import RobotCfg
 
 SEARCHED = "searched controller"
-"""What the page calls the controller of the search, if no other is named."""
+"""Name of the search's controller on the page, if no other is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show:
+class ViewedRun:
     """What the viewer shows."""
 
     opened_run: OpenedRun
@@ -43,23 +43,24 @@ class Show:
 
     @property
     def robot(self) -> RobotCfg:
-        """Whose archive it is."""
+        """The run's robot."""
         return self.opened_run.robot
 
-    def genes(self, elite: int, minimal: bool) -> NDArray[np.float32] | None:
-        """Of the minimal terrain of an elite; None where the whole one is to be shown."""
-        return self.minima.genes.get(elite) if minimal and self.minima is not None else None
+    def minimal_genes(self, elite: int) -> NDArray[np.float32] | None:
+        """Genes of the minimal terrain of an elite; None if it has none."""
+        return None if self.minima is None else self.minima.genes.get(elite)
 
-    def wanted(self, elite: int, controller: str | None, *, minimal: bool = False) -> Wanted | None:
+    def request(self, elite: int, controller: str | None, *, minimal: bool = False) -> Wanted | None:
         """A controller's crossings of an elite, or of its minimal terrain if it has one; None without a controller."""
         if controller is None:
             return None
-        policy, genes = self.controllers[controller], self.genes(elite, minimal)
-        return on_elite(self.opened_run.archive, elite, policy=policy, minimal=genes)
+        genes = self.minimal_genes(elite) if minimal else None
+        return on_elite(self.opened_run.archive, elite, policy=self.controllers[controller], minimal=genes)
 
-    def certifying(self, number: int) -> tuple[str | None, str]:
-        """Name of the controller that crosses a failing elite, the best of several, or why there is none to show."""
-        archive, name = self.opened_run.archive, self.opened_run.certifier(number)
+    def find_certifier(self, number: int) -> tuple[str | None, str]:
+        """Name of the controller that crosses a failing elite most often, or why there is none to show."""
+        archive = self.opened_run.archive
+        name = self.opened_run.certifier(number)
         if name is not None and self.controllers.get(name) == self.opened_run.certifiers()[name]:
             return name, ""
         if archive.faults is None or not archive.certified[number]:
@@ -68,7 +69,7 @@ class Show:
         return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."
 
 
-def find_show(
+def open_viewed_run(
     run: Path | None = None,
     *,
     robot: str | None = None,
@@ -76,40 +77,37 @@ def find_show(
     minimal: str | None = None,
     policies: Sequence[str] = (),
     space: str | None = None,
-) -> Show:
+) -> ViewedRun:
     """What a user asks to see, by the flags of ``faultline view``."""
     opened_run = open_run(robot, run, space=space)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
     if elite and minimal:
         raise ValueError(f"elite and minimal both say what to open, got '{elite}' and '{minimal}': leave one out")
-    minima = read_minimal(opened_run.folder, opened_run.archive) if minimal is None else opened_run.minima()
-    if minima is not None and minimal is not None:
-        numbers = minima.chosen(minimal, opened_run.path)
-    else:
-        numbers = [terrain.number for terrain in opened_run.terrains(elite)] if elite else [None]
+    numbers: list[int | None] = [None]
+    if elite or minimal is not None:
+        numbers = [terrain.number for terrain in opened_run.terrains(elite, minimal)]
     if len(numbers) > 1:
         raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite or minimal}'")
-    (number,) = numbers
-    controllers, note = _controllers_of(policies, opened_run)
-    return Show(
+    controllers, note = _find_controllers(policies, opened_run)
+    return ViewedRun(
         opened_run=opened_run,
-        elite=number,
+        elite=numbers[0],
         controllers=controllers,
         note=note,
-        minima=minima,
+        minima=read_minimal(opened_run.folder, opened_run.archive),
         minimal=minimal is not None,
     )
 
 
-def _controllers_of(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dict[str, str], str]:
+def _find_controllers(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dict[str, str], str]:
     """The controllers by name, and why there are none."""
     certifiers = opened_run.certifiers()
     if any(map(str.strip, policies)):
         controllers = parse_controllers(policies, opened_run.robot)
         for policy in controllers.values():
             check_policy(policy, opened_run.robot, "cpu")
-        return {**controllers, **{name: file for name, file in certifiers.items() if name not in controllers}}, ""
+        return controllers | {name: file for name, file in certifiers.items() if name not in controllers}, ""
     searched, _ = opened_run.as_searched()
     try:
         if ControllerSpec.parse(searched).runs_code:
