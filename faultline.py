@@ -7,7 +7,7 @@ controller cross terrains; docs/searching.md shows them in twenty lines.
 import difflib
 import importlib
 import sys
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 
 class Command(NamedTuple):
@@ -45,6 +45,18 @@ COMMANDS: dict[str, dict[str, Command]] = {
 }
 """What can be done, by what it is for; first the six that a newcomer needs."""
 
+if TYPE_CHECKING:
+    from qd.evaluate.evaluate import evaluate as evaluate
+    from qd.evaluate.sets import make_sets as make_sets
+    from qd.faults.judge import judge as judge
+    from qd.search.loop import search as search
+    from qd.search.settings import preset as preset
+    from qd.workers.cross import cross as cross
+    from qd.workers.evaluator import Compute as Compute
+    from sim.robots.find import get_robot as get_robot
+    from train.cfg import FinetuneCfg as FinetuneCfg
+    from train.finetune import finetune as finetune
+
 API = {
     "search": "qd.search.loop",
     "judge": "qd.faults.judge",
@@ -57,14 +69,16 @@ API = {
     "Compute": "qd.workers.evaluator",
     "get_robot": "sim.robots.find",
 }
-"""Functions and settings for Python by the modules that have them."""
+"""Functions and settings for Python by their modules, loaded when they are used; type checkers see them above."""
 
 
-def __getattr__(name: str) -> Any:
-    """Loads a function of :data:`API` when it is first asked for."""
-    if name not in API:
-        raise AttributeError(f"module 'faultline' has no attribute '{name}': it has {', '.join(API)}")
-    return getattr(importlib.import_module(API[name]), name)
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Loads what :data:`API` names."""
+        if name not in API:
+            raise AttributeError(f"module 'faultline' has no attribute '{name}': it has {', '.join(API)}")
+        return getattr(importlib.import_module(API[name]), name)
 
 
 _BY_NAME = {name: command for group in COMMANDS.values() for name, command in group.items()}

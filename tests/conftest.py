@@ -14,7 +14,6 @@ import pytest
 import torch
 import warp as wp
 
-from qd.search.directory import RESULTS
 from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.provenance import provenance
@@ -91,8 +90,9 @@ def robot(request):
 def published(tmp_path_factory) -> Path:
     """A results/ folder with the published archives."""
     results = tmp_path_factory.mktemp("published") / "results"
+    shipped = Path(__file__).resolve().parents[1] / "results"
     for name in ROBOTS:
-        shutil.copytree(RESULTS.resolve() / name / "archive", results / name / "archive")
+        shutil.copytree(shipped / name / "archive", results / name / "archive")
     return results
 
 

@@ -1,5 +1,6 @@
 """The command: its words, how it fails, and that help loads nothing that takes seconds."""
 
+import ast
 import dataclasses
 import subprocess
 import sys
@@ -50,3 +51,13 @@ def test_an_unknown_word_gets_a_suggestion(capsys, given, meant):
     error = capsys.readouterr().err
     assert f"'{given}'" in error and meant in error
     assert faultline.main([]) == 0 and "usage: faultline COMMAND" in capsys.readouterr().out
+
+
+def test_the_functions_for_python_are_loaded_and_known_to_type_checkers():
+    tree = ast.parse(Path(faultline.__file__).read_text())
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.col_offset]
+    typed = {alias.asname: node.module for node in imports for alias in node.names if alias.asname}
+    assert typed == faultline.API
+    assert all(callable(getattr(faultline, name)) for name in faultline.API)
+    with pytest.raises(AttributeError, match="nobody"):
+        faultline.nobody  # noqa: B018

@@ -21,10 +21,8 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import get_space, load_space
 
 RUNS = Path("runs")
-_OWN_RESULTS = Path(__file__).resolve().parents[2] / "results"
-RESULTS = Path("results") if Path("results").is_dir() or not _OWN_RESULTS.is_dir() else _OWN_RESULTS
-"""Where published archives, tables and panels lie, <robot>/archive and so on: results/ of the present folder, or of
-this checkout where that has none."""
+"""Where runs are written, below the working folder."""
+_CHECKOUT = Path(__file__).resolve().parents[2]
 CONFIG_FILE = "config.json"
 CHECKPOINT_FILE = "checkpoint.bin"
 METRICS_FILE = "metrics.jsonl"
@@ -35,6 +33,12 @@ _REMEDY = "put a copy of it back, or start a new run"
 
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
+
+
+def results_folder() -> Path:
+    """Folder of published archives, tables and panels: results/ of the working folder, else of this checkout."""
+    folders = (Path("results"), _CHECKOUT / "results")
+    return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
 def find_run(
@@ -50,7 +54,7 @@ def find_run(
                 f"{named} is published and stays as it is: copy its directory below {RUNS}/, and name that"
             )
         return named
-    folder = RESULTS / robot.name / "archive"
+    folder = results_folder() / robot.name / "archive"
     runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
     files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
     newest = next((file.parent for file in files if _robot_of(file) == robot.name), None)
@@ -67,7 +71,7 @@ def find_run(
 
 def _is_published(path: Path) -> bool:
     """Whether a run lies among those that are published."""
-    return RESULTS.resolve() in path.resolve().parents
+    return results_folder().resolve() in path.resolve().parents
 
 
 def _robot_of(file: Path) -> str | None:

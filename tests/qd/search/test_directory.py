@@ -4,8 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from qd.search import directory
-from qd.search.directory import RunDirectory, claimed, find_run, folder_for, read_archive_of, search_seed
+from qd.search.directory import (
+    RunDirectory,
+    claimed,
+    find_run,
+    folder_for,
+    read_archive_of,
+    results_folder,
+    search_seed,
+)
 from sim.robots.find import get_robot
 from tests.builders import small_archive, write_run
 from tests.qd.searches import CFG
@@ -66,8 +73,15 @@ def test_what_is_no_run_or_has_not_begun_has_no_state(tmp_path):
 def results(tmp_path, monkeypatch):
     """An empty folder of published results, beside an empty one to work in."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(directory, "RESULTS", tmp_path / "results")
-    return tmp_path / "results"
+    Path("results").mkdir()
+    return Path("results")
+
+
+def test_published_results_are_those_of_the_working_folder_else_of_the_checkout(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (results_folder() / "anymal" / "archive" / "archive.npz").exists()
+    Path("results").mkdir()
+    assert results_folder() == Path("results")
 
 
 def make_run(path: Path, time: float = 0.0, **changes) -> Path:
