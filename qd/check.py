@@ -1,4 +1,4 @@
-"""Whether a robot and its controller are read rightly: it stands, walks alike in both simulators; what stops it."""
+"""Whether a robot and its controller are read correctly: it stands, and walks equally in both simulators."""
 
 import re
 from dataclasses import replace
@@ -16,10 +16,12 @@ from qd.workers.evaluator import Compute, check_policy
 from sim.controllers.spec import crosser_name
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
+from sim.files.templates import open_templates
 from sim.mujoco_c.crossing import cross_terrains
+from sim.robots.describe import describe_model, describe_standing
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
-from sim.robots.stand import Standing, describe_model, describe_standing, stand
+from sim.robots.stand import Standing, stand, standing_mistakes
 from sim.robots.user import describe_inferred
 from sim.rollout import RolloutResult
 from sim.terrains.doses import parse_doses
@@ -28,45 +30,46 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _WALKS = 8  # episodes on flat ground in each simulator
 _APART = 0.05  # share by which speeds may differ
-_MOST_CONTACTS = 1_000  # a robot that has more is refused
+_MAX_CONTACTS = 1_000  # a robot that has more is refused
+_TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
 
 
-def check(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bool:
-    """Prints what is read, whether it stands and walks, and what it gets over if it does.
+def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bool:
+    """Prints what a robot's files hold, whether it stands and walks, and which obstacles it crosses.
 
-    Returns whether it stands as it should and walks alike in both simulators. Without ``policy`` it walks by the
-    robot's own controller.
+    Without ``policy`` it walks by the controller beside its settings. Returns whether nothing has to be mended and it
+    walks equally in both simulators.
     """
     policy = policy or str(robot.policy_file)
     if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
         check_policy(policy, robot, compute.device)
     print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
     robot, standing = _with_room(robot, compute.device, 3.0)
-    text, fine = describe_standing(robot, standing)
-    print(text, flush=True)
+    print(describe_standing(robot, standing), flush=True)
     if not has_controller:
-        beside = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
-        print(f"Without a controller, expected at {beside} or named by --policy, this is all.")
-        return fine
+        expected = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
+        print(f"Without a controller, expected at {expected} or named by --policy, this is all.")
+        return not [*standing_mistakes(robot, standing)]
     with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
-        if not _walks(robot, walk(crossings, policy)):
+        if not _report_walk(robot, walk(crossings, policy)):
             return False
-        most, share = fitting_height(crossings, policy)
+        height, share = fitting_height(crossings, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
     crosser = crosser_name(robot, policy)
     out = RUNS / f"{crosser}-check" / "dose.json"
     dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
-    up, kerb = (_half_words(dose, name) for name in ("stairs_up", "step_up"))
-    print(f"Half get over a kerb {kerb}, stairs {up}; {share:.0%} cross hard-random terrains at --height {most:g}.")
-    return fine
+    stairs, kerb = (_half_label(dose, name) for name in ("stairs_up", "step_up"))
+    print(f"Half get over a kerb {kerb}, stairs {stairs}", end="; ")
+    print(f"{share:.0%} cross hard-random terrains at --height {height:g}.")
+    return not [*standing_mistakes(robot, standing)]
 
 
-def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
-    """A user's robot with room for its contacts and the scales of its penalties.
+def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
+    """A user's robot with room for its contacts and the scales of its penalties; a shipped robot has both.
 
-    What is missing is measured with the controller of its first use, and written beside it. Scales of the robot before
-    it changed are missing, too.
+    Where scales are missing or older than the robot's settings or model, the given controller measures them, and they
+    are written beside the settings.
     """
     if robot.settings_file is None:
         return robot
@@ -84,26 +87,26 @@ def made_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCf
 
 def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, Standing]:
     """The robot with room for the contacts of the dropped ones, written into its settings where these are data."""
-    wanted = robot
-    while (standing := stand(wanted, device=device, seconds=seconds)).overflowed:
-        if wanted.nconmax >= _MOST_CONTACTS:
+    larger = robot
+    while (standing := stand(larger, device=device, seconds=seconds)).overflowed:
+        if larger.nconmax >= _MAX_CONTACTS:
             raise ValueError(
-                f"robot '{robot.name}' has more than {wanted.nconmax} contacts, expected fewer: let fewer of its geoms "
+                f"robot '{robot.name}' has more than {larger.nconmax} contacts, expected fewer: let fewer of its geoms "
                 "touch the ground"
             )
-        wanted = replace(wanted, nconmax=2 * wanted.nconmax)
-    if wanted == robot:
+        larger = replace(larger, nconmax=2 * larger.nconmax)
+    if larger is robot:
         return robot, standing
-    wanted = replace(robot, nconmax=max(robot.nconmax, int(np.ceil(1.5 * standing.contacts))))
-    print(f"It had too little room for contacts: it needs nconmax = {wanted.nconmax}", end="")
+    larger = replace(robot, nconmax=max(robot.nconmax, int(np.ceil(1.5 * standing.contacts))))
+    print(f"It had too little room for contacts: it needs nconmax = {larger.nconmax}", end="")
     file = robot.settings_file
     if file is None or file.suffix != ".toml":
         print(": write it into its settings.", flush=True)
-        return wanted, standing
+        return larger, standing
     text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
-    write_atomically(file, f"nconmax = {wanted.nconmax}\n{text}".encode())
+    write_atomically(file, f"nconmax = {larger.nconmax}\n{text}".encode())
     print(f", as {file} says now.", flush=True)
-    return wanted, standing
+    return larger, standing
 
 
 def walk(crossings: Crossings, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
@@ -122,38 +125,33 @@ def walk(crossings: Crossings, policy: str, seed: int = 0) -> dict[str, dict[str
 
 def _walked(result: RolloutResult) -> dict[str, float]:
     valid = ~result.invalid
-    way = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
+    distance = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
     numbers = {
         "goal": result.reached_goal[valid],
-        "speed": way / result.duration_s[valid],
+        "speed": distance / result.duration_s[valid],
         "height": result.final_position[valid][:, 2],
     }
     means = {name: float(values.mean()) if valid.any() else 0.0 for name, values in numbers.items()}
     return {"episodes": int(valid.sum()), **means}
 
 
-def _walks(robot: RobotCfg, walked: dict[str, dict[str, float]]) -> bool:
+def _report_walk(robot: RobotCfg, walks: dict[str, dict[str, float]]) -> bool:
     """Prints how it walks in both simulators; returns whether it does, and at the same speed."""
-    here, there = (
-        f"{round(now['goal'] * now['episodes'])} of {now['episodes']:.0f} reach the goal, {now['speed']:.3f} m/s, base "
-        f"{now['height']:.3f} m high"
-        for now in walked.values()
+    slow, fast = sorted(walk["speed"] for walk in walks.values())
+    reaches_goal = min(walk["goal"] for walk in walks.values()) >= FAILING_GOAL_RATE
+    agree = fast - slow <= _APART * fast
+    text = _TEMPLATES.get_template("walking.txt").render(
+        robot=robot, walks=walks, reaches_goal=reaches_goal, agree=agree, tolerance=_APART
     )
-    print(f"On flat ground at {robot.speed:g} m/s: {here}. In MuJoCo C: {there}.", flush=True)
-    slow, fast = sorted(now["speed"] for now in walked.values())
-    if min(now["goal"] for now in walked.values()) < FAILING_GOAL_RATE:
-        print("It does not walk: look at the order of joints, default pose, scales, gains, and what it observes.")
-        return False
-    if fast - slow > _APART * fast:
-        print(f"Its speeds differ by more than {_APART:.0%}: what holds in one simulator need not in the other.")
-    return fast - slow <= _APART * fast
+    print(text.rstrip(), flush=True)
+    return reaches_goal and agree
 
 
-def _half_words(dose: dict[str, Any], element: str) -> str:
-    """Up to which rise half of the robots get over an obstacle: ``of 6 cm``."""
+def _half_label(dose: dict[str, Any], element: str) -> str:
+    """The rise up to which half of the robots get over an obstacle: ``of 6 cm``."""
     (half,) = (half["value"] for half in dose["half"] if half["element"] == element)
+    if half is not None:
+        return f"of {100 * half:.0f} cm"
     first = next(row["goal_rate"] for row in dose["dose"] if row["element"] == element)
-    if half is None:
-        over = first is not None and first >= FAILING_GOAL_RATE
-        return f"of over {100 * _RISES[-1]:.0f} cm" if over else f"of less than {100 * _RISES[0]:.0f} cm"
-    return f"of {100 * half:.0f} cm"
+    over = first is not None and first >= FAILING_GOAL_RATE
+    return f"of over {100 * _RISES[-1]:.0f} cm" if over else f"of less than {100 * _RISES[0]:.0f} cm"

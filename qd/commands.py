@@ -92,7 +92,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
-        from qd.check import made_ready
+        from qd.check import ensure_ready
         from qd.faults.judge import find_search, judge
         from qd.search.directory import free_path
         from qd.search.loop import say_what_stops_the_robot, search
@@ -106,7 +106,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
             robot, policy, space = get_robot(self.robot), None, load_space(self.space)
             if self.height is not None:
                 space = at_height(space, self.height)
-            robot = made_ready(robot, self.policy, compute)
+            robot = ensure_ready(robot, self.policy, compute)
             space = space_at(space, self.height, robot)
             cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
         elif self.run_dir or self.height is not None:
@@ -250,10 +250,10 @@ class CheckCommand(ControllerFlags, WorkerFlags):
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
-        from qd.check import check
+        from qd.check import check_robot
 
         compute = _compute(self)
-        return 0 if check(get_robot(self.robot), self.policy, compute=compute) else 1
+        return 0 if check_robot(get_robot(self.robot), self.policy, compute=compute) else 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,7 +287,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
-        from qd.check import made_ready
+        from qd.check import ensure_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
         from qd.evaluate.tables import is_regression
 
@@ -305,7 +305,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
         controllers = parse_controllers(self.policies, robot)
-        robot = made_ready(robot, next(iter(controllers.values())), compute)
+        robot = ensure_ready(robot, next(iter(controllers.values())), compute)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
 

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from qd.check import made_ready, walk
+from qd.check import ensure_ready, walk
 from qd.evaluate.dose import measure_dose
 from qd.evaluate.evaluate import evaluate_rates
 from qd.faults.judge import judge
@@ -86,7 +86,7 @@ def ready(name: str, folder: Path, runs: Path, compute: Compute) -> tuple[RobotC
         import_controller(folder / source, folder / model, home)
         fill_in(home / "controller.toml", of_controller)
         fill_in(home / "robot.toml", of_robot)
-    robot = made_ready(get_robot(str(home / "robot.toml")), None, compute)
+    robot = ensure_ready(get_robot(str(home / "robot.toml")), None, compute)
     return robot, fitting_space(robot) or SUPER_GAUSSIAN.name
 
 

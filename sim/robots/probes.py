@@ -322,12 +322,12 @@ def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
     rng, spread = np.random.default_rng(0), CrossingCfg().start_joint_range
     scale = rng.uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
     scale[0] = 1.0
-    feet = (bottoms[name] for bottoms, _ in extents(builder, scale * robot.default_joint_pos)
+    feet = (bottoms[name] for bottoms, _ in measure_extents(builder, scale * robot.default_joint_pos)
             for name in robot.foot_geoms)  # fmt: skip
     return float(np.ceil(-1e3 * min(feet) - 1e-3) / 1e3)
 
 
-def extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
+def measure_extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
     """Lowest point of each geom, and the farthest of all, from the upright base [m] in poses of shape (num_joints,)."""
     with wp.ScopedDevice(host_device()):
         model, probes = builder.finalize(), make_probes(builder)

@@ -20,7 +20,7 @@ from sim.robots.compiled import PER_JOINT, file_problems
 from sim.robots.elements import joint_names, mj
 from sim.robots.model import builder_of
 from sim.robots.model_files import read_model_files
-from sim.robots.probes import extents, make_probes, start_height
+from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.robots.robot_file import RobotFile, read_robot_file
 from sim.robots.shipped import ROBOTS
@@ -129,7 +129,7 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
         isinstance(angle, int | float) and math.isfinite(angle) for angle in pose
     ):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
-    ((bottoms, _),) = extents(builder_of(model), [pose])
+    ((bottoms, _),) = measure_extents(builder_of(model), [pose])
     body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
     taken = {name for role in ("base_geoms", "foot_geoms", "limb_geoms") for name in given.get(role, ())}
     free = [name for name in bottoms if name not in taken]

@@ -95,7 +95,7 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
 
 @pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
 def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch, again, settling, name):
-    monkeypatch.setattr(check, "made_ready", lambda *given: pytest.fail("they are looked at"))
+    monkeypatch.setattr(check, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
     assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
     assert os.listdir() == []
 

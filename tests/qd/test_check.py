@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from qd.check import check, made_ready
+from qd.check import check_robot, ensure_ready
 from qd.commands import CheckCommand
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
@@ -35,7 +35,7 @@ def test_a_controller_is_tried_before_anything_is_simulated(tmp_path, capsys):
 @pytest.mark.slow
 def test_the_shipped_controller_walks_alike_in_both_simulators_and_gets_over_kerbs(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    assert check(get_robot("anymal"), compute=Compute.resolve("cpu", "1", None))
+    assert check_robot(get_robot("anymal"), compute=Compute.resolve("cpu", "1", None))
     text = capsys.readouterr().out
     assert text.count("8 of 8 reach the goal") == 2 and "get over a kerb of " in text
 
@@ -44,7 +44,7 @@ def test_the_shipped_controller_walks_alike_in_both_simulators_and_gets_over_ker
 def test_a_controller_that_stands_still_does_not_walk(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     compute = Compute.resolve("cpu", "1", None)
-    assert not check(get_robot("anymal"), "tests.sim.policies:stand", compute=compute)
+    assert not check_robot(get_robot("anymal"), "tests.sim.policies:stand", compute=compute)
     text = capsys.readouterr().out
     assert text.count("0 of 8 reach the goal") == 2 and "It does not walk" in text and "kerb" not in text
 
@@ -54,12 +54,12 @@ def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monk
     pose = "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n"
     file, policy = write_toml(tmp_path / "dog", f"{pose}nconmax = 2\n"), f"{tmp_path / 'trot.py'}:Trot"
     (tmp_path / "trot.py").write_text(CONTROLLER)
-    robot = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
+    robot = ensure_ready(get_robot(str(file)), policy, compute_by(Robots()))
     assert robot == get_robot(str(file)) and robot.nconmax > 2
     assert len(read_penalty_scales(robot)) == len(robot.penalties)
-    assert made_ready(robot, policy, compute_by(Robots(stop_after=0))) is robot
+    assert ensure_ready(robot, policy, compute_by(Robots(stop_after=0))) is robot
     file.write_text(f"speed = 0.5\n{file.read_text()}")
-    changed = made_ready(get_robot(str(file)), policy, compute_by(Robots()))
+    changed = ensure_ready(get_robot(str(file)), policy, compute_by(Robots()))
     assert len(read_penalty_scales(changed)) == len(robot.penalties) and changed.speed == 0.5
     assert capsys.readouterr().out.count("measured first") == 2
     scales = json.loads(robot.scales_file.read_text()) | {"space": "super_gaussian@0.06"}

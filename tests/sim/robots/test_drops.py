@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot
-from sim.robots.probes import extents
+from sim.robots.probes import measure_extents
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import CROSSING_TYPES, SPACING, crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -24,7 +24,7 @@ def above_ground(robot, grids, rng):
     q[:, :2] = rng.uniform([4.5, 1.5], [11.5, 6.5], (len(q), 2))
     q[:, 3:7] = Rotation.random(len(q), rng).as_quat()
     q[:, 7:] = robot.default_joint_pos
-    ((_, reach),) = extents(build_robot(robot), [robot.default_joint_pos])
+    ((_, reach),) = measure_extents(build_robot(robot), [robot.default_joint_pos])
     for row, grid in zip(q, grids, strict=True):
         i, j = round(row[1] / SPACING), round(row[0] / SPACING)
         row[2] = grid[max(i - 16, 0) : i + 17, max(j - 16, 0) : j + 17].max() + reach

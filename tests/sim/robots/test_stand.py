@@ -4,8 +4,9 @@ import dataclasses
 
 import pytest
 
+from sim.robots.describe import describe_model, describe_standing
 from sim.robots.find import get_robot
-from sim.robots.stand import describe_model, describe_standing, stand
+from sim.robots.stand import stand, standing_mistakes
 from tests.sim.dogs import KINDS, LEGS, write_dog
 
 
@@ -19,33 +20,39 @@ def test_a_dog_stands_on_its_feet(tmp_path, device, kind):
     assert standing.height[0] == 0.29 and 0.24 < standing.height[1] < 0.29
     assert standing.tilt_deg < 2.0 and standing.joint_error < 0.1
     assert 4 <= standing.contacts < dog.nconmax
-    assert describe_standing(dog, standing)[1]
+    assert not [*standing_mistakes(dog, standing)]
+    assert describe_standing(dog, standing).endswith("It stands.")
     for change in ({"carried": {}}, {"height": (0.29, 0.1)}, {"tilt_deg": 16.0}, {"finite": False}):
         assert not dataclasses.replace(standing, **change).stands
 
 
 @pytest.mark.parametrize(
-    ("change", "parts"),
+    ("change", "mistake", "parts"),
     [
         # Thigh and shank of 0.15 m lean by 0.6 rad to either side: soles 0.3 cos 0.6 + 0.025 = 0.2726 m under the hips.
-        ({"default_base_height": 0.2}, ("0.073", "default_base_height 0.29")),
-        ({"default_base_height": 0.45}, ("0.177 m", "default_base_height 0.29")),  # 0.45 - 0.2726 m
-        ({"default_joint_pos": (0.0, -2.6) * 4}, ("default pose",)),
-        ({"nconmax": 3}, ("nconmax",)),
-        ({"foot_geoms": ("FL_foot",)}, ("without a role", "FR_foot, HL_foot, HR_foot")),
-        ({"armature": (0.0,) * 8}, ("armature", "contact_time_constant_s")),  # its feet bounce
+        ({"default_base_height": 0.2}, "sunk", ("0.073", "default_base_height 0.29")),
+        ({"default_base_height": 0.45}, "falls", ("0.177 m", "default_base_height 0.29")),  # 0.45 - 0.2726 m
+        ({"default_joint_pos": (0.0, -2.6) * 4}, "feet are not lowest", ("default pose",)),
+        ({"nconmax": 3}, "contacts", ("nconmax",)),
+        ({"foot_geoms": ("FL_foot",)}, "weight without a role", ("FR_foot, HL_foot, HR_foot",)),
+        ({"armature": (0.0,) * 8}, "bounces", ("armature", "contact_time_constant_s")),
     ],
 )
-def test_what_has_to_be_mended_is_named(tmp_path, device, change, parts):
+def test_what_has_to_be_mended_is_named(tmp_path, device, change, mistake, parts):
     robot = dataclasses.replace(get_robot(str(write_dog(tmp_path, **KINDS["urdf"]))), **change)
-    text, fine = describe_standing(robot, stand(robot, device=device, seconds=1.5, drops=2))
+    standing = stand(robot, device=device, seconds=1.5, drops=2)
+    assert mistake in standing_mistakes(robot, standing)
+    text = describe_standing(robot, standing)
     mended = "\n".join(line for line in text.splitlines() if line.startswith("To mend"))
-    assert not fine and all(part in mended for part in parts) and "biped" not in text
+    assert all(part in mended for part in parts) and "biped" not in text
+    dead = dataclasses.replace(standing, finite=False)
+    assert "not finite" in standing_mistakes(robot, dead) and "physics_dt" in describe_standing(robot, dead)
 
 
 def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     standing = stand(cassie, device=device, drops=1)
-    assert not standing.stands and "pelvis" in standing.carried and describe_standing(cassie, standing)[1]
+    assert not standing.stands and "pelvis" in standing.carried and not [*standing_mistakes(cassie, standing)]
+    assert "biped" in describe_standing(cassie, standing)
 
 
 def test_motors_and_delay_are_listed(tmp_path):
