@@ -10,7 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.conditions import Condition, Disturbed, begin_conditions, disturb
+from kernels.conditions import Disturbed, DisturbedStep, begin_conditions, disturb
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, limit_torques, tell_solver
 from kernels.episode import Episodes
@@ -28,7 +28,9 @@ from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
 from sim.solver import TheirDynamics, dynamics_of
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions import MOST_DELAY_S, MOST_LAG_S
+from sim.terrains.conditions.base import begin_effects, disturb_effects
+from sim.terrains.conditions.delay import MAX_DELAY_S
+from sim.terrains.conditions.lag import MAX_LAG_S
 
 
 class Simulation:
@@ -198,7 +200,7 @@ class Simulation:
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
         most = robot.drive_delay_steps
         if self.bank.conditions is not None:
-            most += math.ceil(MOST_DELAY_S / robot.physics_dt)
+            most += math.ceil(MAX_DELAY_S / robot.physics_dt)
         if most:
             actuators = len(self._coordinates.target_of_actuator)
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
@@ -216,11 +218,14 @@ class Simulation:
                 f"robot '{self.robot.name}' cannot have conditions, since its model takes mujoco_warp's own step "
                 "(sim/solver.py says why): leave conditions out"
             )
+        assert self.bank.ground is not None
         self._varied = self._dynamics.vary_bases()
-        most, size = math.ceil(MOST_LAG_S / self.robot.control_dt), self.robot.observation_size
+        self._varied.delay_steps, self._varied.friction = self._delay.steps, self.bank.ground.factor
+        self._varied.drive_delay, self._varied.physics_dt = self.robot.drive_delay_steps, self.robot.physics_dt
+        max_lag, size = math.ceil(MAX_LAG_S / self.robot.control_dt), self.robot.observation_size
         disturbed = make_zeros(
-            Disturbed, str(self.device), row=(self.num_envs, len(Condition)), age=(self.num_envs, size),
-            former=(self.num_envs, 1 + most, size),
+            Disturbed, str(self.device), row=(self.num_envs, self.bank.conditions.shape[1]),
+            age=(self.num_envs, size), former=(self.num_envs, 1 + max_lag, size),
         )  # fmt: skip
         for name, width in asdict(NoiseCfg()).items():
             setattr(disturbed.noise, name, width)
@@ -246,11 +251,9 @@ class Simulation:
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""
         if self.disturbed is not None:
-            tree, robots, nominal = self._varied
             begin_conditions(
-                begins, self.terrain_of_env, self.bank.conditions, nominal, self.robot.drive_delay_steps,
-                self.robot.physics_dt, tree, robots, self._delay, self.disturbed,
-            )  # fmt: skip
+                begin_effects(), begins, self.terrain_of_env, self.bank.conditions, self._varied, self.disturbed
+            )
 
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
         """Push robots and disturb observations, (num_envs, observation_size), as the conditions of their terrains say.
@@ -258,8 +261,11 @@ class Simulation:
         The episodes count steps of ``dt`` [s].
         """
         if self.disturbed is not None:
-            every, joints = round(self.robot.control_dt / dt), self.robot.num_joints
-            disturb(episodes, joints, dt, every, self.disturbed, self.joint_qd, observation)
+            step = DisturbedStep()
+            step.memory, step.episodes, step.num_joints = self.disturbed, episodes, self.robot.num_joints
+            step.dt, step.every = dt, round(self.robot.control_dt / dt)
+            step.joint_qd, step.observation = self.joint_qd, observation
+            disturb(disturb_effects(), step)
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""

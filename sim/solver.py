@@ -12,7 +12,7 @@ from mujoco_warp._src import types
 from numpy.typing import NDArray
 
 from kernels import dynamics, lanes, solver
-from kernels.conditions import BASE, Nominal
+from kernels.conditions import BASE, VariedRobots
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, ask_forces, tell_contacts
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
@@ -164,19 +164,18 @@ class Dynamics:
         problem.contacts, problem.surfaces = contacts, surfaces
         problem.qacc_warmstart, problem.iterations, problem.overflow = d.qacc_warmstart, d.solver_niter, d.overflow
 
-    def vary_bases(self) -> tuple[Tree, Robots, Nominal]:
+    def vary_bases(self) -> VariedRobots:
         """Gives each world a base and motors of its own, for :func:`kernels.conditions.begin_conditions`."""
-        tree, robots, nominal = self._tree, self._robots, Nominal()
+        tree, robots, varied = self._tree, self._robots, VariedRobots()
         with wp.ScopedDevice(robots.qpos.device):
-            for name in ("body_mass", "subtree_mass", "body_ipos", "body_iquat", "body_inertia"):
+            for name in _BASE_BY_MODEL:
                 array = getattr(tree, name)
                 rows = np.broadcast_to(array.numpy(), (self._num_worlds, *array.numpy().shape[1:]))
                 setattr(tree, name, wp.array(rows, dtype=array.dtype))
-            for name, of_tree in _OF_NOMINAL.items():
-                array = getattr(tree, of_tree)
-                setattr(nominal, name, wp.array(array.numpy()[:, BASE], dtype=array.dtype))
-            robots.strength = wp.ones(self._num_worlds, dtype=float)
-        return tree, robots, nominal
+                setattr(varied, name, getattr(tree, name))
+                setattr(varied, _BASE_BY_MODEL[name], wp.array(rows[:, BASE], dtype=array.dtype))
+            robots.strength = varied.strength = wp.ones(self._num_worlds, dtype=float)
+        return varied
 
     def find(self) -> None:
         """Poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
@@ -207,9 +206,9 @@ _OF_PROBLEM = {
     "is_ancestor": "body_isdofancestor", "inertia_row": "M_hinit_i", "inertia_col": "M_colind",
 }  # fmt: skip
 """Arrays of mujoco_warp's model by their names in :class:`Tree` and :class:`Problem`."""
-_OF_NOMINAL = {
-    "mass": "body_mass", "total_mass": "subtree_mass", "centre": "body_ipos", "frame": "body_iquat",
-    "inertia": "body_inertia",
+_BASE_BY_MODEL = {
+    "body_mass": "base_mass", "subtree_mass": "total_mass", "body_ipos": "base_centre", "body_iquat": "base_frame",
+    "body_inertia": "base_inertia",
 }  # fmt: skip
 _NOT_OVER_WORLDS = ("body_isdofancestor", "actuator_forcerange")
 """Of arrays with several dimensions: what a drive writes anew in each step may come to differ."""

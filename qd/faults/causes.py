@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kernels.ground import FIRM
 from sim.crossing import CrossingCfg
 from sim.terrains.bank import heights_of, terrains_of
-from sim.terrains.conditions import words_of
+from sim.terrains.conditions.base import CONDITIONS, condition_texts
 from sim.terrains.ground import PATCHES, patches_at
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace, WiderSpace
@@ -29,11 +29,6 @@ NARROW = 0.5
 HALF_WIDTH = 0.35
 """Half the width of a stance, where the robot is not known [m]; the shipped robots have 0.4 m and 0.3 m."""
 SLIPPERY, SOFT = "slippery ground", "soft ground"
-CONDITIONS = {
-    "payload": "payload", "motors": "weak motors", "delay": "late actions", "lag": "old observations",
-    "noise": "noise", "push": "push", "grip": "little grip",
-}  # fmt: skip
-"""Causes that are kinds of conditions (:data:`sim.terrains.conditions.KINDS`)."""
 UNCLEAR = "unclear"
 """The cause where no part of the terrain lies where robots end."""
 
@@ -101,7 +96,7 @@ class Effects:
 
     def shape(self, part: int, half_width: float) -> Shape:
         """The shape of a part; of a condition, or one that changes the ground and no height on the way, its kind."""
-        condition = CONDITIONS.get(self.conditions[part])
+        condition = CONDITIONS[self.conditions[part]].cause if self.conditions[part] else None
         on_ground = self.patches[part].any() and on_the_way(self.heights[part], half_width) < LEAST_HEIGHT
         if condition is None and not on_ground:
             return shape_of(self.heights[part], half_width)
@@ -111,7 +106,7 @@ class Effects:
 
 def commonest_words(cause: str) -> str:
     """That most terrains stop the robot by a cause: ``ridges are the commonest cause``."""
-    if cause in (SLIPPERY, SOFT, *CONDITIONS.values()):
+    if cause in (SLIPPERY, SOFT, *(condition.cause for condition in CONDITIONS.values())):
         return f"{cause} is the commonest cause"
     return f"{cause}{'es' if cause.endswith('ch') else 's'} are the commonest cause"
 
@@ -132,9 +127,10 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainS
 def _conditions_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> tuple[str, ...]:
     """The kind of condition that each part of a terrain sets, if it does."""
     first = len(space.parts(genes)) - len(space.conditions)
-    (row,) = space.conditions_of(genes[None])
-    kinds = [space.conditions[part - first] if part >= first else "" for part in parts]
-    return tuple(kind if kind and words_of(kind, row) else "" for kind in kinds)
+    (row,) = space.condition_rows(genes[None])
+    texts = condition_texts(row, space.conditions)
+    names = [name if text else "" for name, text in zip(space.conditions, texts, strict=True)]
+    return tuple(names[part - first] if part >= first else "" for part in parts)
 
 
 def causes_at(

@@ -60,7 +60,7 @@ class FaultCounts:
     """By them with contact resolved, shape (N, C, 4)."""
     varied_outcomes: NDArray[np.int64] | None = None
     """By the controller that was searched under varied conditions
-    (:data:`sim.terrains.spaces.under_conditions.VARIED`), shape (N, 4); None where nobody has crossed so."""
+    (:func:`sim.terrains.spaces.under_conditions.varied_genes`), shape (N, 4); None where nobody has crossed so."""
     certifier_varied_outcomes: NDArray[np.int64] | None = None
     """By the others under the same ones, shape (N, C, 4); None likewise."""
 

@@ -14,12 +14,12 @@ import warp as wp
 from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.conditions import Condition
 from kernels.episode import Outcome, make_episodes
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions.base import condition_column
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
 SEGMENT_STEPS = 10  # control steps: over 0.2 s a replayed robot still moves as the recorded one did
@@ -155,7 +155,8 @@ def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
     bank.set_heights(sim.bank.heights.numpy())
     rows = bank.conditions.numpy()
-    rows[:, Condition.NOISE], rows[:, Condition.LAG] = 1.0, robot.control_dt
+    rows[:, condition_column("noise")] = 1.0
+    rows[:, condition_column("lag")] = robot.control_dt
     bank.conditions.assign(rows)
     with wp.ScopedDevice(sim.device):
         varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)

@@ -34,7 +34,7 @@ from sim.files.provenance import provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions import KINDS
+from sim.terrains.conditions.base import CONDITIONS
 
 SEEDS = (0, 1, 2)
 """Seeds of everything that is done several times."""
@@ -126,7 +126,7 @@ class Script:
         if not content and not self.small:
             raise ValueError(f"{file} must be of today's sources: run results.make.dose first")
         rows = [row for row in content.get("dose", ()) if row["controller"] == "base"]
-        return [row for row in rows if (row["parameter"] in KINDS) == conditions]
+        return [row for row in rows if (row["parameter"] in CONDITIONS) == conditions]
 
     def run_of_archive(self, name: str = "archive") -> Path:
         """The run of a published archive to work in; a copy of what is published where the run itself is gone."""

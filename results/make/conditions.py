@@ -21,14 +21,15 @@ from qd.search.loop import search
 from qd.workers.cross import Crossings
 from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
-from sim.terrains.conditions import KINDS
-from sim.terrains.doses import CONDITIONS_SPACE as SPACE
-from sim.terrains.spaces.registry import get_space
+from sim.terrains.conditions.base import CONDITIONS
+from sim.terrains.ground import joined_name
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 
 EPISODES_SEARCHED = 400_000
 _STREAM = 2000
 _EXAMPLES = 2
 """Of each kind of condition."""
+SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
 _PUBLISHED = ("archive.npz", "archive.json", "config.json", "minimal.npz", "minimal.json")
 
 
@@ -45,7 +46,7 @@ def search_under_conditions(script: Script) -> tuple[Archive, dict[str, Any]]:
 def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
     """Which failing elites are crossed under nominal conditions, and which of these without one kind of condition."""
     space, rows = get_space(SPACE), np.flatnonzero(archive.failing)
-    first = len(space.parts(archive.genes[0])) - len(KINDS) if len(archive) else 0
+    first = len(space.parts(archive.genes[0])) - len(space.conditions) if len(archive) else 0
     seeds = elite_seeds(archive, script.seed, stream=_STREAM)
     run = script.runs / "conditions"
     with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
@@ -59,9 +60,9 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             return goal_rates(outcome_counts(result))
 
         again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]
-        cured = again[rates(again, range(len(KINDS)), "nominal conditions") >= FAILING_GOAL_RATE]
+        cured = again[rates(again, range(len(space.conditions)), "nominal conditions") >= FAILING_GOAL_RATE]
         needed = {kind: rates(cured, [number], f"without {kind}") >= FAILING_GOAL_RATE
-                  for number, kind in enumerate(KINDS)}  # fmt: skip
+                  for number, kind in enumerate(space.conditions)}  # fmt: skip
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
     examples = examples_of(archive, cured, needed)
     minima = None
@@ -80,7 +81,7 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
                 "elite": number,
                 "needs": kind,
                 "fault": bool(archive.is_fault[number]),
-                "conditions": space.condition_words(archive.genes[number]),
+                "conditions": space.condition_text(archive.genes[number]),
                 "minimal": minima.words(number) if minima else None,
             }
             for number, kind in examples.items()

@@ -16,7 +16,6 @@ from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
 from sim.files.intervals import format_value
-from sim.terrains.conditions import KINDS
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}
@@ -220,9 +219,14 @@ def conditions() -> str:
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
-    columns |= {f"... with nominal {kind}": kind for kind in KINDS}
+    columns |= {f"... with nominal {kind}": kind for kind in condition_names()}
     columns["... with none of these alone"] = "needs_no_single_one"
     return table(rows, columns, upright=True)
+
+
+def condition_names() -> tuple[str, ...]:
+    """The conditions of the published searches."""
+    return tuple(read("results/anymal/conditions.json")["conditions"]["needed"])
 
 
 def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
@@ -230,7 +234,7 @@ def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
     needs = read(f"results/{robot}/conditions.json").get("conditions", {})
     numbers = {one["elite"] for one in needs.get("examples", ()) if one["needs"] == kind}
     minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
-    part = BUMPS + [*KINDS].index(kind)
+    part = BUMPS + condition_names().index(kind)
     kept = [one for one in minima if one["elite"] in numbers and part in one["bumps"]]
     return min(kept, key=lambda one: len(one["bumps"]), default=None)
 
@@ -238,7 +242,7 @@ def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
 def condition_examples() -> str:
     """The smallest failing terrains that keep the condition that their elites need; of each kind the least."""
     lines = ["| needs | what is left | under | reach the goal | verdict |", "|---" * 5 + "|"]
-    for (robot, words), kind in product(ROBOTS.items(), KINDS):
+    for (robot, words), kind in product(ROBOTS.items(), condition_names()):
         if (least := least_minimum(robot, kind)) is not None:
             bumps = sum(part < BUMPS for part in least["bumps"])
             ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"

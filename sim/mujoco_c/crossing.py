@@ -20,7 +20,6 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.conditions import Condition
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES
@@ -37,19 +36,16 @@ from sim.mujoco_c.model import (
     Starts,
     crossing_model,
     goal_commands,
-    noise_widths,
     observations,
-    rounded_steps,
     step_penalties,
     to_mujoco,
-    vary_model,
 )
 from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, terrains_of
-from sim.terrains.conditions import NOMINAL
+from sim.terrains.conditions.base import nominal_row, split_row
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.base import TerrainSpace
 
@@ -94,8 +90,15 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
 class Episodes:
     """States of the episodes of one terrain, stepped one by one."""
 
-    def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: NDArray[np.floating] = NOMINAL) -> None:
-        """From ``starts`` on, under ``conditions`` (12,); payload, strength and friction are the model's."""
+    def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: Array | None = None) -> None:
+        """From ``starts`` on, under a row of ``conditions`` by which the model is changed; nominal ones if None."""
+        self.robot, self.model = robot, model
+        self.strength, self.delay_steps = 1.0, robot.drive_delay_steps
+        self.former_rows = deque[Array]()
+        self.rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))
+        self._conditions = list(split_row(nominal_row() if conditions is None else conditions))
+        for condition, values in self._conditions:
+            condition.begin_plain(self, values)
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
         self.data = [mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
@@ -103,13 +106,11 @@ class Episodes:
         self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
         self.warned = np.zeros(len(self.data), bool)
-        self._strength = float(conditions[Condition.STRENGTH])
-        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1] / self._strength
+        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1] / self.strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
-        steps = robot.drive_delay_steps + rounded_steps(conditions[Condition.DELAY], robot.physics_dt)
-        self._delayed = deque([self._targets.copy()] * steps)
+        self._delayed = deque([self._targets.copy()] * self.delay_steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
         """One physics step of the numbered episodes."""
@@ -122,17 +123,17 @@ class Episodes:
                 (stall, limit), effort = self._motors, self._effort
                 lost = stall * data.qvel[6 + self._joints] / limit
                 limits = np.clip([-stall - lost, stall - lost], -effort, effort).T
-                self._model.actuator_forcerange[:] = self._strength * limits
+                self._model.actuator_forcerange[:] = self.strength * limits
             mj.mj_step(self._model, data)
             self.qpos[k], self.qvel[k] = data.qpos, data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
 
-    def push(self, running: NDArray[np.intp], velocity: Array) -> None:
-        """Adds to the velocities [m/s, world frame] of the bases of the numbered episodes."""
-        for k in running:
-            self.data[k].qvel[:2] += velocity
-            self.qvel[k] = self.data[k].qvel
+    def disturb(self, rows: Array, running: NDArray[np.intp], step: int) -> Array:
+        """Observations (num_episodes, observation_size) as the conditions show them; pushes the running episodes."""
+        for condition, values in sorted(self._conditions, key=lambda pair: pair[0].disturbs_last):
+            rows = condition.disturb_plain(self, values, rows, running, step)
+        return rows
 
     def hold(self, running: NDArray[np.intp], targets: Array) -> None:
         """Sets the joint targets [rad] of the numbered episodes; they count after the delay of the robot's drives."""
@@ -171,15 +172,8 @@ def cross(
     ground with its conditions; the contact time constant is that of the robot's file if None. Noise is drawn otherwise
     than in the parallel simulation.
     """
-    conditions = NOMINAL if ground is None else ground.rows[0]
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
-    vary_model(model, conditions)
-    episodes = Episodes(robot, model, starts, conditions)
-    lag = rounded_steps(conditions[Condition.LAG], robot.control_dt)
-    former: deque[Array] = deque(maxlen=1 + lag)
-    width = float(conditions[Condition.NOISE]) * noise_widths(robot)
-    rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))  # of the episodes' own
-    push_at = rounded_steps(conditions[Condition.PUSH_TIME], robot.physics_dt)
+    episodes = Episodes(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
     count, base = len(starts.qpos), np.array([name in robot.base_geoms for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
@@ -200,8 +194,7 @@ def cross(
             rows[running] = observations(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )
-            former.append(rows + width * rng.uniform(-1.0, 1.0, rows.shape))
-            rows = former[0].copy()
+            rows = episodes.disturb(rows, running, step)
             asked = rows if remembers else rows[running]
             action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
             action = action[running] if remembers else action
@@ -209,8 +202,6 @@ def cross(
             action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
             last_action[running] = action
             episodes.hold(running, default + robot.action_scale * action)
-            if step <= push_at < step + robot.decimation:
-                episodes.push(running, conditions[[Condition.PUSH_X, Condition.PUSH_Y]].astype(np.float64))
         episodes.step(running)
         judged = _judge(robot, episodes, running, base)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT

@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.conditions import Condition
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, rotation_matrix
 from sim.robots.robot import RobotCfg
-from sim.robots.training import NoiseCfg
 from sim.terrains.ground import PATCHES, GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.maps.hfield import QUARTER_TURN, Margins, as_hfield
@@ -207,51 +205,6 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
     model.geom_solimp[geoms[soft]] = impedance, impedance, 0.001, 1.0, 0.5
     model.geom_priority[geoms] = 1
-
-
-def vary_model(model: Any, conditions: NDArray[np.floating]) -> None:
-    """Gives the robot of a model a payload, other motors and other friction, by a row of conditions (12,)."""
-    row, base = np.asarray(conditions, np.float64), 1
-    strength = row[Condition.STRENGTH]
-    model.actuator_gainprm[:, 0] *= strength
-    model.actuator_biasprm[:, :3] *= strength
-    model.actuator_forcerange[:] *= strength
-    model.jnt_actfrcrange[:] *= strength
-    model.geom_friction[:, 0] *= row[Condition.FRICTION]
-    added = max(row[Condition.PAYLOAD] * model.body_subtreemass[base], -0.5 * model.body_mass[base])
-    if added:
-        model.body_sameframe[base] = 0  # or MuJoCo takes the frame of the body for that of its inertia
-        model.body_subtreemass[[0, base]] += added
-    if added < 0.0:
-        model.body_inertia[base] *= (model.body_mass[base] + added) / model.body_mass[base]
-        model.body_mass[base] += added
-    elif added > 0.0:
-        mass, offset = model.body_mass[base], row[[Condition.PAYLOAD_X, Condition.PAYLOAD_Y, Condition.PAYLOAD_Z]]
-        moved = added / (mass + added) * offset
-        axes = rotation_matrix(model.body_iquat[base])
-        inertia = axes @ np.diag(model.body_inertia[base]) @ axes.T
-        for kilograms, d in ((mass, moved), (added, offset - moved)):
-            inertia += kilograms * (d @ d * np.eye(3) - np.outer(d, d))
-        moments, axes = np.linalg.eigh(inertia)
-        axes[:, 2] *= np.linalg.det(axes)  # right-handed
-        mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
-        model.body_inertia[base], model.body_mass[base] = moments, mass + added
-        model.body_ipos[base] += moved
-
-
-def rounded_steps(seconds: float, dt: float) -> int:
-    """Steps of a time, rounded as the parallel simulation does."""
-    return int(np.float32(seconds) / np.float32(dt) + np.float32(0.5))
-
-
-def noise_widths(robot: RobotCfg) -> Array:
-    """Half widths of the noise of each column of an observation, shape (observation_size,)."""
-    noise, joints = NoiseCfg(), robot.num_joints
-    groups = [
-        (3, 2.0 * noise.lin_vel), (3, 0.25 * noise.ang_vel), (3, noise.gravity), (3, 0.0), (joints, noise.joint_pos),
-        (joints, 0.05 * noise.joint_vel), (joints, 0.0), (len(robot.scan_points()[0]), 5.0 * noise.scan),
-    ]  # fmt: skip
-    return np.concatenate([np.full(count, width) for count, width in groups])
 
 
 def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:

@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.conditions import Condition
 from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from sim.device import host_device
-from sim.terrains.conditions import NOMINAL
+from sim.terrains.conditions.base import nominal_row
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
@@ -27,8 +26,8 @@ class TerrainBank:
         heights: Node heights [m], shape (num_terrains, NUM_ROWS, NUM_COLS).
         terrain: The same with their ceilings, as contacts take them.
         ground: Friction and softness; None where no terrain has any.
-        conditions: Under which each is crossed, shape (num_terrains, 12) (:class:`kernels.conditions.Condition`); None
-            where all are nominal.
+        conditions: Under which each is crossed, (:mod:`sim.terrains.conditions`), shape (num_terrains, number of
+            values); None where all are nominal.
     """
 
     def __init__(
@@ -47,7 +46,7 @@ class TerrainBank:
         self.terrain.spacing = SPACING
         with_ground |= with_conditions
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
-        nominal = np.tile(NOMINAL, (num_terrains, 1))
+        nominal = np.tile(nominal_row(), (num_terrains, 1))
         self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None
         self.device, self.num_terrains = device, num_terrains
 
@@ -80,11 +79,9 @@ class TerrainBank:
             raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
 
     def _set_conditions(self, rows: np.ndarray, slots: slice) -> None:
-        """Replace the conditions of some slots, (number of slots, 12), if the bank has any."""
+        """Replace the conditions of some slots, (number of slots, number of values), if the bank has any."""
         if self.conditions is not None:
-            assert self.ground is not None
             self.conditions[slots].assign(np.float32(rows))
-            self.ground.factor[slots].assign(np.float32(rows[:, Condition.FRICTION]))
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
         """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
@@ -101,7 +98,7 @@ class TerrainBank:
             maps.friction.fill_(1.0)
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
-        self._set_conditions(space.conditions_of(valid), slots)
+        self._set_conditions(space.condition_rows(valid), slots)
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""

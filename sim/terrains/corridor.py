@@ -4,9 +4,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.conditions import Condition
 from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
-from sim.terrains.conditions import genes_of
+from sim.terrains.conditions.base import condition_genes
 from sim.terrains.ground import patches_at
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
@@ -19,7 +18,6 @@ NODE_SPACING = 0.1
 """Distance of neighbouring nodes of the corridor [m]."""
 SHAPE = tuple(round((high - low) / NODE_SPACING) + 1 for low, high in (Y, X))
 """Nodes along y and x."""
-_OF_A_SIDE = (Condition.PAYLOAD_Y, Condition.PUSH_Y)
 _AT_ONCE = 2048  # terrains, whole grids of which take 420 MB
 
 
@@ -46,7 +44,7 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
 
 def num_maps(space: TerrainSpace) -> int:
     """Maps of :func:`corridor_maps`."""
-    return len(space.ground) + len(genes_of(space.conditions))
+    return len(space.ground) + len(condition_genes(space.conditions))
 
 
 def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
@@ -57,8 +55,8 @@ def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     everywhere, but where it is of a side: it then grows from minus itself on the right to itself on the left, so that
     mirrored maps are those of mirrored conditions.
     """
-    kinds, across = genes_of(space.conditions), torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
-    profiles = [across if gene.condition in _OF_A_SIDE else torch.ones_like(across) for gene in kinds]
+    kinds, across = condition_genes(space.conditions), torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
+    profiles = [across if gene.mirrored else torch.ones_like(across) for gene in kinds]
     conditions = genes[:, space.num_genes - len(kinds) :, None, None].expand(-1, -1, *SHAPE)
     if kinds:
         conditions = conditions * torch.stack(profiles)[:, :, None]

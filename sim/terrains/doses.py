@@ -12,11 +12,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels import course
-from kernels.conditions import Condition
 from kernels.course import SPACING, Element, Kind
 from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S
 from sim.device import host_device
-from sim.terrains.conditions import KINDS, genes_of
+from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes
 from sim.terrains.ground import GROUND_KINDS, joined_name
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.on_ground import gene_of
@@ -27,14 +26,9 @@ FIRST_COL, NUM_PLACES = 100, 20
 """An obstacle begins at one of so many neighbouring nodes, from x = 5 m on: over 1 m, more than a stride."""
 LEVEL_SPACE = joined_name(SUPER_GAUSSIAN.name, GROUND_KINDS)
 """Space of level ground whose friction or softness is the dose."""
-CONDITIONS_SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(KINDS))
+CONDITIONS_SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
 """Space of level ground that is crossed under a condition, which is the dose."""
-_CONDITIONS = {
-    "payload": Condition.PAYLOAD, "motors": Condition.STRENGTH, "delay": Condition.DELAY, "lag": Condition.LAG,
-    "noise": Condition.NOISE, "push": Condition.PUSH_Y,
-}  # fmt: skip
-"""Conditions that are doses; a push is to the left, after 5 s."""
-_PUSH_TIME_S = 5.0
+_CONDITIONS = {name: condition.dose for name, condition in CONDITIONS.items() if condition.dose is not None}
 
 
 class Quantity(NamedTuple):
@@ -85,11 +79,9 @@ QUANTITIES: dict[Kind, dict[str, Quantity]] = {
     Kind.RUBBLE: _HEIGHT | _LENGTH | {"side": Quantity("detail", 0.05, 1.0, cells=1)},
 }
 """Parameters of the kinds of obstacles, and how far terrains can follow them."""
-_OF_CONDITION = {gene.condition: gene for gene in genes_of(tuple(KINDS))}
-_UNITS = {"delay": "s", "lag": "s", "push": "m/s"}
 _GROUND = {
-    name: Quantity("", max(0.0, gene.least), gene.most, _UNITS.get(name, ""), of_gene=gene.step)
-    for name, gene in ((name, _OF_CONDITION[condition]) for name, condition in _CONDITIONS.items())
+    name: Quantity("", max(0.0, gene.low), gene.high, gene.unit, of_gene=gene.step)
+    for name, gene in ((name, CONDITIONS[name].genes[dose.gene]) for name, dose in _CONDITIONS.items())
 } | {
     "friction": Quantity("", LEAST_FRICTION, 1.0, ""),
     "softness": Quantity("", 1.1 * LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, "s"),
@@ -192,10 +184,10 @@ class Dose:
         zeros = np.zeros((len(self.values), space.num_genes), np.float32)
         genes = space.without(zeros, range(len(space.parts(zeros[0]))))
         if self.parameter in _CONDITIONS:
-            values = {_CONDITIONS[self.parameter]: np.array(self.values), Condition.PUSH_TIME: np.array(_PUSH_TIME_S)}
-            for column, gene in enumerate(genes_of(tuple(KINDS)), SUPER_GAUSSIAN.num_genes):
-                if gene.condition in values:
-                    genes[:, column] = gene.gene(values[gene.condition])
+            dose, own = _CONDITIONS[self.parameter], CONDITIONS[self.parameter].genes
+            first = space.num_genes - len(condition_genes()) + condition_column(own[0].name)
+            for number, value in ((dose.gene, self.values), *dose.others):
+                genes[:, first + number] = own[number].to_gene(value)
             return genes
         maps = genes[:, SUPER_GAUSSIAN.num_genes :].reshape(len(genes), len(GROUND_KINDS), -1)
         maps[:, GROUND_KINDS.index(self.parameter)] = gene_of(self.parameter, np.array(self.values))[:, None]
@@ -227,13 +219,7 @@ DOSES: dict[str, Dose] = {
     "rubble": Dose("rubble", Kind.RUBBLE, "height", _LOW, others={"side": 0.20, "length": 2.00}),
     "friction": Dose("level ground", None, "friction", _FRICTIONS),
     "softness": Dose("level ground", None, "softness", (0.015, 0.02, 0.03, 0.04, 0.05, 0.06)),
-    "payload": Dose("payload over the mass", None, "payload", (0.0, 0.1, 0.2, 0.3, 0.4)),
-    "motors": Dose("strength of motors", None, "motors", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)),
-    "delay": Dose("delay of actions", None, "delay", (0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06)),
-    "lag": Dose("age of observations", None, "lag", (0.0, 0.02, 0.04, 0.06)),
-    "noise": Dose("noise over legged_gym's", None, "noise", (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)),
-    "push": Dose("push to the side", None, "push", (0.0, 0.5, 1.0, 1.5, 2.0)),
-}
+} | {name: Dose(dose.title, None, name, dose.values) for name, dose in _CONDITIONS.items()}
 """Every dose by its name."""
 
 

@@ -3,7 +3,6 @@
 The conditions of a crossing go with them.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,13 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
-from sim.terrains.conditions import KINDS as CONDITION_KINDS
-from sim.terrains.conditions import NOMINAL, check_conditions
+from sim.terrains.conditions.base import CONDITIONS, check_conditions, nominal_row
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
-_KINDS = (*GROUND_KINDS, *CONDITION_KINDS)
-_SUFFIX = re.compile(rf"((?:\+(?:{'|'.join(_KINDS)}))+)$")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,7 +28,7 @@ class GroundMaps:
     time_constant_s: NDArray[np.float32]
     """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
     conditions: NDArray[np.float32] | None = None
-    """Under which each is crossed (:class:`kernels.conditions.Condition`), shape (T, 12); nominal ones if None."""
+    """Conditions (:mod:`sim.terrains.conditions`), shape (T, number of values); nominal ones if None."""
 
     def __post_init__(self) -> None:
         check_map("friction", self.friction)
@@ -47,8 +43,8 @@ class GroundMaps:
 
     @property
     def rows(self) -> NDArray[np.float32]:
-        """Conditions of all, shape (T, 12)."""
-        return np.tile(NOMINAL, (len(self), 1)) if self.conditions is None else self.conditions
+        """Conditions of all, shape (T, number of values)."""
+        return np.tile(nominal_row(), (len(self), 1)) if self.conditions is None else self.conditions
 
     def __len__(self) -> int:
         return len(self.friction)
@@ -99,10 +95,11 @@ def check_map(kind: str, values: NDArray[np.floating]) -> None:
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
-    suffix = _SUFFIX.search(name)
-    if suffix is None or suffix.start() == 0:
-        return name, ()
-    return name[: suffix.start()], tuple(kind for kind in _KINDS if f"+{kind}" in suffix[1])
+    kinds, base, named = (*GROUND_KINDS, *CONDITIONS), name, set[str]()
+    while (head := base.rpartition("+"))[0] and head[2] in kinds:
+        base = head[0]
+        named.add(head[2])
+    return base, tuple(kind for kind in kinds if kind in named)
 
 
 def joined_name(name: str, kinds: Sequence[str]) -> str:

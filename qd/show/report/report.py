@@ -157,7 +157,7 @@ def _case(
         "verdict": VERDICTS[int(ranking.elites.verdict[row])],
         "source": sources[0],
         "time_s": failure.time_s,
-        "conditions": opened_run.space.condition_words(archive.genes[number]),
+        "conditions": opened_run.space.condition_text(archive.genes[number]),
         "beside": beside,
         "figure": figure_source(draw_crossing(recording, title)) if whole else "",
         "rates": _rates(ranking, archive, row, arrived),

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
-from sim.terrains.conditions import NOMINAL
+from sim.terrains.conditions.base import nominal_row
 from sim.terrains.ground import joined_name
 from sim.terrains.hand_crafted import Seed
 
@@ -35,7 +35,7 @@ class TerrainSpace:
     ground: tuple[str, ...] = ()
     """What its terrains have maps of beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
     conditions: tuple[str, ...] = ()
-    """Conditions that it has genes of, some of :data:`sim.terrains.conditions.KINDS`."""
+    """Conditions that it has genes of, some of :data:`sim.terrains.conditions.base.CONDITIONS`."""
     height_share: float = 1.0
     """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
 
@@ -49,12 +49,12 @@ class TerrainSpace:
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into the maps that :attr:`ground` names, on the device; others stay as they are."""
 
-    def conditions_of(self, genes: ArrayLike) -> NDArray[np.float32]:
-        """Rows of conditions (:class:`kernels.conditions.Condition`), shape (num_terrains, 12)."""
-        return np.tile(NOMINAL, (len(np.asarray(genes)), 1))
+    def condition_rows(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Rows of conditions (:mod:`sim.terrains.conditions`), shape (num_terrains, number of values)."""
+        return np.tile(nominal_row(), (len(np.asarray(genes)), 1))
 
-    def condition_words(self, genes: ArrayLike) -> str:
-        """The conditions of one row of genes (num_genes,) in words; empty of a space without any."""
+    def condition_text(self, genes: ArrayLike) -> str:
+        """The conditions of one row of genes (num_genes,) as text; empty of a space without any."""
         return ""
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:

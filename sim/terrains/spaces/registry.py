@@ -7,7 +7,7 @@ from dataclasses import replace
 from sim.controllers.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions import KINDS
+from sim.terrains.conditions.base import CONDITIONS
 from sim.terrains.ground import GROUND_KINDS, joined_name, split_name
 from sim.terrains.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace, WiderSpace
 from sim.terrains.spaces.course import COURSE
@@ -98,7 +98,7 @@ def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
     if not is_own(name):
         raise ValueError(
             f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
-            f"some of {', '.join(f'+{kind}' for kind in (*GROUND_KINDS, *KINDS))}"
+            f"some of {', '.join(f'+{kind}' for kind in (*GROUND_KINDS, *CONDITIONS))}"
         )
     for space in _loaded:
         if space.name == name if sha256 is None else space.sha256 == sha256:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.conditions import Condition
 from qd.faults import judge as judging
 from qd.faults.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
 from qd.search.archive import read_archive, write_archive
@@ -18,6 +17,7 @@ from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
+from sim.terrains.conditions.base import condition_column
 from sim.terrains.spaces.registry import get_space
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
@@ -159,7 +159,7 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
 
     def rule(cfg, genes, seeds):
         crossed[cfg.policy] += [*genes]
-        weak = space.conditions_of(genes)[:, Condition.STRENGTH] < 0.92
+        weak = space.condition_rows(genes)[:, condition_column("strength")] < 0.92
         return (weak | (genes[:, :64] != fragile).any(axis=1)) & (cfg.policy == SHIPPED)
 
     space, robots = get_space("super_gaussian+payload+motors+delay+noise+grip"), Robots(rule)

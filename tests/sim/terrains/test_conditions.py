@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.conditions import Condition
 from sim.crossing import CrossingCfg
-from sim.mujoco_c.crossing import draw_starts
-from sim.mujoco_c.model import crossing_model, noise_widths, rounded_steps, vary_model
+from sim.mujoco_c.crossing import Episodes, draw_starts
+from sim.mujoco_c.model import Starts, crossing_model
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrains.bank import terrains_of
-from sim.terrains.conditions import KINDS, NOMINAL, genes_of
+from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, nominal_row, round_steps
+from sim.terrains.conditions.noise import noise_widths
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.registry import get_space, identity, load_space
@@ -23,16 +23,14 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.sim.dogs import write_dog
 from tests.sim.plain_mujoco import cross_and_keep
 
-ALL = "super_gaussian+" + "+".join(KINDS)
-SPACE = get_space(ALL)
+SPACE = get_space("+".join(("super_gaussian", *CONDITIONS)))
 EPISODES = 3
 FLAT_GENES = np.zeros(SUPER_GAUSSIAN.num_genes, np.float32)
 
 
 def genes(**values: float) -> np.ndarray:
     """A row of flat ground under some conditions by their names; the others are nominal."""
-    named = {Condition[name.upper()]: value for name, value in values.items()}
-    row = [gene.gene(named[gene.condition]) if gene.condition in named else gene.absent for gene in genes_of(KINDS)]
+    row = [gene.to_gene(values[gene.name]) if gene.name in values else gene.absent for gene in condition_genes()]
     return np.concatenate([FLAT_GENES, np.float32(row)])
 
 
@@ -63,9 +61,9 @@ def rollouts(anymal):
 @pytest.mark.parametrize("case", CASES)
 def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, rollouts, case):
     row, seconds = genes(**CASES[case]), 0.2 if case == "grip" else 0.3  # later each slips in its way
-    conditions = SPACE.conditions_of(row[None])[0]
+    conditions = SPACE.condition_rows(row[None])[0]
     for name, value in CASES[case].items():
-        assert conditions[Condition[name.upper()]] == pytest.approx(value, rel=1e-5)
+        assert conditions[condition_column(name)] == pytest.approx(value, rel=1e-5)
     rollout = rollouts(anymal, anymal.policy_file)
     rollout.clear()
     rollout.put(row[None], np.array([1000], np.uint32))
@@ -78,7 +76,7 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, roll
     starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
     plain, nominal = (
         cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=under(row))[0].qpos
-        for row in (conditions, NOMINAL)
+        for row in (conditions, nominal_row())
     )
     np.testing.assert_allclose(ours[:, :3], plain[:, :3], atol=1e-3)
     np.testing.assert_allclose(ours[:, 7:], plain[:, 7:], atol=0.02)
@@ -131,22 +129,22 @@ def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts
     sizes = {"num_terrains": 1, "num_replicas": EPISODES, "device": "cpu"}
     by_genes = Rollout(short, anymal.policy_file, **sizes, space=SPACE).evaluate(row[None], seeds)
     rollout = Rollout(short, anymal.policy_file, **sizes, with_conditions=True)
-    ground = under(SPACE.conditions_of(row[None])[0])
+    ground = under(SPACE.condition_rows(row[None])[0])
     np.testing.assert_array_equal(rollout.evaluate(heights, seeds, ground=ground).penalties, by_genes.penalties)
     assert (rollout.evaluate(heights, seeds).penalties != by_genes.penalties).any()
     again = terrains_of(row[None], SPACE)[1]
     np.testing.assert_array_equal(again.rows, ground.rows)
     assert (again.friction == 1.0).all()  # the factor is a condition, and no patch's
     joined = again.joined(GroundMaps.plain(2))
-    np.testing.assert_array_equal(joined.rows, [again.rows[0], NOMINAL, NOMINAL])
-    np.testing.assert_array_equal(joined[1:].rows, [NOMINAL, NOMINAL])
+    np.testing.assert_array_equal(joined.rows, [again.rows[0], nominal_row(), nominal_row()])
+    np.testing.assert_array_equal(joined[1:].rows, [nominal_row(), nominal_row()])
     plain = Rollout(short, anymal.policy_file, **sizes, with_ground=True)
     with pytest.raises(ValueError, match="terrains have conditions"):
         plain.evaluate(heights, seeds, ground=ground)
     for wrong in ({"delay": 0.5}, {"strength": 0.0}, {"noise": -1.0}):
-        with pytest.raises(ValueError, match=f"condition {next(iter(wrong)).upper()} must lie"):
-            changed = NOMINAL.copy()
-            changed[Condition[next(iter(wrong)).upper()]] = next(iter(wrong.values()))
+        (name, value), changed = next(iter(wrong.items())), nominal_row()
+        changed[condition_column(name)] = value
+        with pytest.raises(ValueError, match=name):
             under(changed)
 
 
@@ -191,10 +189,15 @@ def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, 
         assert (np.abs(weak) < np.abs(strong)).all()
 
 
+def vary(robot, model, row):
+    """Changes a model of MuJoCo C as a row of conditions does."""
+    Episodes(robot, model, Starts(qpos=np.zeros((0, 7)), qvel=np.zeros((0, 6))), row.astype(float))
+
+
 def test_a_payload_is_a_point_mass_on_the_base(anymal):
-    row = SPACE.conditions_of(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0]
+    row = SPACE.condition_rows(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0]
     plain, loaded = (crossing_model(anymal, np.zeros((161, 321), np.float32)) for _ in range(2))
-    vary_model(loaded, row)
+    vary(anymal, loaded, row)
     mass = plain.body_subtreemass[1]
     assert loaded.body_subtreemass[1] == pytest.approx(1.2 * mass)
     moved = loaded.body_ipos[1] - plain.body_ipos[1]
@@ -222,7 +225,7 @@ def test_a_payload_is_where_it_is_on_a_base_whose_inertia_lies_at_its_origin(tmp
     robot = get_robot(str(write_dog(tmp_path)))
     model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
     assert model.body_sameframe[1]
-    vary_model(model, SPACE.conditions_of(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0])
+    vary(robot, model, SPACE.condition_rows(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0])
     data = mujoco.MjData(model)
     data.qpos[3] = 1.0
     mujoco.mj_kinematics(model, data)
@@ -241,13 +244,13 @@ def test_a_negative_payload_leaves_a_body_that_can_be(robot, device):
     assert tree.body_mass.numpy()[0, 1] == pytest.approx(share * plain.body_mass[1], rel=1e-5)
     np.testing.assert_allclose(tree.body_inertia.numpy()[0, 1], share * plain.body_inertia[1], rtol=1e-5)
     np.testing.assert_allclose(tree.body_ipos.numpy()[0, 1], plain.body_ipos[1], atol=1e-6)
-    vary_model(plain, SPACE.conditions_of(row[None])[0])
+    vary(robot, plain, SPACE.condition_rows(row[None])[0])
     np.testing.assert_allclose(plain.body_inertia[1], tree.body_inertia.numpy()[0, 1], rtol=1e-5)
 
 
 def test_times_are_rounded_alike_in_both():
     for seconds, dt, steps in ((0.03, 0.02, 2), (0.01, 0.02, 1), (0.0125, 0.005, 3), (0.06, 0.024, 3), (0.0, 0.02, 0)):
-        assert rounded_steps(seconds, dt) == steps
+        assert round_steps(seconds, dt) == steps
 
 
 def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
@@ -259,22 +262,22 @@ def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
 def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing():
     rows = SPACE.uniform_random(3, 1)
     words = SPACE.parts(rows[0])
-    assert len(words) == 8 + len(KINDS) and SPACE.num_genes == 64 + 11
-    without = SPACE.without(rows, range(8, 8 + len(KINDS)))
-    acts = np.arange(len(Condition)) != Condition.PUSH_TIME  # which means nothing without a push
-    assert (SPACE.conditions_of(without) == NOMINAL)[:, acts].all() and (without[:, :64] == rows[:, :64]).all()
-    only = SPACE.without(rows, [8 + list(KINDS).index("push")])
-    changed = SPACE.conditions_of(only) != SPACE.conditions_of(rows)
-    assert changed[:, [Condition.PUSH_X, Condition.PUSH_Y]].all() and changed[:, : Condition.PUSH_X].sum() == 0
+    assert len(words) == 8 + len(CONDITIONS) and SPACE.num_genes == 64 + 11
+    without = SPACE.without(rows, range(8, 8 + len(CONDITIONS)))
+    assert (SPACE.condition_rows(without) == nominal_row()).all() and (without[:, :64] == rows[:, :64]).all()
+    only = SPACE.without(rows, [8 + list(CONDITIONS).index("push")])
+    changed = SPACE.condition_rows(only) != SPACE.condition_rows(rows)
+    first = condition_column("push_x")
+    assert changed[:, [first, first + 1]].all() and changed[:, :first].sum() == 0
     described = SPACE.describe(genes(payload=0.08, payload_x=-0.12, delay=0.02, friction=0.7)).splitlines()[-1]
     payload = "payload of 8.0% of the robot's mass, 0.12 m behind the centre of the base"
     assert described == f"{payload}, actions 20 ms late, friction times 0.70"
     assert SPACE.describe(genes()).splitlines()[-1] == "nominal conditions"
-    pushed = SPACE.condition_words(genes(push_x=-0.3, push_y=1.2, push_time=4.0))
+    pushed = SPACE.condition_text(genes(push_x=-0.3, push_y=1.2, push_time=4.0))
     assert pushed == "pushed by 0.3 m/s back and 1.2 m/s to the left after 4 s"
-    assert SPACE.condition_words(genes(push_x=0.04, push_y=-1.2)) == "pushed by 1.2 m/s to the right after 6 s"
-    assert SPACE.condition_words(genes(delay=0.002, lag=0.009)) == "nominal conditions"  # no whole steps
-    assert SPACE.condition_words(genes(delay=0.0126, lag=0.033)) == "actions 15 ms late, observations 40 ms old"
+    assert SPACE.condition_text(genes(push_x=0.04, push_y=-1.2)) == "pushed by 1.2 m/s to the right after 6 s"
+    assert SPACE.condition_text(genes(delay=0.002, lag=0.009)) == "nominal conditions"  # no whole steps
+    assert SPACE.condition_text(genes(delay=0.0126, lag=0.033)) == "actions 15 ms late, observations 40 ms old"
     on_ice = get_space("course+friction+push")
     assert (on_ice.ground, on_ice.conditions, on_ice.num_genes) == (("friction",), ("push",), 36 + 32 + 3)
     assert identity("course+push", None) == "course+push"
@@ -283,10 +286,9 @@ def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing()
 
 
 def test_values_and_genes_are_each_others_inverse():
-    for gene in genes_of(KINDS):
-        if gene.condition != Condition.PUSH_TIME:  # which means nothing without a push
-            assert gene.value(np.array([gene.absent])) == NOMINAL[gene.condition]
-        count = round((gene.most - gene.least) / gene.step) + 1 if gene.step else 9
-        values = np.linspace(gene.least, gene.most, count)
-        np.testing.assert_allclose(gene.value(gene.gene(values)), values, atol=1e-12)
-        np.testing.assert_allclose(gene.value(np.array([-5.0, 5.0])), [gene.least, gene.most])
+    for gene in condition_genes():
+        assert gene.to_value(gene.absent) == nominal_row()[condition_column(gene.name)]
+        count = round((gene.high - gene.low) / gene.step) + 1 if gene.step else 9
+        values = np.linspace(gene.low, gene.high, count)
+        np.testing.assert_allclose(gene.to_value(gene.to_gene(values)), values, atol=1e-12)
+        np.testing.assert_allclose(gene.to_value([-5.0, 5.0]), [gene.low, gene.high])

@@ -151,10 +151,10 @@ def test_elites_that_fail_under_conditions_are_trained_on_under_them():
     spaces = get_space("super_gaussian+payload+push"), COURSE
     genes = spaces[0].hard_random(3, 1), COURSE.hard_random(2, 1)
     tiles = make_mix(terrains=10, genes=genes, spaces=spaces).next()
-    expected = np.concatenate([spaces[0].conditions_of(genes[0]), COURSE.conditions_of(genes[1])])
+    expected = np.concatenate([spaces[0].condition_rows(genes[0]), COURSE.condition_rows(genes[1])])
     mix = make_mix(terrains=10, genes=genes, spaces=spaces)
     mix.next()
     np.testing.assert_array_equal(tiles.ground.rows[5:], expected[mix.rows])
     np.testing.assert_array_equal(
-        tiles.ground.rows[:5], COURSE.conditions_of(np.zeros((5, 36)))
+        tiles.ground.rows[:5], COURSE.condition_rows(np.zeros((5, 36)))
     )  # hand-crafted: nominal

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from kernels.conditions import Condition
 from kernels.episode import Outcome
 from sim.robots.find import get_robot
-from sim.terrains.conditions import NOMINAL
+from sim.terrains.conditions.base import condition_column, nominal_row
 from sim.terrains.ground import GroundMaps
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
@@ -179,8 +178,8 @@ def test_crossings_begin_along_the_way_with_the_goal_where_it_is(make_task):
 
 
 def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
-    rows = np.tile(NOMINAL, (2, 1))
-    rows[1, [Condition.PAYLOAD, Condition.PUSH_Y, Condition.PUSH_TIME]] = 0.2, 1.5, 0.1
+    rows = np.tile(nominal_row(), (2, 1))
+    rows[1, [condition_column(name) for name in ("payload", "push_y", "push_time")]] = 0.2, 1.5, 0.1
     ground = GroundMaps(**vars(GroundMaps.plain(2)) | {"conditions": rows})
     tiles = Tiles(heights=np.zeros((2, 161, 321), np.float32), type_of_column=("a", "b"), ground=ground)
     cfg = TaskCfg(curriculum=CURRICULUM, push_interval_s=1e6, added_base_mass=(5.0, 5.0), friction=(1.0, 1.0))

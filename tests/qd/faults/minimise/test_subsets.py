@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.conditions import Condition
 from qd.faults.causes import effects_of
 from qd.faults.judge import Search
 from qd.faults.minimise.subsets import Case, Trial, case_of, find_minimal, take_apart
 from qd.workers.cross import Crossings
 from sim.robots.find import get_robot
+from sim.terrains.conditions.base import condition_column
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive
@@ -191,7 +191,7 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
 
     def fails(cfg, genes, seeds):
         """With this payload, on the bump where it is higher than .6 of what the elite has."""
-        return (space.conditions_of(genes)[:, Condition.PAYLOAD] > 0.1) & (genes[:, 31] > 0.42)
+        return (space.condition_rows(genes)[:, condition_column("payload")] > 0.1) & (genes[:, 31] > 0.42)
 
     case = case_of(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
