@@ -1,4 +1,4 @@
-"""Settings of trainings. Nothing here loads torch or Warp: the help of a command shows them."""
+"""Settings of trainings. This module loads neither torch nor Warp, so that a command's help is quick."""
 
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ _SPECIALIST_SEED = 7
 
 @dataclass(frozen=True, kw_only=True)
 class RunCfg:
-    """Where a training runs, which does not change what it learns."""
+    """Device and export of a training. They do not change what it learns."""
 
     device: str | None = None
     """cpu, cuda or cuda:N; CUDA where there is one."""
@@ -41,7 +41,7 @@ RUN = RunCfg()
 
 @dataclass(frozen=True, kw_only=True)
 class TrainCfg:
-    """The training of a base controller. With the robot it says all that the result depends on."""
+    """The training of a base controller. Its result depends on these settings and the robot alone."""
 
     seed: NonNegativeInt = 0
     """Seed of everything drawn."""
@@ -58,12 +58,12 @@ class TrainCfg:
         return cls(task=TaskCfg.of(robot), ppo=PpoCfg.of(robot))
 
     def sized(self, robot: RobotCfg, device: str) -> Self:
-        """The same with sizes that suit the robot and the Warp device in place of those that are 0."""
+        """Replaces sizes of 0 by those that suit the robot and the Warp device."""
         on_cuda = {"num_envs": robot.learning.num_envs, "iterations": robot.learning.iterations}
         return _with_sizes(self, on_cuda if device.startswith("cuda") else _BASE_ON_CPU)
 
     def check(self, robot: RobotCfg) -> None:
-        """Refuses settings that nothing can be learned with; sizes are given."""
+        """Raises a ValueError for settings that cannot be trained with; sizes must be filled in."""
         check_settings(self)
         lines = [*task_problems(self.task, robot.control_dt), *ppo_problems(self.ppo, self.num_envs)]
         if lines:
@@ -72,30 +72,30 @@ class TrainCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class RecipeCfg:
-    """What seldom differs between fine-tunings."""
+    """Settings that seldom differ between fine-tunings."""
 
     swap_every: NonNegativeInt = 0
     """Iterations after which the terrains are exchanged; 0: on CUDA 400 (Cassie: 200), on the CPU 50."""
     draw: Draw = "learnable"
-    """How elites are drawn at each exchange. uniform: all alike. failing: the likelier, the less often they were
-    crossed the last time. learnable: the likelier, the nearer to half of the time (goal rate times its rest: Rutherford
-    et al. 2024). In a training robots start all along the way, and it is the rate of all. Where there are places for
-    all elites, each has one, and the draw is of the places that are left."""
+    """How elites are drawn at each exchange. uniform: all with equal chance. failing: with a chance that falls with
+    the rate at which they were crossed last. learnable: with a chance that is largest for a rate of a half (rate times
+    one minus rate: Rutherford et al. 2024). The rate is over robots that start all along the way. If there are at
+    least as many terrains as elites, each elite is taken, and the draw fills the rest."""
     critic_iterations: NonNegativeInt | None = None
-    """Iterations in which the critic learns alone at first, if the controller comes without one; 50, or half of all if
-    there are fewer than 100."""
+    """First iterations, in which the critic alone learns, if the controller has no critic; 50, or half of all if there
+    are fewer than 100."""
     noise_of: str | None = None
-    """Controller with whose noise of the actions to begin, if its file has it; that of --policy. Noise grows in a
-    training, and a hardening lets each begin with the noise of the base controller."""
+    """Controller whose action noise the training begins with, if its file has it; that of --policy. Noise grows in a
+    training, and each training of a hardening begins with the noise of the base controller."""
     only: Literal["all", "failing"] = "all"
-    """Which elites to train on. failing: those that fail by their fresh episodes."""
+    """Which elites to train on. failing: those that fail in fresh episodes."""
     held_out: bool = True
-    """Whether elites are held out for the evaluation. A specialist, which is to certify, trains on all."""
+    """Hold elites out for the evaluation. A specialist, a certifier, trains on all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneCfg(TrainCfg):
-    """A fine-tuning. With the robot and the files it names, it says all that the result depends on."""
+    """A fine-tuning. Its result depends on these settings, the files they name and the robot alone."""
 
     policy: str | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size, or a controller.toml of such or of
@@ -134,13 +134,13 @@ class FinetuneCfg(TrainCfg):
         return replace(cfg, seed=_SPECIALIST_SEED, recipe=replace(cfg.recipe, only="failing", held_out=False))
 
     def sized(self, robot: RobotCfg, device: str, **on_cuda: int) -> Self:
-        """The same with sizes that suit the robot and the Warp device, or are given, in place of those that are 0."""
+        """Replaces sizes of 0 by ``on_cuda`` and the paper's on a GPU, or by small ones on the CPU."""
         sizes = asdict(robot.paper) | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
         recipe = replace(self.recipe, swap_every=self.recipe.swap_every or sizes["swap_every"])
         return replace(_with_sizes(self, sizes), recipe=recipe)
 
     def check(self, robot: RobotCfg) -> None:
-        """Refuses settings that nothing can be learned with; sizes are given."""
+        """Raises a ValueError for settings that cannot be trained with; sizes must be filled in."""
         super().check(robot)
         if self.terrains < 2 and self.mix != "hand-crafted":
             raise ValueError(f"terrains must be at least 2 for mix {self.mix}, half of each kind, got {self.terrains}")
@@ -175,7 +175,7 @@ class RoundEvaluationCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class HardenCfg:
-    """A hardening. With the robot and the files it names, it says all that the result depends on."""
+    """A hardening. Its result depends on these settings, the files they name and the robot alone."""
 
     policy: str | None = None
     """Controller to begin with: an rsl_rl checkpoint with layers of any size, or a controller.toml; the robot's own."""
@@ -199,7 +199,7 @@ class HardenCfg:
         return cls(tune=FinetuneCfg.of(robot))
 
     def sized_tune(self, robot: RobotCfg, device: str) -> FinetuneCfg:
-        """Each training with sizes that suit the robot and the Warp device in place of those that are 0."""
+        """The settings of each training, with sizes of 0 replaced by those that suit the robot and the Warp device."""
         return self.tune.sized(robot, device, **(LARGE if robot.tuning.large_rounds else {}))
 
 

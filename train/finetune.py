@@ -27,12 +27,12 @@ from train.ppo.training import (
     DESCRIBED,
     Kind,
     Training,
-    check_settings,
-    device_of,
+    check_resumed,
+    dump_settings,
+    find_device,
     is_finished,
     read_saved,
     run_directory,
-    settings_of,
 )
 from train.task.mix import Mix
 
@@ -42,38 +42,36 @@ _CRITIC_ITERATIONS = 50
 def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
     """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
 
-    Where the directory holds a checkpoint of the same settings, the training goes on; one that is over is left as it
-    is. ``run_dir`` gets checkpoint, controller, record and TensorBoard's file; ``run`` says where.
+    If the directory holds a checkpoint of the same settings, the training goes on; a finished one is left as it is.
+    ``run_dir`` gets checkpoint, controller, record and TensorBoard's file. ``run`` has the device and an export.
     """
-    device = device_of(run.device)
-    if Ranks.of_environment().size > 1:
+    device = find_device(run.device)
+    if Ranks.from_environment().size > 1:
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
     checkpoint = run_dir / CHECKPOINT
     saved = read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
-    # Where it goes on, the first controller may be gone.
+    # The first controller of a training that goes on may be gone.
     start = read_start(Path(cfg.policy or robot.policy_file) if saved is None else checkpoint, robot)
     if saved is None and cfg.recipe.noise_of is not None:
         noise = read_start(Path(cfg.recipe.noise_of), robot).actor
         start = replace(start, actor=start.actor | {key: noise[key] for key in noise if key == STD})
-    controller = start.controller
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
-    elites = elites_of(robot, cfg)
+    elites = select_elites(robot, cfg)
     settings = {
-        **settings_of(cfg, robot),
-        "elites": elites.about,
+        **dump_settings(cfg, robot),
+        "elites": elites.archives,
         "spaces": list(dict.fromkeys(identity(space.name, space.sha256) for space in elites.spaces)),
     }
     if saved is not None:
-        check_settings(run_dir, saved, settings)
+        check_resumed(run_dir, saved, settings)
         if is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done; with more it goes on.")
-            return _with_onnx(run_dir / (POLICY if controller is None else DESCRIBED), robot)
-    beside = None if run.export is None else run.export.with_suffix(".toml")
-    if controller is not None and beside is not None and beside.exists() and saved is None:
-        raise ValueError(
-            f"export {run.export} must have no {beside.name} beside it, which is written too: name another"
-        )
+            return _write_onnx(run_dir / (POLICY if start.controller is None else DESCRIBED), robot)
+    if start.controller is not None and saved is None and run.export is not None:
+        description = run.export.with_suffix(".toml")
+        if description.exists():
+            raise ValueError(f"export also writes {description}, which exists: name another file")
     with run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
@@ -82,54 +80,55 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
         policy = training.run(run.export)
-    return _with_onnx(policy, robot, anew=True)
+    return _write_onnx(policy, robot)
 
 
-def _with_onnx(policy: Path, robot: RobotCfg, *, anew: bool = False) -> Path:
-    """A controller as it is, once its ONNX file lies beside it; one with a description has none."""
-    onnx = policy.with_suffix(".onnx")
-    if policy.name == POLICY and (anew or not onnx.exists()):
-        export_onnx(load_actor(policy, robot), onnx)
+def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
+    """Writes a controller's ONNX file beside it, unless it has a description; returns the controller's file."""
+    if policy.name == POLICY:
+        export_onnx(load_actor(policy, robot), policy.with_suffix(".onnx"))
     return policy
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains a search's own specialist, by :meth:`FinetuneCfg.specialist`, and puts it with the certifiers of its run.
+    """Trains a search's specialist, by :meth:`FinetuneCfg.specialist`, and writes it to the certifiers of the run.
 
-    It is the controller of the search, trained further on the elites that it fails by their fresh episodes, all of
-    them: a certificate is a proof of existence, so it may have trained on the terrain. The training works in
+    The specialist is the controller of the search, trained further on all elites that it fails in fresh episodes. A
+    certificate is a proof of existence, so a certifier may have trained on its terrain. The training works in
     ``<run>/specialist``.
     """
     archive = read_elites(run, robot, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)
     if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
-        raise ValueError(f"the controller of {run} must be the one that was searched, got {policy or SHIPPED}, another "
-                         "now: name it by --policy")  # fmt: skip
-    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, device_of(options.device), **SPECIALIST)
+        raise ValueError(
+            f"policy must be the controller that {run} searched, got {policy or SHIPPED}, whose file differs: name it "
+            "by --policy"
+        )
+    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, find_device(options.device), **SPECIALIST)
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Elites:
-    """Elites to train on."""
+class TrainingElites:
+    """E elites to train on, by archive."""
 
     genes: tuple[NDArray[np.float32], ...]
-    """A part of each archive, shape (E, genes of its space); E sums up over the parts."""
+    """Genes from each archive, shape (elites of the archive, genes of its space)."""
     spaces: tuple[TerrainSpace, ...]
-    """Of each part; without elites one, that of hard-random terrains."""
+    """Space of each archive; without elites that of hard-random terrains."""
     goal_rate: NDArray[np.float64] | None = None
-    """Of each, as its archive has it, shape (E,)."""
-    about: list[dict[str, Any]] = field(default_factory=list)
-    """Of each archive, for the record."""
+    """Goal rate of each elite in its archive, shape (E,)."""
+    archives: list[dict[str, Any]] = field(default_factory=list)
+    """Sizes and hash of each archive, for the record."""
 
 
-def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
-    """The elites to train on."""
+def select_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
+    """The elites to train on, without those that any archive holds out."""
     if cfg.mix != "generated":
         space = space_at(load_space(cfg.space), None, robot)
-        return Elites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
+        return TrainingElites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_elites(path, robot, cfg.space) for path in paths]
     splits = [split_elites(archive, held_out=cfg.recipe.held_out) for archive in archives]
@@ -141,25 +140,32 @@ def elites_of(robot: RobotCfg, cfg: FinetuneCfg) -> Elites:
         rows = split.train
         if cfg.recipe.only == "failing":
             if archive.fresh is None:
-                own = robot.spec if archive.robot == robot.name and robot.settings_file else None
+                named_robot = robot.spec if archive.robot == robot.name and robot.settings_file else None
                 space = archive.space if archive.space_sha256 else None
-                judge = command_line("judge", robot=own, run=directory_of(path), space=space)
+                judge = command_line("judge", robot=named_robot, run=directory_of(path), space=space)
                 raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: run `{judge}`")
             rows = rows[archive.failing[rows]]
-        is_free = [mark not in held_out for mark in hash_elites(archive.genes[rows])]
-        chosen.append((archive, rows[np.array(is_free, bool)], split))
-    if not any(len(rows) for _, rows, _ in chosen):
-        places = ", ".join(map(str, paths))
-        raise ValueError(f"{places} must have elites to train on that are {cfg.recipe.only}, got none")
-    return Elites(
-        genes=tuple(archive.genes[rows] for archive, rows, _ in chosen),
+        is_free = [elite not in held_out for elite in hash_elites(archive.genes[rows])]
+        chosen.append(rows[np.array(is_free, bool)])
+    if not any(map(len, chosen)):
+        names = ", ".join(map(str, paths))
+        raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
+    return TrainingElites(
+        genes=tuple(archive.genes[rows] for archive, rows in zip(archives, chosen, strict=True)),
         spaces=tuple(map(read_space, archives)),
-        goal_rate=np.concatenate([(archive.fresh or archive).goal_rate[rows] for archive, rows, _ in chosen]),
-        about=[
-            {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation),
-             "sha256": elites_sha256(archive)} for archive, rows, split in chosen
+        goal_rate=np.concatenate(
+            [(archive.fresh or archive).goal_rate[rows] for archive, rows in zip(archives, chosen, strict=True)]
+        ),
+        archives=[
+            {
+                "elites": len(archive),
+                "trained_on": len(rows),
+                "validation": len(split.validation),
+                "sha256": elites_sha256(archive),
+            }
+            for archive, rows, split in zip(archives, chosen, splits, strict=True)
         ],
-    )  # fmt: skip
+    )
 
 
 class FineTuning(Training):
@@ -176,35 +182,50 @@ class FineTuning(Training):
         device: str,
         settings: dict[str, Any],
         saved: dict[str, Any] | None,
-        elites: Elites,
+        elites: TrainingElites,
         start: Start,
     ) -> None:
         """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
         self.mix = Mix(
-            kind=cfg.mix, num_terrains=cfg.terrains, draw=cfg.recipe.draw, genes=elites.genes, spaces=elites.spaces,
-            seed=cfg.seed, device=device, goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
-        )  # fmt: skip
+            kind=cfg.mix,
+            num_terrains=cfg.terrains,
+            draw=cfg.recipe.draw,
+            genes=elites.genes,
+            spaces=elites.spaces,
+            seed=cfg.seed,
+            device=device,
+            goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
+        )
         if saved is None:
-            before = read_trained_on(str(cfg.policy or robot.policy_file))
-            alone = 0
-            if start.critic is None:
-                most = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
-                alone = most if cfg.recipe.critic_iterations is None else cfg.recipe.critic_iterations
-            marks = sorted({*chain(*map(hash_elites, elites.genes)), *before})
-            facts, tiles = {TRAINED_ON: marks, "critic_iterations": alone}, self.mix.next()
+            critic_iterations = cfg.recipe.critic_iterations
+            if start.critic is not None:
+                critic_iterations = 0
+            elif critic_iterations is None:
+                critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+            trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
+            trained_on = sorted({*chain(*map(hash_elites, elites.genes)), *trained_before})
+            facts = {TRAINED_ON: trained_on, "critic_iterations": critic_iterations}
+            tiles = self.mix.next()
         else:
             facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
             tiles = self.mix.restore(saved["mix"])
         self._swap_every = cfg.recipe.swap_every
         super().__init__(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, tiles=tiles, facts=facts,
+            robot,
+            cfg,
+            run_dir,
+            device=device,
+            settings=settings,
+            saved=saved,
+            tiles=tiles,
+            facts=facts,
             controller=start.controller,
-        )  # fmt: skip
+        )
         if saved is None:
             self.learner.start_from(start)
 
     def before_iteration(self) -> None:
-        """Exchanges the terrains where that is due, and lets the actor learn once its critic has had its time."""
+        """Exchanges the terrains when that is due, and lets the actor learn after its critic's first iterations."""
         iteration = self.learner.iteration
         if iteration // self._swap_every > self.mix.swap:
             self.task.exchange(self.mix.next(self.task.counts()))
@@ -214,5 +235,5 @@ class FineTuning(Training):
             self.learner.alg.begin_actor()
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps, the terrains among it."""
+        """Content of a checkpoint, with the present terrains."""
         return {**super().state(), "mix": self.mix.state(self.task.counts())}

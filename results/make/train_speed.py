@@ -64,7 +64,7 @@ def time_mjlab(folder: str, device: str, num_envs: int) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Times both sizes, and mjlab if there is one; each row says which run it is of."""
     script = parse(__doc__, argv, "train_speed.json")
-    ranks = Ranks.of_environment()
+    ranks = Ranks.from_environment()
     sizes, iterations = (((8, 24), (16, 24)), 1) if script.small else (SIZES, 40)
     if ranks.size > 1:  # several processes make one training alone
         sizes = sizes[-1:]

@@ -289,7 +289,7 @@ def test_rates_of_training_are_of_the_same_device(speeds):
 
 def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
     def time_training(script, device, num_envs, steps, iterations):
-        return {"gpus": Ranks.of_environment().size, "num_envs": num_envs}
+        return {"gpus": Ranks.from_environment().size, "num_envs": num_envs}
 
     monkeypatch.setattr(train_speed, "time_training", time_training)
     file = tmp_path / "train_speed.json"

@@ -22,7 +22,7 @@ from tests.train.conftest import begun
 from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import FinetuneCommand
-from train.finetune import elites_of, finetune, train_specialist
+from train.finetune import finetune, select_elites, train_specialist
 from train.ppo import training
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
 from train.task.task import CommandTask
@@ -188,7 +188,7 @@ def test_archives_are_trained_on_together_but_for_what_any_of_them_holds_out(pla
     }
     for name, archive in made.items():
         write_archive(places / f"{name}.npz", archive)
-    elites = elites_of(ROBOT, cfg_of(places, archive=tuple(str(places / f"{name}.npz") for name in made)))
+    elites = select_elites(ROBOT, cfg_of(places, archive=tuple(str(places / f"{name}.npz") for name in made)))
     assert [space.name for space in elites.spaces] == ["super_gaussian", "super_gaussian", "course"]
     assert len(elites.genes[2]) == 7  # two of ten are in the test and one validates
     split = split_elites(whole)
@@ -221,13 +221,13 @@ def test_which_elites_are_trained_on(places, searched):
     genes, archive = make_archive(10).genes, (str(searched),)
     train = set(hash_elites(genes[split_elites(make_archive(10)).train]))
     for only, count in (("all", 10), ("failing", 8)):
-        marks = {
-            held: set(hash_elites(elites_of(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held)).genes[0]))
-            for held in (True, False)
-        }
-        assert marks[False] == set(hash_elites(genes[:count]))
-        assert marks[True] == train & marks[False]
-    elites = elites_of(ROBOT, cfg_of(places, archive=archive, only="failing"))
+        whole, held = (
+            select_elites(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held_out)).genes[0]
+            for held_out in (False, True)
+        )
+        assert set(hash_elites(whole)) == set(hash_elites(genes[:count]))
+        assert set(hash_elites(held)) == train & set(hash_elites(whole))
+    elites = select_elites(ROBOT, cfg_of(places, archive=archive, only="failing"))
     assert elites.goal_rate is not None and set(elites.goal_rate) == {0.1}
     made = make_archive(10)
     write_archive(places / "crossed.npz", replace(made, fresh=replace(fresh_values(made), goal_rate=np.ones(10))))
@@ -235,9 +235,9 @@ def test_which_elites_are_trained_on(places, searched):
     own = replace(ROBOT, settings_file=Path("/mine/robot.toml"))
     for robot, named in ((ROBOT, ""), (own, "--robot /mine/robot.toml ")):
         with pytest.raises(ValueError, match=f"`faultline judge {named}--run {unjudged}`"):
-            elites_of(robot, cfg_of(places, archive=(str(unjudged),), only="failing"))
+            select_elites(robot, cfg_of(places, archive=(str(unjudged),), only="failing"))
     with pytest.raises(ValueError, match="elites to train on"):
-        elites_of(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
+        select_elites(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
 
 
 def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, searched):

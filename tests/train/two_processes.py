@@ -19,9 +19,9 @@ def main() -> None:
     for iterations in ("1", "2"):
         assert faultline.main([*_TRAIN.split(), "--run-dir", sys.argv[1], "--iterations", iterations]) == 0
         distributed.init_process_group = lambda backend: None  # the group of the first training is there yet
-    ranks = Ranks.of_environment()
-    assert not ranks.all_want(ranks.rank == 0, "cpu")
-    assert ranks.all_want(True, "cpu")
+    ranks = Ranks.from_environment()
+    assert not ranks.all_true(ranks.rank == 0, "cpu")
+    assert ranks.all_true(True, "cpu")
     ranks.check_same([torch.ones(3), torch.zeros(2, 2)])
     try:
         ranks.check_same([torch.ones(3), torch.full((2,), 1e-7 * ranks.rank)])

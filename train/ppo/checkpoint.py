@@ -1,4 +1,4 @@
-"""Checkpoints of trainings, and the networks that a fine-tuning begins with; no code in a file is run."""
+"""Checkpoints of trainings, and the networks that a fine-tuning begins with; code in a file never runs."""
 
 import io
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ DESCRIPTION = "controller"
 STD = "distribution.std_param"
 """Key of the standard deviation of the actions in an actor's state."""
 _NOISES = (STD, "distribution.log_std_param", "std", "log_std")
-_USUAL_NOISE = 0.3  # of a network whose file says none: about what trainings end with
+_DEFAULT_NOISE = 0.3  # for a file without it: about the noise at the end of trainings
 State = dict[str, torch.Tensor]
 """Weights under rsl_rl's keys."""
 
@@ -50,21 +50,21 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """A trained actor, and its critic where it is known."""
+    """A trained actor, and its critic if known."""
 
     actor: State
     critic: State | None
     hidden_dims: tuple[int, ...]
     """Hidden layers of both."""
     controller: ControllerCfg | None = None
-    """What the actor sees and does, with the activation between its layers, if it is described."""
+    """Description of a described actor: its observations, its actions and the activation between its layers."""
 
 
 def read_start(path: Path, robot: RobotCfg) -> Start:
-    """Networks of an rsl_rl checkpoint, fit to be trained on.
+    """Networks of an rsl_rl checkpoint or a described controller, for a fine-tuning.
 
     A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
-    such a file is left: its own normaliser is another.
+    such a file is dropped, because it has another normaliser.
     """
     if path.name == CHECKPOINT and path.is_file() and DESCRIPTION in (saved := read_checkpoint(path)):
         policy = load_described(read_controller(path, saved[DESCRIPTION]), path, robot, "cpu", path)
@@ -81,15 +81,16 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
         )
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
     critic = None if policy.normalised else content.get("critic_state_dict")
-    return _start_of(policy, actor, critic, robot, path)
+    return _make_start(policy, actor, critic, robot, path)
 
 
-def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, path: Path) -> Start:
+def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, path: Path) -> Start:
     if policy.normalised:
         weight = actor["mlp.0.weight"] / (policy.std.flatten() + 1e-2)
         actor |= {"mlp.0.weight": weight, "mlp.0.bias": actor["mlp.0.bias"] - weight @ policy.mean.flatten()}
     hidden = tuple(layer.out_features for layer in policy.layers if isinstance(layer, torch.nn.Linear))[:-1]
-    std, count = actor.get(STD), policy.sizes[1]
+    std = actor.get(STD)
+    count = policy.sizes[1]
     if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
         raise ValueError(
             f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0, got "
@@ -110,46 +111,54 @@ def _start_of(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, pat
 
 
 def _start_described(described: Described, path: Path, robot: RobotCfg) -> Start:
-    """The network of a description, and its critic of the robot's row where a training has made one."""
+    """The network of a description, with the critic of a training's checkpoint."""
     weights = path if path.name == CHECKPOINT else weights_file(path)
     policy = plain_layers(described.network, str(path))
-    # Of TorchScript the noise is not known.
+    # TorchScript does not say its noise.
     content = read_weights(weights) if weights and isinstance(described.network, MlpPolicy) else {}
-    before = content.get("actor_state_dict", content.get("model_state_dict", {}))
-    noise = {name: torch.exp(before[name]) if "log" in name else before[name] for name in _NOISES if name in before}
-    std = next(iter(noise.values()), torch.full((policy.sizes[1],), _USUAL_NOISE)).float()
+    stored = content.get("actor_state_dict", content.get("model_state_dict", {}))
+    noise = [torch.exp(stored[name]) if "log" in name else stored[name] for name in _NOISES if name in stored]
+    std = (noise or [torch.full((policy.sizes[1],), _DEFAULT_NOISE)])[0].float()
     actor = {f"mlp.{key}": value.detach().clone() for key, value in policy.layers.state_dict().items()} | {STD: std}
-    start = _start_of(policy, actor, content.get("critic_state_dict") if path.name == CHECKPOINT else None, robot, path)
+    start = _make_start(
+        policy, actor, content.get("critic_state_dict") if path.name == CHECKPOINT else None, robot, path
+    )
     return replace(start, controller=replace(described.cfg, policy=POLICY, activation=policy.activation))
 
 
 @torch.inference_mode()
-def plain_layers(network: Any, place: str) -> MlpPolicy:
-    """A network as a perceptron; one of a TorchScript module must answer as its layers say.
+def plain_layers(network: Any, name: str) -> MlpPolicy:
+    """A network as a perceptron; a TorchScript module must compute the same as its layers.
 
-    ``place`` names the controller in errors.
+    Errors call the controller ``name``.
     """
     if isinstance(network, MlpPolicy):
         return network
     module = getattr(network, "module", None)
     tensors = module.state_dict() if module is not None and not hasattr(network, "reset") else {}
-    names = [
-        name.removesuffix("weight") for name, value in tensors.items() if name.endswith("weight") and value.ndim == 2
+    layers = [
+        key.removesuffix("weight") for key, value in tensors.items() if key.endswith("weight") and value.ndim == 2
     ]
-    parts = [(k, name, part) for k, name in enumerate(names) for part in ("weight", "bias")]
-    state = {f"mlp.{2 * k}.{part}": tensors[name + part] for k, name, part in parts if name + part in tensors}
-    state |= {f"obs_normalizer.{end}": tensors[name] for name in tensors for end in ("_mean", "_std")
-              if name.rpartition(".")[2] == end}  # fmt: skip
-    for activation in ACTIVATIONS if len(names) > 1 and len(state) >= len(parts) else ():
+    state = {}
+    for k, layer in enumerate(layers):
+        state |= {f"mlp.{2 * k}.{key}": tensors[layer + key] for key in ("weight", "bias") if layer + key in tensors}
+    is_complete = len(layers) > 1 and len(state) == 2 * len(layers)
+    for key, value in tensors.items():
+        name_in_module = key.rpartition(".")[2]
+        if name_in_module in ("_mean", "_std"):
+            state[f"obs_normalizer.{name_in_module}"] = value
+    for activation in ACTIVATIONS if is_complete else ():
         try:
             policy = MlpPolicy(state, activation)
             rows = torch.randn(64, policy.sizes[0], generator=torch.Generator().manual_seed(0))
-            rows = policy.mean + policy.std * rows * torch.logspace(-1, 1, 64)[:, None]  # a limit shows far out
+            rows = (
+                policy.mean + policy.std * rows * torch.logspace(-1, 1, 64)[:, None]
+            )  # far from 0, limits show
             if torch.allclose(policy(rows), network(rows), rtol=1e-4, atol=1e-4):
                 return policy
         except (KeyError, RuntimeError):
             break
     raise ValueError(
-        f"finetune needs a network of plain layers with one kind of activation, got another in {place}: give an rsl_rl "
+        f"finetune needs a network of plain layers with one kind of activation, got another in {name}: give an rsl_rl "
         "checkpoint or its TorchScript as the description's policy"
     )

@@ -24,16 +24,16 @@ from train.task.vec_env import CommandVecEnv
 
 @dataclass(frozen=True, kw_only=True)
 class Ranks:
-    """Which of how many processes this one is."""
+    """Rank of this process among the processes of a training."""
 
     rank: int = 0
     local_rank: int = 0
-    """Its number on this machine, which is its GPU's."""
+    """Rank on this machine, the number of its GPU."""
     size: int = 1
 
     @classmethod
-    def of_environment(cls) -> "Ranks":
-        """What torchrun put into RANK, LOCAL_RANK and WORLD_SIZE; one process without it."""
+    def from_environment(cls) -> "Ranks":
+        """Reads RANK, LOCAL_RANK and WORLD_SIZE, which torchrun sets; without them there is one process."""
         rank, local_rank, size = (int(os.environ.get(name, 0)) for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"))
         return cls(rank=rank, local_rank=local_rank, size=max(1, size))
 
@@ -43,49 +43,49 @@ class Ranks:
         return self.rank == 0
 
     def device(self, name: str) -> str:
-        """The Warp device of this process, where ``name`` was asked for."""
+        """The Warp device of this process; ``name`` is what the user asked for."""
         if self.size == 1 or not name.startswith("cuda"):
             return name
         if name not in ("cuda", "cuda:0"):
             raise ValueError(f"with torchrun each process takes its own GPU, got device {name}: give cuda, or leave it")
         return f"cuda:{self.local_rank}"
 
-    def all_want(self, wish: bool, device: torch.device | str) -> bool:
-        """Whether every process wishes so; all get the same answer."""
+    def all_true(self, value: bool, device: torch.device | str) -> bool:
+        """Whether ``value`` is true in every process; all get the same answer."""
         if self.size == 1:
-            return wish
-        flag = torch.tensor(int(wish), device=device)
+            return value
+        flag = torch.tensor(int(value), device=device)
         distributed.all_reduce(flag, op=distributed.ReduceOp.MIN)
         return bool(flag.item())
 
     def check_same(self, parameters: list[torch.Tensor]) -> None:
-        """A FloatingPointError if the processes do not hold the same numbers, as averaged gradients leave them."""
+        """Raises a FloatingPointError if the parameters of the processes differ; averaged gradients keep them equal."""
         if self.size == 1:
             return
         numbers = torch.cat([parameter.detach().flatten() for parameter in parameters])
         first = numbers.clone()
         distributed.broadcast(first, src=0)
-        if not self.all_want(bool(torch.equal(numbers, first)), numbers.device):
+        if not self.all_true(bool(torch.equal(numbers, first)), numbers.device):
             raise FloatingPointError("the networks of the processes have drifted apart: this training is not one")
 
 
 class Runner(OnPolicyRunner):
-    """rsl_rl's runner, which several processes may share on CPUs too."""
+    """rsl_rl's runner, also for several processes on CPUs."""
 
     def _configure_multi_gpu(self) -> None:
-        ranks = Ranks.of_environment()
+        ranks = Ranks.from_environment()
         if ranks.size == 1 or self.device.startswith("cuda"):
             super()._configure_multi_gpu()
             return
         self.is_distributed, self.gpu_world_size = True, ranks.size
         self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
         self.cfg["multi_gpu"] = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
-        distributed.init_process_group("gloo")  # rsl_rl's own choice is NCCL, which CPUs do not have
+        distributed.init_process_group("gloo")  # rsl_rl chooses NCCL, which CPUs lack
 
 
 @dataclass(frozen=True, kw_only=True)
 class Iteration:
-    """What one iteration took and what the update said."""
+    """Durations and losses of one iteration."""
 
     collection_s: float
     learning_s: float
@@ -94,20 +94,20 @@ class Iteration:
 
 
 class Learner:
-    """Actor, critic and optimiser at work on an environment.
+    """Actor, critic and optimiser on an environment.
 
     Attributes:
-        iteration: Iterations done, those before a resume included.
-        averaged: Iterations whose actors are in the mean; 0: there is none.
+        iteration: Iterations done, including those before a resume.
+        averaged: Number of iterations whose actors are in the mean; 0 if there is no mean.
         steps_per_iteration: Environment steps of an iteration, of all processes.
-        ranks: Which process of a training this is.
+        ranks: Rank of this process.
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
-        """Draw the networks from ``seed``, as the actions are.
+        """Draw the networks from ``seed``, and later the actions.
 
-        With ``random_ages`` episodes begin with clocks set forward, so that they do not end together; such an episode
-        is shorter than its length says, and ends by the clock without having had its time.
+        With ``random_ages`` the first episodes begin at random ages, so that they do not end together; they are shorter
+        than others.
         """
         torch.manual_seed(seed)
         torch.set_float32_matmul_precision("high")  # TF32 on CUDA: half the learning time, no measurable loss
@@ -117,7 +117,7 @@ class Learner:
         self.iteration = 0
         self.averaged = 0
         self._mean: State = {}
-        self.ranks = Ranks.of_environment()
+        self.ranks = Ranks.from_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
             self.runner = Runner(env, runner_settings(cfg, env.controller), log_dir=None, device=str(env.device))
@@ -128,11 +128,11 @@ class Learner:
         self.begin()
 
     def _draw_apart(self, seed: int) -> None:
-        """Other random numbers from here on than the other processes draw."""
+        """Seeds this process's random numbers, different from those of the other processes."""
         torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
     def begin(self) -> None:
-        """Go on from the environment as it is now, where all episodes have begun anew."""
+        """Start from an environment whose episodes have all just begun."""
         if self._random_ages:
             ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
             self.env.episode_length_buf = ages
@@ -141,7 +141,7 @@ class Learner:
     def iterate(self) -> Iteration:
         """Collect ``steps_per_env`` control steps of every environment, then update the networks.
 
-        After a FloatingPointError the networks are beyond use, the last checkpoint is not.
+        After a FloatingPointError the networks are unusable; the last checkpoint is intact.
         """
         alg = self.alg
         began = time.perf_counter()
@@ -156,7 +156,7 @@ class Learner:
             torch.cuda.synchronize()  # or the simulation's time would be counted as learning
         collected = time.perf_counter()
         losses = alg.update()
-        # The last step may have spoiled the networks after their losses were computed.
+        # The last step may have made the networks non-finite after the losses were computed.
         parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
         sums = torch.stack([parameter.detach().sum() for parameter in parameters]).tolist()
         if not all(map(math.isfinite, [*losses.values(), *sums])):
@@ -172,11 +172,11 @@ class Learner:
         return {key: value.detach().cpu().clone() for key, value in self.alg.get_policy().state_dict().items()}
 
     def mean_actor_state(self) -> State:
-        """The mean of the actors counted so far under the same keys; the present one where there are none."""
+        """The mean of the actors counted so far, under the same keys; the present actor if none is counted."""
         return {**self.actor_state(), **{key: value.cpu().clone() for key, value in self._mean.items()}}
 
     def count_into_mean(self, counts: bool) -> None:
-        """Count the present actor into the mean, or forget the mean where it does not count."""
+        """Count the present actor into the mean, or clear the mean if the actor does not count."""
         self.averaged = self.averaged + 1 if counts else 0
         if self.averaged <= 1:
             self._mean = {}
@@ -185,7 +185,7 @@ class Learner:
                 self._mean.setdefault(key, value.detach().clone()).lerp_(value.detach(), 1.0 / self.averaged)
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps: networks, optimiser, terrain levels and random numbers, all on the CPU."""
+        """Content of a checkpoint: networks, optimiser, terrain levels and random numbers, all on the CPU."""
         task = self.env.task
         return {
             **self.alg.save(),
@@ -200,7 +200,7 @@ class Learner:
         }
 
     def start_from(self, start: Start) -> None:
-        """Begin with trained networks; without a standard deviation of the actions, the configured one is kept."""
+        """Begin with trained networks; without a standard deviation of the actions, the configured one stays."""
         policy = self.alg.get_policy()
         policy.load_state_dict({STD: policy.state_dict()[STD], **start.actor})
         if start.critic is not None:
@@ -211,14 +211,15 @@ class Learner:
         task = self.env.task
         try:
             self.alg.load(content, None, True)
-            self.iteration, self.averaged = content["iter"], content["averaged"]
+            self.iteration = content["iter"]
+            self.averaged = content["averaged"]
             self._mean = {key: value.to(self.alg.device) for key, value in content["mean_actor_state_dict"].items()}
             task.counter.fill_(content["counter"])
             task.restart_all(content["levels"].to(task.levels.device, task.levels.dtype))
             torch.set_rng_state(content["rng_cpu"])
             if content["rng_cuda"] is not None and task.observation.is_cuda:
                 torch.cuda.set_rng_state(content["rng_cuda"], task.observation.device)
-        except Exception as error:  # torch answers states that do not fit with many types
+        except Exception as error:  # torch raises many types for states that do not fit
             raise ValueError(f"the checkpoint is damaged: {in_one_line(error)}; put a copy of it back") from error
         if self.ranks.size > 1:  # the state is the first process's
             self._draw_apart(int(torch.initial_seed()) % 2**31)

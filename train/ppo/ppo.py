@@ -69,17 +69,17 @@ class CapturedPPO(PPO):
         self._eager_steps = 0
 
     def let_actor_learn(self, learns: bool) -> None:
-        """Whether updates change the actor; without, the critic alone learns, and the learning rate stays.
+        """Let updates change the actor, or the critic alone at a constant learning rate.
 
-        A critic that has seen nothing yet would lead a trained actor astray.
+        An untrained critic would mislead a trained actor.
         """
         self._actor_learns.fill_(float(learns))
 
     def begin_actor(self) -> None:
-        """Forget the optimiser's moments of the actor, and let it learn in small steps at first.
+        """Reset the optimiser's moments of the actor, and let it learn in small steps at first.
 
-        While the critic learned alone, the actor's gradients were zero: Adam would take its first steps three times too
-        large, for a moment of squares that has counted zeros.
+        While the critic learned alone, the actor's gradients were zero. Adam's second moment has counted these zeros,
+        so that its first steps would be three times too large.
         """
         for parameter in self.actor.parameters():
             for value in self.optimizer.state.get(parameter, {}).values():
@@ -95,8 +95,8 @@ class CapturedPPO(PPO):
         if self._stream is None:
             self._run_epochs(order)
         else:
-            # One stream of our own for every backward pass: autograd remembers the stream of a parameter's first use,
-            # and a capture must not meet another one.
+            # One stream for every backward pass: autograd remembers the stream of a parameter's first use, and a
+            # capture must not meet another one.
             self._stream.wait_stream(torch.cuda.current_stream(self.device))
             with torch.cuda.stream(self._stream):
                 self._run_epochs(order)
@@ -115,7 +115,7 @@ class CapturedPPO(PPO):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load rsl_rl's state dicts; the captured graph is dropped because it holds the old optimiser's tensors."""
-        again = super().load(loaded_dict, load_cfg, strict)
+        has_iteration = super().load(loaded_dict, load_cfg, strict)
         self._lr.fill_(float(self.learning_rate))
         for group in self.optimizer.param_groups:
             group.update(lr=self._lr, capturable=self._stream is not None, fused=self._stream is not None or None)
@@ -123,7 +123,7 @@ class CapturedPPO(PPO):
             state["step"] = state["step"].to(self._lr.device)
         self._graph = None
         self._eager_steps = 0
-        return again
+        return has_iteration
 
     def _run_epochs(self, order: torch.Tensor) -> None:
         for _ in range(self.num_learning_epochs):
@@ -132,7 +132,7 @@ class CapturedPPO(PPO):
                 self._run_minibatch()
 
     def _run_minibatch(self) -> None:
-        # Processes of one training capture and replay in step, collectives included: each has taken as many steps.
+        # All processes of a training have taken the same number of steps, so they capture and replay together.
         if self._stream is None or self._eager_steps < _EAGER_STEPS:
             self._learn_minibatch()
             self._eager_steps += 1
@@ -140,14 +140,15 @@ class CapturedPPO(PPO):
         if self._graph is None:
             self.optimizer.zero_grad(set_to_none=True)
             self._graph = torch.cuda.CUDAGraph()
-            # NCCL's watchdog asks for its events from a thread of its own, which a capture of all threads forbids.
+            # NCCL's watchdog queries events from another thread, which a capture of all threads forbids.
             with recording(), torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
                 self._learn_minibatch()
         self._graph.replay()
 
     def _learn_minibatch(self) -> None:
         """One optimiser step on the transitions of ``_index``; reads and writes fixed memory only."""
-        stored, index = self.storage, self._index
+        stored = self.storage
+        index = self._index
         observations: Any = {key: value.flatten(0, 1)[index] for key, value in stored.observations.items()}
         old_mean_std = tuple(value.flatten(0, 1)[index] for value in stored.distribution_params or ())
         distribution: Any = self.actor.distribution
@@ -159,7 +160,8 @@ class CapturedPPO(PPO):
         ratio = torch.exp(log_prob - stored.actions_log_prob.flatten(0, 1)[index].squeeze(1))
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
-        values, returns = self.critic(observations), stored.returns.flatten(0, 1)[index]
+        values = self.critic(observations)
+        returns = stored.returns.flatten(0, 1)[index]
         old_values = stored.values.flatten(0, 1)[index]
         clipped = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
         value_loss = torch.max((values - returns).pow(2), (clipped - returns).pow(2)).mean()

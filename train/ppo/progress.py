@@ -1,4 +1,4 @@
-"""How a training goes: printed rows, TensorBoard's scalars, and the training record."""
+"""Progress of a training: printed rows, TensorBoard's scalars, and the training record."""
 
 import os
 import time
@@ -25,23 +25,24 @@ _HEADER = (
 
 
 class Progress:
-    """Collects iterations into rows; a row is printed, written to TensorBoard and kept for the record."""
+    """Collects iterations into rows, which are printed, written to TensorBoard and recorded."""
 
     def __init__(
-        self, run_dir: Path, learner: Learner, iterations: int, *, about: dict[str, Any], saved: dict[str, Any] | None
+        self, run_dir: Path, learner: Learner, iterations: int, *, origin: dict[str, Any], saved: dict[str, Any] | None
     ) -> None:
-        """Begin a piece of training of ``iterations`` in all; of several processes the first prints and writes.
+        """Begin a piece of training of ``iterations`` in all; only the first of several processes prints and writes.
 
-        ``about`` is the provenance of this piece, ``saved`` the :meth:`state` of those before.
+        ``origin`` is the provenance of this piece, ``saved`` the :meth:`state` of the pieces before.
         """
-        before = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
+        saved = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
         self._learner = learner
         self._iterations = iterations
         self._every = max(1, iterations // _ROWS)
-        self._about = about
-        self._curve: list[dict[str, Any]] = list(before["curve"])
-        self._pieces = [*before["pieces"], {**about, "from_iteration": learner.iteration}]
-        self._env_steps, self._wall_before_s = before["env_steps"], before["wall_s"]
+        self._origin = origin
+        self._curve: list[dict[str, Any]] = list(saved["curve"])
+        self._pieces = [*saved["pieces"], {**origin, "from_iteration": learner.iteration}]
+        self._env_steps = saved["env_steps"]
+        self._saved_wall_s = saved["wall_s"]
         self._began = time.monotonic()
         self._window: list[Iteration] = []
         self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
@@ -50,7 +51,7 @@ class Progress:
             print(_HEADER, flush=True)
 
     def add(self, step: Iteration) -> None:
-        """Count an iteration; finish a row where one is due."""
+        """Count an iteration; finish a row if one is due."""
         self._window.append(step)
         self._env_steps += self._learner.steps_per_iteration
         if self._learner.iteration % self._every == 0:
@@ -62,18 +63,18 @@ class Progress:
             self._finish_row()
 
     def state(self) -> dict[str, Any]:
-        """What the next piece needs, plain data."""
+        """Plain data for the next piece."""
         return {
             "env_steps": self._env_steps,
-            "wall_s": round(self._wall_before_s + time.monotonic() - self._began, 1),
+            "wall_s": round(self._saved_wall_s + time.monotonic() - self._began, 1),
             "pieces": self._pieces,
             "curve": self._curve,
         }
 
     def record(self) -> dict[str, Any]:
-        """The training record: provenance, totals, the pieces it was trained in, and the curve."""
+        """The training record: provenance, totals, the pieces of the training, and the curve."""
         return {
-            **self._about,
+            **self._origin,
             "robot": self._learner.env.task.robot.name,
             "iterations": self._learner.iteration,
             "num_envs": self._learner.env.num_envs,
@@ -81,11 +82,14 @@ class Progress:
         }
 
     def _finish_row(self) -> None:
-        learner, window, task = self._learner, self._window, self._learner.env.task
+        learner = self._learner
+        window = self._window
+        task = learner.env.task
         collection_s = sum(step.collection_s for step in window)
         learning_s = sum(step.learning_s for step in window)
         sums = task.read_statistics()
-        episodes, steps = sums["episodes"], max(sums["steps"], 1.0)
+        episodes = sums["episodes"]
+        steps = max(sums["steps"], 1.0)
         dt = task.robot.control_dt
         row = {
             "iteration": learner.iteration,
@@ -118,8 +122,10 @@ class Progress:
             groups |= {name: values for name, values in row.items() if isinstance(values, dict)}
             scalars = [
                 Summary.Value(tag=f"{group}/{name}", simple_value=value)
-                for group, values in groups.items() for name, value in values.items() if value is not None
-            ]  # fmt: skip
+                for group, values in groups.items()
+                for name, value in values.items()
+                if value is not None
+            ]
             _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
 
     def _print(self, row: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What trainings share: iterating until told to stop, checkpoints, and the controller at the end."""
+"""Training loop with checkpoints, signals to stop, and the controller and its record at the end."""
 
 import io
 import signal
@@ -33,12 +33,12 @@ from train.task.task import CommandTask
 from train.task.vec_env import CommandVecEnv
 
 DESCRIBED = "controller.toml"
-"""File of a training's directory that describes its controller, if it is described."""
+"""File of a training's directory with the description of its controller, if it has one."""
 CONFIG = "config.json"
 SAVE_EVERY_S = 60.0
 _SEED_STEP = 1_000_003  # between the tasks of two processes
 _FREE = ("iterations", "archive", "space")
-"""Settings that may differ where a training goes on: of archives and space hashes are compared."""
+"""Settings that may differ when a training goes on. Of archives and spaces, hashes are compared."""
 
 Kind = Literal["train", "finetune"]
 """What a training is, by the command that makes it."""
@@ -46,24 +46,24 @@ Kind = Literal["train", "finetune"]
 
 @contextmanager
 def stop_request() -> Iterator[Event]:
-    """An event that Ctrl-C or SIGTERM sets: the iteration at hand is finished and all is saved. A second one kills."""
+    """An event that Ctrl-C or SIGTERM sets, so that a training ends its iteration and saves. A second signal kills."""
     stop = Event()
 
-    def ask(kind: int, _frame: object) -> None:
+    def request(kind: int, _frame: object) -> None:
         stop.set()
         signal.signal(kind, signal.SIG_DFL)
 
-    before = {kind: signal.signal(kind, ask) for kind in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {kind: signal.signal(kind, request) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:
-        for kind, handler in before.items():
+        for kind, handler in handlers.items():
             signal.signal(kind, handler)
 
 
-def device_of(name: str | None) -> str:
-    """Warp device name of this process of a training, where ``name`` was asked for."""
-    device = Ranks.of_environment().device(resolve_device(name))
+def find_device(name: str | None) -> str:
+    """Warp device name of this process of a training; ``name`` is what the user asked for."""
+    device = Ranks.from_environment().device(resolve_device(name))
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(
             f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
@@ -72,16 +72,16 @@ def device_of(name: str | None) -> str:
     return device
 
 
-def settings_of(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
-    """What makes a training what it is, checked, as plain values."""
+def dump_settings(cfg: TrainCfg, robot: RobotCfg) -> dict[str, Any]:
+    """The settings that determine a training, checked, as plain values."""
     cfg.check(robot)
     return {**asdict(cfg), "robot_sha256": robot_digest(robot)}
 
 
 @contextmanager
 def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
-    """Makes the directory of a training, checks that it can be written to, and keeps other trainings out of it."""
-    if not Ranks.of_environment().is_first:
+    """Makes and locks the directory of a training, and checks that files can be written there."""
+    if not Ranks.from_environment().is_first:
         yield
         return
     if any((run_dir / name).exists() for name in (ARCHIVE_FILE, CHECKPOINT_FILE)):
@@ -90,7 +90,7 @@ def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
         if export.suffix != ".pt":
             raise ValueError(f"export must be a file named *.pt, got {export}")
         if export.exists() and not is_same_controller(str(export), str(run_dir / POLICY)):
-            raise ValueError(f"export {export} must not be there yet, got another training's: move it, or name another")
+            raise ValueError(f"export {export} exists and is of another training: move it, or name another")
         prepare_output(export)
     prepare_output(run_dir / CONFIG)  # last: what is refused leaves no directory
     with locked(run_dir, f"another training works in {run_dir}: let it end, or give another directory"):
@@ -98,7 +98,7 @@ def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
 
 
 def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
-    """The checkpoint in the directory of a training of a kind, of a robot by its name."""
+    """The checkpoint in a training's directory; refuses one of another kind or robot."""
     saved = read_checkpoint(run_dir / CHECKPOINT)
     if (saved["kind"], saved["robot"]) != (kind, robot):
         raise ValueError(
@@ -108,9 +108,10 @@ def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
     return saved
 
 
-def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
+def check_resumed(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
     """Refuses to go on with other settings than a training was begun with, or with fewer iterations than are done."""
-    before, now = ({name: part[name] for name in part if name not in _FREE} for part in (saved["settings"], settings))
+    before = {name: value for name, value in saved["settings"].items() if name not in _FREE}
+    now = {name: value for name, value in settings.items() if name not in _FREE}
     if different := differences(before, now):
         raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
     if saved["iter"] > settings["iterations"]:
@@ -120,17 +121,23 @@ def check_settings(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any
 
 
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
-    """Whether a training has done its iterations and written its controller wherever it is asked for."""
+    """Whether a training has done its iterations and written its controller, also to ``export``."""
     record = (run_dir / POLICY).with_suffix(".train.json")
     is_exported = export is None or is_same_controller(str(export), str(run_dir / POLICY))
-    if export is not None:  # what is written last
-        last = ".toml" if (run_dir / DESCRIBED).exists() else ".train.json"
-        is_exported = is_exported and export.with_suffix(last).exists()
+    if export is not None:
+        last_written = ".toml" if (run_dir / DESCRIBED).exists() else ".train.json"
+        is_exported = is_exported and export.with_suffix(last_written).exists()
     return is_exported and record.exists() and read_json(record).get("iterations") == iterations
 
 
 class Training:
-    """A training at work: the task, what learns on it, and how far it is."""
+    """A training: its task, learner and progress.
+
+    Attributes:
+        task: Robots on their terrains.
+        learner: Actor, critic and optimiser.
+        progress: Rows printed and recorded.
+    """
 
     kind: Kind = "train"
 
@@ -149,15 +156,18 @@ class Training:
     ) -> None:
         """Begin, or go on from a checkpoint (:func:`read_saved`); without ``tiles`` on those of the curriculum.
 
-        ``settings`` are what checkpoint and record say of it (:func:`settings_of`), ``facts`` what they say beside,
-        ``controller`` is as of :class:`CommandVecEnv`.
+        Checkpoint and record have ``settings`` (:func:`dump_settings`) under one key and each of ``facts`` under its
+        own. ``controller`` is as of :class:`CommandVecEnv`.
         """
-        self._cfg, self._run_dir, self._settings, self._facts = cfg, run_dir, settings, facts or {}
-        ranks = Ranks.of_environment()
+        self._cfg = cfg
+        self._run_dir = run_dir
+        self._settings = settings
+        self._facts = facts or {}
+        ranks = Ranks.from_environment()
         self.task = CommandTask(
             robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
         )
-        # On terrains that are given every episode is whole: who crossed which is counted.
+        # On given terrains every episode is whole, because the crossings of each terrain are counted.
         env = CommandVecEnv(self.task, controller)
         self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=tiles is None)
         if saved is not None:
@@ -166,12 +176,12 @@ class Training:
             run_dir,
             self.learner,
             cfg.iterations,
-            about={**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size},
+            origin={**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size},
             saved=saved and saved["progress"],
         )
 
     def before_iteration(self) -> None:
-        """What a kind of training does before each iteration: nothing."""
+        """A hook for kinds of training; does nothing here."""
 
     @property
     def critic_iterations(self) -> int:
@@ -180,11 +190,11 @@ class Training:
 
     @property
     def averaged_from(self) -> int:
-        """The iteration after which actors count into the controller; while the critic learns alone, none does."""
+        """The iteration after which actors count into the controller; none counts while the critic learns alone."""
         return max(round((1.0 - self._cfg.ppo.average) * self._cfg.iterations), self.critic_iterations)
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
+        """Content of a checkpoint."""
         controller = self.learner.env.controller
         return {
             **self.learner.state(),
@@ -198,7 +208,7 @@ class Training:
     def run(self, export: Path | None) -> Path:
         """Iterates until all is done or a stop is requested, and saves; returns the controller's file.
 
-        ``export`` is another place for the controller.
+        ``export`` is a further file for the controller.
         """
         if self.learner.ranks.is_first:
             write_atomically(self._run_dir / CONFIG, to_json(self._settings))
@@ -213,13 +223,13 @@ class Training:
     def _iterate(self, stop: Event) -> None:
         learner = self.learner
         last_save = time.monotonic()
-        if learner.iteration - learner.averaged < self.averaged_from:  # it was shorter: its last actors are others
+        if learner.iteration - learner.averaged < self.averaged_from:  # a shorter training averaged other actors
             learner.count_into_mean(False)
 
         def wants_more() -> bool:
             return learner.iteration < self._cfg.iterations and not stop.is_set()
 
-        while learner.ranks.all_want(wants_more(), learner.env.device):
+        while learner.ranks.all_true(wants_more(), learner.env.device):
             self.before_iteration()
             step = learner.iterate()
             learner.count_into_mean(learner.iteration > self.averaged_from)
@@ -240,28 +250,28 @@ class Training:
         if not learner.ranks.is_first:
             return
         record = {**self.progress.record(), "averaged": learner.averaged, **self._facts}
-        for path in (self._run_dir / POLICY, *([export] if export else [])):
+        for path in filter(None, (self._run_dir / POLICY, export)):
             write_controller(path, learner, record)
-            written = path
+            file = path
             if learner.env.controller is not None:
-                written = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
-                write_atomically(written, format_controller(replace(learner.env.controller, policy=path.name)).encode())
-            print(f"Controller and training record written to {written} and {path.with_suffix('.train.json').name}")
+                file = path.with_suffix(".toml") if path == export else path.with_name(DESCRIBED)
+                write_atomically(file, format_controller(replace(learner.env.controller, policy=path.name)).encode())
+            print(f"Controller and training record written to {file} and {path.with_suffix('.train.json').name}")
 
 
 def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
 
-    Layers are in half precision, which takes half of the room and is finer than what training leaves to chance. All
-    who read the file compute in single precision, so that a controller is its file, wherever it is measured.
+    Layers are in half precision, which takes half of the space; its error is small beside the differences between
+    trainings. Readers compute in single precision, so that a controller behaves the same wherever it is measured.
     """
     buffer = io.BytesIO()
-    marks = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # known of a copy without its record too
+    trained_on = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # for a copy without its record
     actor = learner.mean_actor_state()
     for key, half in {key: value.half() for key, value in actor.items() if value.ndim > 1}.items():
-        if half.isfinite().all():  # else it has numbers too large for it
+        if half.isfinite().all():  # not if a number is too large for half precision
             actor[key] = half
     activation = "elu" if learner.env.controller is None else learner.env.controller.activation
-    torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **marks}, buffer)
+    torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **trained_on}, buffer)
     write_atomically(path, buffer.getvalue())
     write_atomically(path.with_suffix(".train.json"), to_json(record))

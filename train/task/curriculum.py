@@ -1,4 +1,4 @@
-"""Which terrain an environment is trained on: a grid of tiles, harder level by level, one type a column."""
+"""The terrain of each environment: a grid of tiles, harder level by level, one type a column."""
 
 from dataclasses import dataclass
 
@@ -29,8 +29,8 @@ class Tiles:
         """Levels of the grid."""
         return len(self.heights) // self.num_columns
 
-    def columns_of(self, num_envs: int) -> np.ndarray:
-        """Column of each environment, int32 of shape (num_envs,): equal runs, so that every type gets its share."""
+    def assign_columns(self, num_envs: int) -> np.ndarray:
+        """Column of each environment, int32 of shape (num_envs,): in order, equally many each."""
         return (np.arange(num_envs) * self.num_columns // num_envs).astype(np.int32)
 
 

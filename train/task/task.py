@@ -59,13 +59,17 @@ class CommandTask:
     ) -> None:
         """Build terrain, robots and graph; every episode begins. Without ``tiles``, those of the curriculum."""
         prepare_torch(device)
-        self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
+        self.robot = robot
+        self.cfg = cfg
+        self.num_envs = num_envs
+        self.device = device
         tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
         first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
         self.tiles = tiles or make_tiles(cfg.curriculum, int(tile_seed))
-        columns = self.tiles.columns_of(num_envs)
-        most, rng = cfg.curriculum.max_first_level, np.random.default_rng(level_seed)
-        levels = rng.integers(most, size=num_envs, endpoint=True, dtype=np.int32) % self.tiles.num_levels
+        columns = self.tiles.assign_columns(num_envs)
+        max_level = cfg.curriculum.max_first_level
+        levels = np.random.default_rng(level_seed).integers(max_level, size=num_envs, endpoint=True, dtype=np.int32)
+        levels %= self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
         self._task = _make_task(cfg, robot)
         self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
@@ -95,8 +99,8 @@ class CommandTask:
         self._statistics = torch.from_dlpack(training.statistics)
         self._counted = torch.zeros_like(self._statistics)
         self._reward_terms = torch.from_dlpack(rewards.terms)
-        # Capturing makes a step, which is undone after. At its file's pose a robot may be deep in the ground, with more
-        # contacts than there is room for: it is put at a start before.
+        # Capturing makes a step, which is undone after. At the pose of its file a robot may be deep in the ground, with
+        # more contacts than fit: so it is put at a start before.
         self.restart_all(torch.from_numpy(levels))
         self._graph = self.sim.capture(self._control_step)
         self.counter.fill_(first_count)
@@ -136,7 +140,7 @@ class CommandTask:
         self.sim.bank.set_heights(tiles.heights, ground=tiles.ground)
         self.tiles = tiles
         self._restart_on(torch.zeros_like(self.levels))
-        torch.neg(self._statistics, out=self._counted)  # what read_statistics has yet to tell is of the terrains before
+        torch.neg(self._statistics, out=self._counted)  # read_statistics adds steps on the terrains before
 
     def _restart_on(self, levels: torch.Tensor) -> None:
         self.levels.copy_(levels)
@@ -145,7 +149,7 @@ class CommandTask:
         self._begin_episodes()
 
     def counts(self) -> dict[str, np.ndarray]:
-        """Since the terrains were last exchanged, of each environment: :data:`STATISTICS`, shape (num_envs,) each.
+        """:data:`STATISTICS` of each environment since the last exchange of terrains, shape (num_envs,) each.
 
         Synchronises with the device.
         """
@@ -169,11 +173,13 @@ class CommandTask:
         return {str(name): float(levels[types == name].mean()) for name in dict.fromkeys(types)}
 
     def _control_step(self) -> None:
-        sim, episodes, training = self.sim, self._episodes, self._training
+        sim = self.sim
+        episodes = self._episodes
+        training = self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
-            # A crossing ends at the first touch of the base, however short; what is commanded is judged once a step.
+            # A crossing ends at the first touch of the base, however short; other outcomes are checked once a step.
             if self.cfg.crosses and step < self.robot.decimation:
                 sim.read_geom_forces()
                 note_base_forces(sim.geom_force, sim.geom_role, episodes)
@@ -191,7 +197,10 @@ class CommandTask:
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
-        sim, episodes, training, terrain = self.sim, self._episodes, self._training, self.sim.bank.terrain
+        sim = self.sim
+        episodes = self._episodes
+        training = self._training
+        terrain = sim.bank.terrain
         seed_restarts(training, episodes)
         restart_episodes(
             training.ended, sim.terrain_of_env, terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,

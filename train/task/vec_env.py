@@ -15,15 +15,16 @@ from train.task.task import CommandTask
 class CommandVecEnv(VecEnv):
     """rsl_rl's view of a :class:`CommandTask`: one observation group, ``policy``, for actor and critic.
 
-    The actor of a description has a group of its own, ``actor``, and acts through it.
+    A described actor has another group, ``actor``, and acts through its description.
 
-    Every tensor handed out is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in
-    the next step.
+    Every returned tensor is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in the
+    next step.
     """
 
     def __init__(self, task: CommandTask, controller: ControllerCfg | None = None) -> None:
-        """Wrap a task; ``controller`` describes an actor that sees and does other things than the task's."""
-        self.task, self.controller = task, controller
+        """Wrap a task; ``controller`` describes an actor with other observations and actions than the task's."""
+        self.task = task
+        self.controller = controller
         self._described = None if controller is None else Described(controller, task.robot, "the controller")
         self.num_envs = task.num_envs
         self.num_actions = task.robot.num_joints if self._described is None else self._described.num_actions
@@ -45,7 +46,7 @@ class CommandVecEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """The present observations, ``policy``: shape (num_envs, observation_size).
 
-        To be called where all episodes begin; :meth:`step` gives those after it, each once.
+        Call it when all episodes begin; :meth:`step` returns those after each step.
         """
         groups = {"policy": self.task.observation.clone()}
         if self._described is not None:
@@ -56,11 +57,11 @@ class CommandVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Make one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
 
-        What follows are observations after it (of the new episode where one ended), rewards (num_envs,), dones
-        (num_envs,) and ``{"time_outs": (num_envs,)}``, the dones that no failure caused.
+        Returns observations after it (of the new episode if one ended), rewards (num_envs,), dones (num_envs,) and
+        ``{"time_outs": (num_envs,)}``, the dones that no failure caused.
         """
         self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end
-        # A robot at its goal or out of the world did not fail: as with the clock, its value goes on.
+        # A robot at its goal or out of the world did not fail, so its value goes on as after a time-out.
         cut = (end == int(Outcome.TIME_OUT)) | (end == int(Outcome.GOAL)) | (end == int(Outcome.OUT))
         return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}

@@ -119,10 +119,10 @@ def test_two_processes_train_one_controller_and_go_on(tmp_path):
 
 
 def test_each_process_takes_its_own_gpu(monkeypatch):
-    assert Ranks.of_environment() == Ranks()
+    assert Ranks.from_environment() == Ranks()
     for name, value in {"RANK": "5", "LOCAL_RANK": "1", "WORLD_SIZE": "8"}.items():
         monkeypatch.setenv(name, value)
-    ranks = Ranks.of_environment()
+    ranks = Ranks.from_environment()
     assert not ranks.is_first
     assert (ranks.device("cuda:0"), ranks.device("cuda"), ranks.device("cpu")) == ("cuda:1", "cuda:1", "cpu")
     with pytest.raises(ValueError, match="cuda:3"):

@@ -30,10 +30,10 @@ def test_noise_grows_with_the_level(tiles):
 
 
 def test_every_column_gets_its_share(tiles):
-    counts = np.bincount(tiles.columns_of(700))
+    counts = np.bincount(tiles.assign_columns(700))
     assert counts.tolist() == [100] * 7
-    assert set(np.bincount(tiles.columns_of(703))) == {100, 101}
-    assert tiles.columns_of(3).max() < 7
+    assert set(np.bincount(tiles.assign_columns(703))) == {100, 101}
+    assert tiles.assign_columns(3).max() < 7
 
 
 def test_columns_of_noise_alone_and_none_at_all():

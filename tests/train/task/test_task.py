@@ -84,7 +84,7 @@ def test_robots_stand_on_the_tile_of_their_level(shared_task):
     task = shared_task
     levels = torch.arange(task.num_envs, device=task.device)
     task.restart_all(levels)
-    columns = task.tiles.columns_of(task.num_envs)
+    columns = task.tiles.assign_columns(task.num_envs)
     np.testing.assert_array_equal(task.sim.terrain_of_env.numpy(), np.arange(task.num_envs) * 3 + columns)
     assert task.level_by_type().keys() == dict.fromkeys(task.tiles.type_of_column).keys()
     # Default height over the highest ground beneath: the scan sees nothing above the base's height less .5 m.
