@@ -93,7 +93,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     def execute(self) -> None:
         """Searches, and judges what was found."""
         from qd.check import ensure_ready
-        from qd.faults.judge import find_search, judge
+        from qd.faults.judge import judge
+        from qd.faults.searches import find_search
         from qd.search.directory import free_path
         from qd.search.loop import say_what_stops_the_robot, search
         from qd.search.settings import preset

@@ -1,7 +1,7 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
 import socket
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,8 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from qd.search.archive import FRESH, Archive, FaultCounts, FreshValues, write_archive
+from qd.search.archive import Archive, FreshValues, no_outcomes, write_archive
+from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json
 from sim.robots.identity import robot_identity
 from sim.robots.shipped import ROBOTS
@@ -56,6 +57,7 @@ def small_archive(num_elites: int = 3) -> Archive:
         invalid_episodes=np.zeros(num_elites, int),
         episodes=np.full(num_elites, 4),
         iteration=np.arange(num_elites) + 1,
+        **no_outcomes(num_elites),
     )
 
 
@@ -74,7 +76,7 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
 
 def fresh_values(archive: Archive) -> FreshValues:
     """Forty fresh episodes that say half the fitness, and otherwise what the elites had."""
-    same = {name: getattr(archive, name) for name in FRESH if hasattr(archive, name)}
+    same = {field.name: getattr(archive, field.name) for field in fields(Evaluation)}
     changed = {"fitness": archive.fitness / 2, "episodes": np.full(len(archive), 40)}
     return FreshValues(**same | changed, reproduced=np.arange(len(archive)) % 2 == 0)
 
@@ -88,7 +90,9 @@ def judged_archive() -> Archive:
     fresh = replace(fresh_values(archive), goal_rate=np.array([0.0, 0.475, 0.2, 0.1, 0.5]))
     under, half = [9, 6, 5, 0], [10, 10, 0, 0]
     never, much = [0, 0, 0, 0], [20, 0, 0, 0]
-    faults = FaultCounts(
+    return replace(
+        archive,
+        fresh=fresh,
         resolved_outcomes=np.array([under, under, half, half, under]),
         certifiers=("C-G", "S"),
         certifier_sha256=("a" * 64, "b" * 64),
@@ -98,7 +102,6 @@ def judged_archive() -> Archive:
             [[never, half], [[14, 0, 0, 6], never], [half, never], [never, never], [much, much]]
         ),
     )
-    return replace(archive, fresh=fresh, faults=faults)
 
 
 def write_run(folder: Path, archive: Archive, settings: dict | None = None) -> Path:

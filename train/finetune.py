@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
 from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elites
-from qd.faults.judge import CERTIFIERS_FOLDER
 from qd.faults.numbers import SPECIALIST as CERTIFIER
+from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.directory import RunDirectory, directory_of, find_run
 from sim.controllers.loaders import load_actor
 from sim.controllers.onnx import export_onnx

@@ -26,10 +26,10 @@ from qd.evaluate.pack import (
     write_terrains,
 )
 from qd.evaluate.show import show_pack
-from qd.faults.families import families_of, rank, verdict_of
-from qd.faults.judge import Search, certifiers_of
+from qd.faults.families import VERDICTS, find_families, find_verdicts, rank
 from qd.faults.minimise.results import read_minimal
-from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_of
+from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers
+from qd.faults.searches import Search, find_certifiers
 from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
@@ -38,7 +38,6 @@ from sim.controllers.spec import controller_identity, describe_controllers, is_s
 from sim.files.atomic import prepare_output
 from sim.files.command import publish
 from sim.terrains.bank import heights_of
-from sim.terrains.spaces.registry import get_space
 
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
@@ -63,12 +62,12 @@ def make_pack(
     """
     archive = _read_judged(search)
     robot = search.robot
-    controllers = {**(controllers or {"base": str(robot.policy_file), **certifiers_of(search)})}
+    controllers = {**(controllers or {"base": str(robot.policy_file), **find_certifiers(search)})}
     if not any(is_same_controller(search.policy, policy) for policy in controllers.values()):
         controllers = {"searched": search.policy, **controllers}
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
-    entries, genes, not_passable = find_candidates(archive, search.run)
+    entries, genes, not_passable = find_candidates(archive, search)
     trained_on = set[str]().union(*(read_trained_on(file) for name, file in controllers.items() if name != SPECIALIST))
     hashes = hash_elites(archive.genes)
     untrained = [index for index, entry in enumerate(entries) if hashes[entry["elite"]] not in trained_on]
@@ -96,7 +95,7 @@ def make_pack(
             "episodes": episodes,
             "searched": next(name for name, policy in controllers.items() if is_same_controller(policy, search.policy)),
             "iterations": archive.iterations,
-            "certifiers": list(archive.counts.certifiers),
+            "certifiers": list(archive.certifiers),
             "candidates": len(untrained),
             "not_known_to_be_passable": not_passable,
             "controllers": describe_controllers(controllers, robot),
@@ -116,8 +115,7 @@ def _read_judged(search: Search) -> Archive:
             "their own"
         )
     archive = search.read_archive()
-    faults = archive.counts
-    crossed = faults.resolved_outcomes.any(axis=1) & faults.certifier_outcomes.any(axis=(1, 2))
+    crossed = archive.resolved_outcomes.any(axis=1) & archive.certifier_outcomes.any(axis=(1, 2))
     if archive.fresh is None or (archive.failing & ~crossed).any():
         raise ValueError(
             f"{search.run} must have its failing elites crossed with contact resolved and by other controllers, got "
@@ -126,18 +124,19 @@ def _read_judged(search: Search) -> Archive:
     return archive
 
 
-def find_candidates(archive: Archive, run: Path) -> tuple[list[Entry], list[NDArray[np.float32]], int]:
+def find_candidates(archive: Archive, search: Search) -> tuple[list[Entry], list[NDArray[np.float32]], int]:
     """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
 
     Returns an entry and the genes of each, and how many more terrains fail that nobody is known to cross.
     """
     assert archive.fresh is not None
-    space = get_space(archive.space, archive.space_sha256)
-    minima = read_minimal(run, archive)
+    space = search.space
+    minima = read_minimal(search.run, archive)
     rate = archive.fresh.goal_rate
+    verdicts = find_verdicts(archive)
     near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
-    families = dict(zip(near.tolist(), families_of(archive.genes[near], space).tolist(), strict=True))
-    causes = rank(archive, space, minima).causes if len(near) else ()
+    families = dict(zip(near.tolist(), find_families(archive.genes[near], space).tolist(), strict=True))
+    causes = rank(archive, space, minima, half_width=search.robot.footprint[1]).causes if len(near) else ()
     entries: list[Entry] = []
     genes: list[NDArray[np.float32]] = []
     not_passable = 0
@@ -159,8 +158,8 @@ def find_candidates(archive: Archive, run: Path) -> tuple[list[Entry], list[NDAr
 
     for number in near.tolist():
         if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
-            searched = rate_of(fresh_counts(archive, number))
-            verdict = verdict_of(archive, number)
+            searched = rate_numbers(fresh_counts(archive, number))
+            verdict = VERDICTS[verdicts[number]]
             add(number, None, archive.genes[number], verdict, searched=searched, **judgement(archive, number))
         else:
             not_passable += 1

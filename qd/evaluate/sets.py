@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.evaluate.marks import hash_elites
-from qd.faults.families import families_of, rms_distances
+from qd.faults.families import find_families, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_archive_of, search_seed
 from sim.robots.robot import RobotCfg
@@ -72,7 +72,7 @@ class TerrainSet:
     space: str = SUPER_GAUSSIAN.name
     """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
     families: NDArray[np.int64] | None = None
-    """Number of each elite's family (:func:`qd.faults.families.families_of`), shape (T,); None of independent
+    """Number of each elite's family (:func:`qd.faults.families.find_families`), shape (T,); None of independent
     terrains."""
     elites: Archive | None = None
     """The elites as an archive; None of other terrains."""
@@ -83,7 +83,7 @@ class TerrainSet:
     @property
     def certified(self) -> NDArray[np.bool_] | None:
         """Whether another controller crosses each elite that the searched one fails, shape (T,); None if unknown."""
-        return self.elites.certified if self.elites is not None and self.elites.counts.certifiers else None
+        return self.elites.certified if self.elites is not None and self.elites.certifiers else None
 
     def rows(self, indices: NDArray[np.int64]) -> "TerrainSet":
         """The terrains at some indices."""
@@ -212,7 +212,7 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
     """A set of elites with their families in the whole archive, if it was judged: kin of kin may not be in the set."""
     elites = archive.rows(rows)
     space = read_space(archive)
-    families = families_of(elites.genes, space) if elites.family is None else elites.family
+    families = find_families(elites.genes, space) if elites.family is None else elites.family
     return TerrainSet(
         terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families, elites=elites
     )

@@ -142,11 +142,11 @@ def _count_certified(
     for name, terrains in sets.items():
         if terrains.certified is None or terrains.elites is None:
             continue
-        counts = terrains.elites.counts
-        certificates = counts.certificates() & terrains.elites.failing[:, None]
-        certifiers = dict(zip(counts.certifiers, certificates.sum(axis=0).tolist(), strict=True))
-        roles: dict[str | None, str] = {terrains.elites.policy_sha256: "searched"}
-        for sha256, certifier in zip(counts.certifier_sha256, counts.certifiers, strict=True):
+        elites = terrains.elites
+        certificates = elites.certificates & elites.failing[:, None]
+        certifiers = dict(zip(elites.certifiers, certificates.sum(axis=0).tolist(), strict=True))
+        roles: dict[str | None, str] = {elites.policy_sha256: "searched"}
+        for sha256, certifier in zip(elites.certifier_sha256, elites.certifiers, strict=True):
             if certifiers[certifier]:
                 roles[sha256] = "certifier"
         hashes = {controller: about["sha256"] for controller, about in controllers.items()}

@@ -1,6 +1,6 @@
 """The shape of a part of a terrain, as a robot that walks straight to the goal meets it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -26,16 +26,26 @@ SHORT = 1.0
 NARROW = 0.5
 """A part that falls to half of its height nearer than this beside the way ends there [m]."""
 
-HALF_WIDTH = 0.35
-"""Half the width of a stance, where the robot is not known [m]; the shipped robots have 0.4 m and 0.3 m."""
-SLIPPERY, SOFT = "slippery ground", "soft ground"
+SLIPPERY = "slippery ground"
+SOFT = "soft ground"
+OFF_THE_WAY = "beside the way"
 UNCLEAR = "unclear"
 """The cause where no part of the terrain lies where robots end."""
+_STRAIGHT = {"rise": "high", "drop": "deep", "ridge": "high", "ditch": "deep"}
+SHAPES: dict[str, str | None] = {
+    **_STRAIGHT,
+    **{f"oblique {kind}": size for kind, size in _STRAIGHT.items()},
+    "ridge end": "high", "ditch end": "deep", "knob": "high", "hole": "deep",
+    "gentle hill": "high", "gentle hollow": "deep", "side slope": None, OFF_THE_WAY: None,
+}  # fmt: skip
+"""Causes that are shapes, by what their height is called; None where its sign says whether it is high or deep."""
 
-_BEHIND, _AHEAD, _BESIDE = 1.25, 0.75, 0.4  # of the place where robots end, what may have stopped them there [m]
-_BESIDE_THE_WAY = "beside the way"
+_BEHIND = 1.25  # how far before the place where robots end something may have stopped them [m]
+_AHEAD = 0.75
+_BESIDE = 0.4
 _COARSE = 2  # nodes; parts are compared at 0.1 m
 _NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
+_CENTRE = round(CrossingCfg.start[1] / SPACING)  # the row of the straight way
 _FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is met first counts
 
 
@@ -44,23 +54,23 @@ class Shape:
     """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
     kind: str
-    """In a word or two: rise, drop, ridge, ditch and so on; docs/faults.md has all."""
+    """One of :func:`list_kinds`."""
     height_m: float
     """Height under the robot where it is largest, negative of a hollow [m]."""
     slope_deg: float
     """Steepest slope under the robot [degrees]."""
     along_deg: float
-    """Its part along the way, negative where the ground falls [degrees]."""
+    """Slope along the way, negative where the ground falls [degrees]."""
     across_deg: float
-    """Its part across the way [degrees]."""
+    """Slope across the way [degrees]."""
     oblique_deg: float
     """Angle between the way and the direction in which the ground rises or falls most, 0 to 90 [degrees]."""
     length_m: float
     """Length over which it has at least half of that height, along the way through that place [m]."""
     left_m: float
-    """How far it has so to the left of the way, within 1 m along the way of that place [m]."""
+    """How far left of the way it has that height, within 1 m along the way of that place [m]."""
     right_m: float
-    """How far to the right [m]; negative where it lies to the left alone."""
+    """How far right of the way [m]; negative where it lies to the left alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,9 +82,9 @@ class Effects:
     slippery: NDArray[np.bool_]
     """Patches that it makes slippery, shape (num_parts, rows, cols) of its map."""
     soft: NDArray[np.bool_]
-    """Patches that it makes soft, likewise."""
+    """Patches that it makes soft, of the same shape."""
     conditions: tuple[str, ...]
-    """The kind of condition that each of the parts sets; empty of one that sets none."""
+    """The kind of condition that each part sets; empty where it sets none."""
 
     @property
     def patches(self) -> NDArray[np.bool_]:
@@ -82,36 +92,55 @@ class Effects:
         return self.slippery | self.soft
 
     def changes(self, least: float) -> NDArray[np.bool_]:
-        """Which parts set a condition, or change the ground, or heights by more than ``least`` [m]; (num_parts,)."""
+        """Whether a part sets a condition, or changes the ground, or heights by over ``least`` [m]; (num_parts,)."""
         sets = np.array([kind != "" for kind in self.conditions], bool)
         return sets | (np.abs(self.heights).max(axis=(1, 2)) > least) | (self.patches.sum(axis=(1, 2)) > 0)
 
     def way(self, part: int, half_width: float) -> tuple[float, bool]:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
-        patches, (x, y) = self.patches[part], CrossingCfg.start
+        patches = self.patches[part]
+        x, y = CrossingCfg.start
         first_row, last_row = patches_at((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
         first, last = patches_at((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
         changed = patches[first_row : last_row + 1, first : last + 1].any()
-        return on_the_way(self.heights[part], half_width), bool(changed)
+        return largest_height(self.heights[part], half_width), bool(changed)
 
     def shape(self, part: int, half_width: float) -> Shape:
-        """The shape of a part; of a condition, or one that changes the ground and no height on the way, its kind."""
-        condition = CONDITIONS[self.conditions[part]].cause if self.conditions[part] else None
-        on_ground = self.patches[part].any() and on_the_way(self.heights[part], half_width) < LEAST_HEIGHT
-        if condition is None and not on_ground:
-            return shape_of(self.heights[part], half_width)
-        kind = condition or (SLIPPERY if self.slippery[part].any() else SOFT)
+        """The shape of a part. A condition has only a kind, and so has a part that changes the ground alone."""
+        name = self.conditions[part]
+        kind = CONDITIONS[name].cause if name else None
+        if kind is None and self.patches[part].any() and self.way(part, half_width)[0] < LEAST_HEIGHT:
+            kind = SLIPPERY if self.slippery[part].any() else SOFT
+        if kind is None:
+            return measure_shape(self.heights[part], half_width)
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
 
 
-def commonest_words(cause: str) -> str:
+def list_kinds() -> tuple[str, ...]:
+    """What the part of a terrain that stops the robot can be; docs/faults.md has the limits of the shapes."""
+    return (*SHAPES, SLIPPERY, SOFT, *(condition.cause for condition in CONDITIONS.values()))
+
+
+def describe_cause(cause: Mapping[str, Any] | None) -> str:
+    """A cause with the values of its :class:`Shape`: ``ridge, 0.25 m high, 53 degrees steep``."""
+    if cause is None:
+        return UNCLEAR
+    kind, height = cause["kind"], cause.get("height_m")
+    if not height:
+        return kind
+    size = SHAPES[kind] or ("high" if height > 0.0 else "deep")
+    steep = f", {cause['slope_deg']:.0f} degrees steep" if "slope_deg" in cause else ""
+    return f"{kind}, {abs(height):.2f} m {size}{steep}"
+
+
+def describe_commonest(kind: str) -> str:
     """That most terrains stop the robot by a cause: ``ridges are the commonest cause``."""
-    if cause in (SLIPPERY, SOFT, *(condition.cause for condition in CONDITIONS.values())):
-        return f"{cause} is the commonest cause"
-    return f"{cause}{'es' if cause.endswith('ch') else 's'} are the commonest cause"
+    if kind not in SHAPES or kind == OFF_THE_WAY:
+        return f"{kind} is the commonest cause"
+    return f"{kind}{'es' if kind.endswith('ch') else 's'} are the commonest cause"
 
 
-def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
+def find_effects(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
     """What some parts of a terrain, of genes of shape (num_genes,), do, each beside all others."""
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
     heights, ground = terrains_of(np.concatenate(rows), space)
@@ -120,11 +149,11 @@ def effects_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainS
         heights=heights[0] - heights[1:],
         slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],
         soft=nothing if ground is None else ground.time_constant_s[0] != ground.time_constant_s[1:],
-        conditions=_conditions_of(genes, parts, space),
+        conditions=_find_conditions(genes, parts, space),
     )
 
 
-def _conditions_of(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> tuple[str, ...]:
+def _find_conditions(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> tuple[str, ...]:
     """The kind of condition that each part of a terrain sets, if it does."""
     first = len(space.parts(genes)) - len(space.conditions)
     (row,) = space.condition_rows(genes[None])
@@ -133,23 +162,23 @@ def _conditions_of(genes: NDArray[np.float32], parts: Sequence[int], space: Terr
     return tuple(names[part - first] if part >= first else "" for part in parts)
 
 
-def causes_at(
-    genes: NDArray[np.float32], ends: NDArray[np.floating], space: TerrainSpace, half_width: float = HALF_WIDTH
+def find_causes(
+    genes: NDArray[np.float32], ends: NDArray[np.floating], space: TerrainSpace, half_width: float
 ) -> list[str]:
-    """What stops robots that end at a place of each terrain, in a word or two as :attr:`Shape.kind`.
+    """What stops robots that end at a place of each terrain: one of :func:`list_kinds`, or :data:`UNCLEAR`.
 
     It is the part which, alone on flat ground, has the largest difference of heights near that place. Where none has
-    :data:`LEAST_HEIGHT` it is slippery or soft ground, or :data:`UNCLEAR`. How near was chosen on half of the elites in
-    results/ whose minimal terrain is known. Of the other half it names the kind of the minimal terrain's cause in six
+    :data:`LEAST_HEIGHT` it is slippery or soft ground, or unclear. How near was chosen on half of the elites in
+    results/ whose minimal terrain is known. On the other half it names the kind of the minimal terrain's cause in six
     of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
 
     Genes have shape (N, num_genes). ``ends`` are world-local x and y of the places [m], shape (N, 2), NaN where they
     are not known; ``half_width`` is that of the robot's stance [m].
     """
-    return [_cause_at(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
+    return [_find_cause(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
 
 
-def _cause_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace, half_width: float) -> str:
+def _find_cause(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace, half_width: float) -> str:
     if not np.isfinite(end).all():
         return UNCLEAR
     raised = space
@@ -159,29 +188,31 @@ def _cause_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: Terr
     parts = range(len(raised.parts(row[0])))
     alone = [raised.without(row, [other for other in parts if other != part]) for part in parts] or [row]
     every = _COARSE if space.any_spacing else 1
-    fields = heights_of(np.concatenate(alone), raised, every=every)
-    heights = [np.ptp(field[_around(end, every * SPACING, field.shape)]) for field in fields]
-    part = int(np.argmax(heights))
-    if heights[part] >= LEAST_HEIGHT:
-        field = fields[part] if every == 1 else heights_of(alone[part], raised)[0]
-        at_end = np.roll(field, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
-        kinds = (shape_of(heights, half_width).kind for heights in (field, at_end))  # robots may leave the straight way
-        return next((kind for kind in kinds if kind != _BESIDE_THE_WAY), UNCLEAR)
-    return _ground_at(genes, end, space) if space.ground else UNCLEAR
+    maps = heights_of(np.concatenate(alone), raised, every=every)
+    differences = [np.ptp(heights[_around(end, every * SPACING, heights.shape)]) for heights in maps]
+    part = int(np.argmax(differences))
+    if differences[part] < LEAST_HEIGHT:
+        return _find_ground(genes, end, space) if space.ground else UNCLEAR
+    heights = maps[part] if every == 1 else heights_of(alone[part], raised)[0]
+    at_end = np.roll(heights, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
+    kinds = (measure_shape(field, half_width).kind for field in (heights, at_end))  # robots may leave the straight way
+    return next((kind for kind in kinds if kind != OFF_THE_WAY), UNCLEAR)
 
 
 def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
     """Rows and columns of the nodes near a place, or nearest to it at the edge."""
-    (x, y), (last_row, last_column) = end.tolist(), np.array(shape) - 1
+    x, y = end.tolist()
+    last_row, last_column = np.array(shape) - 1
     rows = np.clip(np.rint(np.array([y - _BESIDE, y + _BESIDE]) / spacing), 0, last_row).astype(int)
     columns = np.clip(np.rint(np.array([x - _BEHIND, x + _AHEAD]) / spacing), 0, last_column).astype(int)
     return slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
 
 
-def _ground_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
+def _find_ground(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
     """What the ground at a place is like if it is unlike other ground."""
-    ground, (x, y) = terrains_of(genes[None], space)[1], end.tolist()
+    _, ground = terrains_of(genes[None], space)
     assert ground is not None
+    x, y = end.tolist()
     row = patches_at(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
     column = patches_at(x, SPACING * (NUM_COLS - 1), PATCHES[1])
     if ground.friction[0, row, column] < 1.0:
@@ -189,7 +220,7 @@ def _ground_at(genes: NDArray[np.float32], end: NDArray[np.floating], space: Ter
     return SOFT if ground.time_constant_s[0, row, column] != FIRM else UNCLEAR
 
 
-def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
+def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
     """The shape of a part, which adds heights [m] of shape (nrow, ncol), under a robot on the straight way.
 
     ``half_width`` is that of the robot's stance [m].
@@ -202,34 +233,35 @@ def shape_of(field: NDArray[np.float32], half_width: float) -> Shape:
     steepness = np.hypot(along, across)
     met = np.argwhere(steepness >= _FIRST_MET * steepness.max())
     met = met[met[:, 0] == met[0, 0]]
-    place = (int(met[0, 0]), int(met[np.argmax(steepness[*met.T]), 1]))
+    steepest = (int(met[0, 0]), int(met[np.argmax(steepness[*met.T]), 1]))
     left, right = _reach(heights, column, row, half_width)
     slopes = {"slope_deg": steepness, "along_deg": along, "across_deg": across}
     numbers = {
         "height_m": height,
-        **{name: float(np.rad2deg(np.arctan(float(values[place])))) for name, values in slopes.items()},
-        "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[place]), abs(along[place])))),
+        **{name: float(np.rad2deg(np.arctan(float(values[steepest])))) for name, values in slopes.items()},
+        "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[steepest]), abs(along[steepest])))),
         "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
         "left_m": left,
         "right_m": right,
     }
-    return Shape(kind=_kind_of(numbers), **{name: round(value, 3) for name, value in numbers.items()})
+    return Shape(kind=_classify(numbers), **{name: round(value, 3) for name, value in numbers.items()})
 
 
-def on_the_way(field: NDArray[np.float32], half_width: float) -> float:
+def largest_height(field: NDArray[np.float32], half_width: float) -> float:
     """Largest height or depth [m] of a part under a robot on the straight way from start to goal."""
     return float(np.abs(_under(field, half_width)).max())
 
 
-def _kind_of(shape: dict[str, float]) -> str:
+def _classify(shape: dict[str, float]) -> str:
     """The kind of a shape by the limits above; docs/faults.md has them as a table."""
     raised = shape["height_m"] > 0.0
     if abs(shape["height_m"]) < LEAST_HEIGHT:
-        return _BESIDE_THE_WAY
+        return OFF_THE_WAY
     if shape["slope_deg"] < GENTLE:
         return "gentle hill" if raised else "gentle hollow"
     if shape["length_m"] <= SHORT:
-        name, ends = "ridge" if raised else "ditch", sum(shape[side] < NARROW for side in ("left_m", "right_m"))
+        name = "ridge" if raised else "ditch"
+        ends = sum(shape[side] < NARROW for side in ("left_m", "right_m"))
         if ends:
             return f"{name} end" if ends == 1 else "knob" if raised else "hole"
     elif shape["oblique_deg"] > SIDEWAYS:
@@ -241,20 +273,26 @@ def _kind_of(shape: dict[str, float]) -> str:
 
 def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
     """Values of the nodes under the robot, shape (along the way, across it)."""
-    centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
-    first, last = (round(place[0] / SPACING) for place in (CrossingCfg.start, CrossingCfg.goal))
-    return values[centre - beside : centre + beside + 1, first : last + 1].T
+    first, last = (round(x / SPACING) for x, _ in (CrossingCfg.start, CrossingCfg.goal))
+    lowest = _first_row(half_width)
+    return values[lowest : 2 * _CENTRE - lowest + 1, first : last + 1].T
+
+
+def _first_row(half_width: float) -> int:
+    """The grid's first row that is under the robot."""
+    return _CENTRE - round(half_width / SPACING)
 
 
 def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width: float) -> tuple[float, float]:
     """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
-    centre, beside = round(CrossingCfg.start[1] / SPACING), round(half_width / SPACING)
-    first, near = round(CrossingCfg.start[0] / SPACING) + int(column), round(_NEAR / SPACING)
-    place = centre - beside + int(row)
-    highest = field[place, first]
+    middle = _first_row(half_width) + int(row)
+    first = round(CrossingCfg.start[0] / SPACING) + int(column)
+    near = round(_NEAR / SPACING)
+    highest = field[middle, first]
     window = field[:, max(first - near, 0) : first + near + 1]
     low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
-    above, below = np.flatnonzero(low[place:]), np.flatnonzero(low[place::-1])
-    left = place + int(above[0]) if len(above) else len(low)
-    right = place - int(below[0]) if len(below) else -1
-    return SPACING * (left - centre), SPACING * (centre - right)
+    above = np.flatnonzero(low[middle:])
+    below = np.flatnonzero(low[middle::-1])
+    left = middle + int(above[0]) if len(above) else len(low)
+    right = middle - int(below[0]) if len(below) else -1
+    return SPACING * (left - _CENTRE), SPACING * (_CENTRE - right)

@@ -5,20 +5,20 @@ Causes: failing elites on which a part of the same kind stops the robot, such as
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from kernels.episode import Outcome
-from qd.faults.causes import HALF_WIDTH, UNCLEAR, causes_at, commonest_words
+from qd.faults.causes import UNCLEAR, describe_commonest, find_causes
 from qd.faults.minimise.results import MinimalTerrains
 from qd.faults.numbers import count_faults
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
-from sim.robots.shipped import ROBOTS
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.base import TerrainSpace
 
@@ -41,16 +41,11 @@ ORDERS = {
 """Orders of elites, in words."""
 
 
-def verdicts_of(archive: Archive) -> NDArray[np.int64]:
-    """The verdict on each elite as its place in :data:`VERDICTS`, shape (N,)."""
+def find_verdicts(archive: Archive) -> NDArray[np.int64]:
+    """The verdict on each elite as its index in :data:`VERDICTS`, shape (N,)."""
     failing, confirmed, certified = archive.failing, archive.confirmed, archive.certified
     conditions = [confirmed & certified, confirmed, certified, failing]
     return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
-
-
-def verdict_of(archive: Archive, number: int) -> str:
-    """The verdict on one elite in a word."""
-    return VERDICTS[int(verdicts_of(archive)[number])]
 
 
 _WAYS = {
@@ -68,18 +63,23 @@ def way_to_end(outcome: int, fallen: bool) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Elites(Evaluation):
-    """N elites by what fresh episodes say of each where it has valid ones, else as they were found.
+class Ranking(Evaluation):
+    """N elites by what is known best of each, in orders to show them in.
 
-    Lower numbers have a higher fitness.
+    Values are those of fresh episodes where valid ones exist, else as found. Lower numbers have a higher fitness.
     """
 
     numbers: NDArray[np.int64]
     """Number of each elite in the archive, shape (N,), ascending."""
-    fresh: NDArray[np.bool_]
+    is_fresh: NDArray[np.bool_]
     """Whether the values are of fresh episodes, shape (N,)."""
     verdict: NDArray[np.int64]
-    """Place in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found it say whether it fails."""
+    """Index in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found an elite say whether it fails."""
+    causes: tuple[str, ...]
+    """What stops the robot on each: the cause of its minimal terrain, else that of the place where its typical episode
+    ends (:func:`qd.faults.causes.find_causes`). Empty where the elite does not fail."""
+    families: NDArray[np.int64]
+    """Family of each, shape (N,), numbered from 1 by its worst member."""
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -94,27 +94,40 @@ class Elites(Evaluation):
         """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
         return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
 
-    def rows(self, chosen: NDArray[np.int64]) -> "Elites":
-        """The elites in some rows, in their order."""
-        return Elites(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
-
-    def place_of(self, number: int) -> int:
+    def find_row(self, number: int) -> int:
         """Row of an elite by its number in the archive."""
         return int(np.searchsorted(self.numbers, number))
 
-    def hits(self, rate: str, place: int) -> int:
+    def hits(self, rate: str, row: int) -> int:
         """Episodes of the elite in a row that a rate counts."""
-        return round(float(getattr(self, rate)[place]) * int(self.counted[place]))
+        return round(float(getattr(self, rate)[row]) * int(self.counted[row]))
 
     def ending(self, row: int) -> tuple[str, str]:
-        """How most robots that fail an elite end, in words, and the name of the rate that counts them."""
-        collided, place = self.collision_rate[row], self.end_position[row]
-        is_out = (place <= CrossingCfg.lower).any() or (place >= CrossingCfg.upper).any()
-        outcome, rate = Outcome.OUT if is_out else Outcome.TIME_OUT, "other_rate"
+        """How most robots that fail an elite end, in a text, and the name of the rate that counts them."""
+        collided, end = self.collision_rate[row], self.end_position[row]
         if collided >= self.other_rate[row]:
-            outcome, rate = Outcome.BASE_COLLISION, "collision_rate"
-        fallen = 2 * self.fallen_rate[row] > (collided if outcome == Outcome.BASE_COLLISION else 1.0)
+            outcome, rate, share = Outcome.BASE_COLLISION, "collision_rate", collided
+        else:
+            is_out = (end <= CrossingCfg.lower).any() or (end >= CrossingCfg.upper).any()
+            outcome, rate, share = Outcome.OUT if is_out else Outcome.TIME_OUT, "other_rate", 1.0
+        fallen = 2 * self.fallen_rate[row] > share
         return way_to_end(outcome, fallen), "fallen_rate" if fallen else rate
+
+    def name(self, row: int) -> str:
+        """An elite by its cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""
+        if not self.failing[row]:
+            return f"crossed, {self.hits('goal_rate', row)} of {self.counted[row]}"
+        ending, rate = self.ending(row)
+        return f"{self.causes[row]}: {ending}, {self.hits(rate, row)} of {self.counted[row]}"
+
+    def by_cause(self) -> dict[str, NDArray[np.int64]]:
+        """Rows of the failing elites by cause, the worst first; the commonest cause first, the unclear last."""
+        rows: dict[str, list[int]] = {}
+        for row in self.by_severity().tolist():
+            if self.causes[row]:
+                rows.setdefault(self.causes[row], []).append(row)
+        commonest = sorted(rows, key=lambda cause: (cause == UNCLEAR, -len(rows[cause])))
+        return {cause: np.array(rows[cause], np.int64) for cause in commonest}
 
     def by_severity(self) -> NDArray[np.int64]:
         """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
@@ -123,21 +136,100 @@ class Elites(Evaluation):
         """
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
+    def order(self, by: str = "cause") -> NDArray[np.int64]:
+        """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
 
-def elites_of(archive: Archive, *, judged: bool = False) -> Elites:
-    """The elites of an archive, in its order; ``judged`` leaves out those whose fresh episodes are invalid."""
+        ``cause`` begins with the worst terrain of each cause, no two of one family where that can be had: faults first,
+        then the commonest cause. The worst failing terrain of each other family follows, then the rest.
+        """
+        severity = self.by_severity()
+        if by == "fault":
+            return severity
+        if by == "cause":
+            return self._leading_first(severity)
+        values = self.families if by == "family" else np.asarray(getattr(self, by))
+        sign = 1 if by in ("family", "goal_rate") else -1
+        return severity[np.argsort(sign * values[severity], kind="stable")]
+
+    def _leading_first(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
+        families = self.families.tolist()
+        leading: dict[int, int] = {}  # families by row
+        for rows in self.by_cause().values():
+            leader = next((row for row in rows.tolist() if families[row] not in leading.values()), int(rows[0]))
+            leading[leader] = families[leader]
+        leading = dict(sorted(leading.items(), key=lambda pair: -int(self.verdict[pair[0]])))
+        for row in severity[self.failing[severity]].tolist():
+            if families[row] not in leading.values():
+                leading[row] = families[row]
+        return np.array([*leading, *severity[~np.isin(severity, [*leading])]], dtype=np.int64)
+
+    def worst(self, count: int) -> list[int]:
+        """Numbers of the first terrains of the order ``cause``."""
+        return self.numbers[self.order()[:count]].tolist()
+
+
+def rank(
+    archive: Archive,
+    space: TerrainSpace,
+    minima: MinimalTerrains | None = None,
+    *,
+    half_width: float,
+    judged: bool = False,
+    numbers: Sequence[int] | None = None,
+) -> Ranking:
+    """The ranking of an archive that has elites.
+
+    Minimal terrains say best what the cause is. ``half_width`` is that of the robot's stance [m]. ``judged`` leaves out
+    elites whose fresh episodes are invalid; ``numbers`` are elites to rank alone, one a row.
+    """
+    values, is_fresh = best_values(archive)
+    chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
+    if judged and archive.fresh is not None:
+        chosen = chosen[is_fresh[chosen]]
+    values = {name: value[chosen] for name, value in values.items()}
+    archive = archive.rows(chosen)
+    families = find_families(archive.genes, space) if archive.family is None else archive.family
+    causes = find_failing_causes(archive, space, half_width) if archive.cause is None else archive.cause
+    entries = [] if minima is None else minima.numbers["elites"]
+    minimal_causes = {entry["elite"]: entry["cause"]["kind"] for entry in entries if entry["cause"]}
+    ranking = Ranking(
+        **values,
+        numbers=chosen,
+        is_fresh=is_fresh[chosen],
+        verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
+        causes=tuple(
+            minimal_causes.get(number, cause) if cause else ""
+            for number, cause in zip(chosen.tolist(), causes.tolist(), strict=True)
+        ),
+        families=families,
+    )
+    worst_first = dict.fromkeys(families[ranking.by_severity()].tolist())
+    by_worst = {family: number for number, family in enumerate(worst_first, 1)}
+    return replace(ranking, families=np.array([by_worst[family] for family in families.tolist()], np.int64))
+
+
+def best_values(archive: Archive) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
+    """The evaluation of each elite by fresh episodes where valid ones exist, else as found, and where they do."""
     values = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(Evaluation)}
-    is_fresh = np.zeros(len(archive), bool)
-    if (fresh := archive.fresh) is not None:
-        is_fresh = fresh.valid
-        for name, value in values.items():
-            values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
-    verdict = np.maximum(verdicts_of(archive), values["goal_rate"] < FAILING_GOAL_RATE)
-    elites = Elites(numbers=np.arange(len(archive)), fresh=is_fresh, verdict=verdict, **values)
-    return elites.rows(np.flatnonzero(is_fresh)) if judged and fresh is not None else elites
+    fresh = archive.fresh
+    if fresh is None:
+        return values, np.zeros(len(archive), bool)
+    is_fresh = fresh.valid
+    for name, value in values.items():
+        values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
+    return values, is_fresh
 
 
-def families_of(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
+def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float) -> NDArray[np.str_]:
+    """What stops the robot on each elite where its typical episode ends, shape (N,); empty where it does not fail."""
+    values, _ = best_values(archive)
+    failing = values["goal_rate"] < FAILING_GOAL_RATE
+    causes = np.full(len(archive), "", object)
+    causes[failing] = find_causes(archive.genes[failing], values["end_position"][failing], space, half_width)
+    return causes.astype(np.str_)
+
+
+def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
     """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
 
     Who descends from whom is not recorded. Terrains within :data:`KIN_M` are kin, and kin of kin are one family. Genes
@@ -160,122 +252,25 @@ def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDA
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ranking:
-    """N elites, why they stop the robot, and their families, in orders to show them in."""
-
-    elites: Elites
-    causes: tuple[str, ...]
-    """What stops the robot on each, such as ``ridge``: the cause of its minimal terrain, or where there is none of the
-    place where its typical episode ends (:func:`qd.faults.causes.causes_at`). Empty of an elite that does not fail."""
-    families: NDArray[np.int64]
-    """Family of each, shape (N,), numbered from 1 by its worst member."""
-
-    def name(self, row: int) -> str:
-        """An elite by its own cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""
-        elites = self.elites
-        if not elites.failing[row]:
-            return f"crossed, {elites.hits('goal_rate', row)} of {elites.counted[row]}"
-        ending, rate = elites.ending(row)
-        return f"{self.causes[row]}: {ending}, {elites.hits(rate, row)} of {elites.counted[row]}"
-
-    def by_cause(self) -> dict[str, NDArray[np.int64]]:
-        """Rows of the failing elites by cause, within each the worst first; the commonest first, the unclear last."""
-        rows: dict[str, list[int]] = {}
-        for row in self.elites.by_severity().tolist():
-            if self.causes[row]:
-                rows.setdefault(self.causes[row], []).append(row)
-        commonest = sorted(rows, key=lambda cause: (cause == UNCLEAR, -len(rows[cause])))
-        return {cause: np.array(rows[cause], np.int64) for cause in commonest}
-
-    def order(self, by: str = "cause") -> NDArray[np.int64]:
-        """Rows of all elites, shape (N,), in one of the :data:`ORDERS`; ties are by severity.
-
-        ``cause`` begins with the worst terrain of each cause, no two of one family where that can be had: faults first,
-        then the commonest cause. The worst failing terrain of each other family follows, then the rest.
-        """
-        severity = self.elites.by_severity()
-        if by == "fault":
-            return severity
-        if by == "cause":
-            return self._leading(severity)
-        values = self.families if by == "family" else np.asarray(getattr(self.elites, by))
-        sign = 1 if by in ("family", "goal_rate") else -1
-        return severity[np.argsort(sign * values[severity], kind="stable")]
-
-    def _leading(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
-        families = self.families.tolist()
-        leading: dict[int, int] = {}  # families by row
-        for rows in self.by_cause().values():
-            leader = next((row for row in rows.tolist() if families[row] not in leading.values()), int(rows[0]))
-            leading[leader] = families[leader]
-        leading = dict(sorted(leading.items(), key=lambda pair: -int(self.elites.verdict[pair[0]])))
-        for row in severity[self.elites.failing[severity]].tolist():
-            if families[row] not in leading.values():
-                leading[row] = families[row]
-        return np.array([*leading, *severity[~np.isin(severity, [*leading])]], dtype=np.int64)
-
-    def worst(self, count: int) -> list[int]:
-        """Numbers of the first terrains of the order ``cause``."""
-        return self.elites.numbers[self.order()[:count]].tolist()
-
-
-def rank(
-    archive: Archive,
-    space: TerrainSpace,
-    minima: MinimalTerrains | None = None,
-    *,
-    judged: bool = False,
-    numbers: Sequence[int] | None = None,
-) -> Ranking:
-    """The ranking of an archive that has elites.
-
-    Minimal terrains say best what the cause is. ``judged`` leaves out elites whose fresh episodes are invalid;
-    ``numbers`` are elites to rank alone, one a row.
-    """
-    elites = elites_of(archive, judged=judged)
-    elites = elites if numbers is None else elites.rows(np.searchsorted(elites.numbers, numbers))
-    archive = archive.rows(elites.numbers)
-    families = families_of(archive.genes, space) if archive.family is None else archive.family
-    by_worst = {family: place for place, family in enumerate(dict.fromkeys(families[elites.by_severity()].tolist()), 1)}
-    causes = causes_of(elites, archive, space) if archive.cause is None else archive.cause
-    entries = [] if minima is None else minima.numbers["elites"]
-    of_minimal = {entry["elite"]: entry["cause"]["kind"] for entry in entries if entry["cause"]}
-    rows = zip(elites.numbers.tolist(), causes.tolist(), strict=True)
-    return Ranking(
-        elites=elites,
-        causes=tuple(of_minimal.get(number, cause) if cause else "" for number, cause in rows),
-        families=np.array([by_worst[family] for family in families.tolist()], np.int64),
-    )
-
-
-def causes_of(elites: Elites, archive: Archive, space: TerrainSpace) -> NDArray[np.str_]:
-    """What stops the robot on each elite where its typical episode ends, shape (N,); empty where it does not fail."""
-    failing, half_width = elites.failing, ROBOTS[archive.robot].footprint[1] if archive.robot in ROBOTS else HALF_WIDTH
-    causes = np.full(len(elites), "", object)
-    causes[failing] = causes_at(archive.genes[failing], elites.end_position[failing], space, half_width)
-    return causes.astype(np.str_)
-
-
-def summary_of(ranking: Ranking, archive: Archive) -> str:
+def summarise(ranking: Ranking, archive: Archive) -> str:
     """What a search says of the controller, in one plain sentence."""
-    elites, by_cause = ranking.elites, ranking.by_cause()
-    failing = int(elites.failing.sum())
-    if len(elites) == 1:
-        words = ["The only terrain stops the robot" if failing else "The robot crosses the only terrain"]
+    failing = int(ranking.failing.sum())
+    if len(ranking) == 1:
+        phrases = ["The only terrain stops the robot" if failing else "The robot crosses the only terrain"]
     elif not failing:
-        words = [f"The robot crosses all {len(elites):,} terrains"]
+        phrases = [f"The robot crosses all {len(ranking):,} terrains"]
     else:
-        words = [f"{failing:,} of {len(elites):,} terrains {'stops' if failing == 1 else 'stop'} the robot"]
-    commonest = next(iter(by_cause), UNCLEAR)
+        phrases = [f"{failing:,} of {len(ranking):,} terrains {'stops' if failing == 1 else 'stop'} the robot"]
+    commonest = next(iter(ranking.by_cause()), UNCLEAR)
     if commonest != UNCLEAR:
-        words.append(commonest_words(commonest) if failing > 1 else f"cause: {commonest}")
-    if failing and archive.counts.certifiers:
-        faults, crosses = count_faults(archive), "another controller of this robot crosses"
+        phrases.append(describe_commonest(commonest) if failing > 1 else f"cause: {commonest}")
+    if failing and archive.certifiers:
+        faults = count_faults(archive)
+        crosses = "another controller of this robot crosses"
         if faults is None:
-            words.append(f"{crosses} {archive.certified.sum() or 'none'} of them")
+            phrases.append(f"{crosses} {archive.certified.sum() or 'none'} of them")
         elif faults == 0:
-            words.append("none is known to be a fault")
+            phrases.append("none is known to be a fault")
         else:
-            words.append(f"1 is a fault: {crosses} it" if faults == 1 else f"{faults:,} are faults: {crosses} them")
-    return "; ".join(words)
+            phrases.append(f"1 is a fault: {crosses} it" if faults == 1 else f"{faults:,} are faults: {crosses} them")
+    return "; ".join(phrases)

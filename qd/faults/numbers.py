@@ -20,17 +20,17 @@ from sim.files.intervals import bootstrap_interval, format_rate, wilson_interval
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
 EPISODES = 20
-"""Episodes of each other kind that an elite is judged by."""
+"""Episodes of an elite in each further stage of judging."""
 SPECIALIST = "specialist"
-"""Name of the certifier that was trained for one search, on its failing elites; all others are the panel."""
+"""Name of the certifier that was trained for one search, on its failing elites; all others form the panel."""
 
 _INVALID = OUTCOMES.index("invalid")
-OF_VARIED = ("crossed_varied", "robust")
-"""Numbers of :func:`fault_numbers` that only those have who were judged under varied conditions."""
+VARIED_NUMBERS = ("crossed_varied", "robust")
+"""Numbers of :func:`fault_numbers` that an archive has only if it was judged under varied conditions."""
 
 
 def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What a search found and how much it took, as reports have it; ``metrics`` has a row an iteration."""
+    """What a search found and how much it took, as ``archive.json`` has it; ``metrics`` has a row an iteration."""
     with_collision = int((archive.collision_rate > 0.0).sum())  # in any episode; the bit is of 20
     return {
         "iterations": archive.iterations,
@@ -49,8 +49,9 @@ def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dic
 
 
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
-    """What fresh episodes say of an archive, as reports have it."""
-    std, corrected = fresh.penalty_std[fresh.valid].sum(axis=1), fresh.corrected_elites()
+    """What fresh episodes say of an archive, as ``archive.json`` has it."""
+    std = fresh.penalty_std[fresh.valid].sum(axis=1)
+    corrected = fresh.corrected_elites()
     families = None if archive.family is None else archive.family[fresh.valid]
     return {
         "reevaluated": len(fresh.reproduced),
@@ -68,12 +69,11 @@ def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
 def fault_numbers(
     archive: Archive, families: NDArray[np.int64] | None = None, seen: NDArray[np.bool_] | None = None
 ) -> dict[str, Any]:
-    """The numbers of faults, as ``archive.json`` has them; None of what is not known.
+    """The numbers of faults, as ``archive.json`` has them; None where nobody knows.
 
     ``families`` has shape (N,); ``seen``, of shape (N, C), says whether a certifier has trained on kin of an elite.
     """
-    faults, failing, confirmed = archive.counts, archive.failing, archive.confirmed
-    names = faults.certifiers
+    failing, confirmed, names = archive.failing, archive.confirmed, archive.certifiers
     counts = ("confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
@@ -81,35 +81,35 @@ def fault_numbers(
         "families": None if families is None else len(np.unique(families)),
         "certifiers": list(names),
     }
-    if archive.faults is None or not failing.any():
+    if not archive.is_judged or not failing.any():
         return numbers
-    resolved = failing & faults.resolved_outcomes.any(axis=1)
-    certificates = faults.certificates() & failing[:, None]
+    resolved = failing & archive.resolved_outcomes.any(axis=1)
+    certificates = archive.certificates & failing[:, None]
     numbers["crossed_resolved"] = int(resolved.sum())
     numbers["certificates"] = [
         {
             "controller": name,
             "policy_sha256": digest,
-            "crossed": int((faults.certifier_outcomes[:, column].any(axis=1) & failing).sum()),
+            "crossed": int((archive.certifier_outcomes[:, column].any(axis=1) & failing).sum()),
             "certified": int(certificates[:, column].sum()),
         }
-        for column, (name, digest) in enumerate(zip(names, faults.certifier_sha256, strict=True))
+        for column, (name, digest) in enumerate(zip(names, archive.certifier_sha256, strict=True))
     ]
     if resolved.any():
         numbers["confirmed"] = int(confirmed.sum())
     if names:
         numbers["certified"] = int(certificates.any(axis=1).sum())
     if names and resolved.any():
-        of_panel = np.array(names) != SPECIALIST
+        in_panel = np.array(names) != SPECIALIST
         is_fault = confirmed & certificates.any(axis=1)
-        numbers["faults"] = None if of_panel.all() else int(is_fault.sum())
-        numbers["faults_panel"] = int((confirmed & certificates[:, of_panel].any(axis=1)).sum())
+        numbers["faults"] = None if in_panel.all() else int(is_fault.sum())
+        numbers["faults_panel"] = int((confirmed & certificates[:, in_panel].any(axis=1)).sum())
         if seen is not None:
             numbers["faults_unseen"] = int((confirmed & (certificates & ~seen).any(axis=1)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
-        if faults.varied_outcomes is not None:
-            numbers["crossed_varied"] = int((is_fault & faults.varied_outcomes.any(axis=1)).sum())
+        if archive.varied_outcomes is not None:
+            numbers["crossed_varied"] = int((is_fault & archive.varied_outcomes.any(axis=1)).sum())
             numbers["robust"] = int(archive.robust.sum())
     return numbers
 
@@ -120,38 +120,36 @@ def count_faults(archive: Archive) -> int | None:
     return numbers["faults_panel"] if numbers["faults"] is None else numbers["faults"]
 
 
-def certifier_of(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
+def best_certifier(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
     """Name of the certifier that crosses an elite most often, of all or of some; None if none has a certificate."""
     if not archive.certified[number]:
         return None
-    faults = archive.counts
-    rates = goal_rates(faults.certifier_outcomes[number]) * faults.certificates()[number]
-    rate_of = dict(zip(faults.certifiers, rates.tolist(), strict=True))
-    names = [name for name, rate in rate_of.items() if rate > 0.0 and (among is None or name in among)]
-    return max(names, key=rate_of.__getitem__, default=None)
+    rates = goal_rates(archive.certifier_outcomes[number]) * archive.certificates[number]
+    rate_by_name = dict(zip(archive.certifiers, rates.tolist(), strict=True))
+    names = [name for name, rate in rate_by_name.items() if rate > 0.0 and (among is None or name in among)]
+    return max(names, key=rate_by_name.__getitem__, default=None)
 
 
 def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
-    """Further episodes on an elite that reached the goal, and valid ones, by who crossed it how, in words."""
-    faults = archive.counts
-    counts = {"With contact resolved (steps of 1 ms)": faults.resolved_outcomes[number]}
-    if faults.varied_outcomes is not None:
-        counts["Under varied conditions"] = faults.varied_outcomes[number]
-    for column, name in enumerate(faults.certifiers):
-        counts[name] = faults.certifier_outcomes[number, column]
-        counts[f"{name} with contact resolved"] = faults.certifier_resolved_outcomes[number, column]
-        if faults.certifier_varied_outcomes is not None:
-            counts[f"{name} under varied conditions"] = faults.certifier_varied_outcomes[number, column]
-    return {who: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for who, ends in counts.items() if ends.any()}
+    """Further episodes on an elite that reached the goal, and valid ones, by controller and conditions."""
+    counts = {"With contact resolved (steps of 1 ms)": archive.resolved_outcomes[number]}
+    if archive.varied_outcomes is not None:
+        counts["Under varied conditions"] = archive.varied_outcomes[number]
+    for column, name in enumerate(archive.certifiers):
+        counts[name] = archive.certifier_outcomes[number, column]
+        counts[f"{name} with contact resolved"] = archive.certifier_resolved_outcomes[number, column]
+        if archive.certifier_varied_outcomes is not None:
+            counts[f"{name} under varied conditions"] = archive.certifier_varied_outcomes[number, column]
+    return {label: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for label, ends in counts.items() if ends.any()}
 
 
-def elite_words(archive: Archive, number: int) -> list[str]:
-    """What is known of one elite, in sentences; nothing where nobody crossed it under other conditions."""
-    faults, rates = archive.counts, further_rates(archive, number)
-    sentences = [f"{who}: {format_rate(*rate)} reach the goal." for who, rate in rates.items()]
+def describe_elite(archive: Archive, number: int) -> list[str]:
+    """What is known of an elite, in sentences; none where nobody crossed it under other conditions."""
+    rates = further_rates(archive, number)
+    sentences = [f"{label}: {format_rate(*rate)} reach the goal." for label, rate in rates.items()]
     if not sentences:
         return []
-    crossers = [*compress(faults.certifiers, faults.certificates()[number].tolist())]
+    crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
     if not archive.failing[number]:
         sentences.append("It does not fail by its fresh episodes.")
     elif crossers:
@@ -169,37 +167,38 @@ def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:
     """The fresh episodes of an elite by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
     fresh = archive.fresh
     assert fresh is not None
-    valid, invalid = int(fresh.counted[number]), int(fresh.invalid_episodes[number])
+    valid = int(fresh.counted[number])
     goal, collided = (round(float(rate[number]) * valid) for rate in (fresh.goal_rate, fresh.collision_rate))
-    return np.array([goal, collided, valid - goal - collided, invalid])
+    return np.array([goal, collided, valid - goal - collided, int(fresh.invalid_episodes[number])])
 
 
-def rate_of(counts: NDArray[np.int64]) -> dict[str, Any]:
-    """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); a rate of None: too many are invalid."""
-    valid, rate = int(counts.sum() - counts[_INVALID]), float(goal_rates(counts))
+def rate_numbers(counts: NDArray[np.int64]) -> dict[str, Any]:
+    """Goal rate of episodes, shape (4,), with its 95 % interval (Wilson); None where too many are invalid."""
+    valid = int(counts.sum() - counts[_INVALID])
+    rate = float(goal_rates(counts))
     interval = [round(limit, 4) for limit in wilson_interval(int(counts[0]), valid)]
     return {"goal_rate": None if np.isnan(rate) else rate, "goal_interval": interval, "valid_episodes": valid}
 
 
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
-    """What is known of an elite under other conditions, as JSON values; None of what nobody looked at.
+    """What is known of an elite under other conditions, as JSON values; None where nobody looked.
 
-    ``resolved`` is the rate with contact resolved; ``certificates`` has of each controller that certifies it name,
-    hash, and rates at the ``searched`` settings and with contact ``resolved``. ``varied`` is that under varied
-    conditions of one that was crossed so, its own and its certifiers'.
+    ``resolved`` is the rate with contact resolved. ``certificates`` has name and hash of each controller that certifies
+    it, and its rates at the ``searched`` settings and with contact ``resolved``. ``varied`` is a rate under varied
+    conditions, where the elite was crossed so.
     """
-    faults = archive.counts
-    resolved, varied = faults.resolved_outcomes[number], faults.varied_outcomes
-    kinds = {"searched": faults.certifier_outcomes, "resolved": faults.certifier_resolved_outcomes}
-    if faults.certifier_varied_outcomes is not None:
-        kinds["varied"] = faults.certifier_varied_outcomes
-    under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_of(varied[number])}
+    resolved = archive.resolved_outcomes[number]
+    varied = archive.varied_outcomes
+    kinds = {"searched": archive.certifier_outcomes, "resolved": archive.certifier_resolved_outcomes}
+    if archive.certifier_varied_outcomes is not None:
+        kinds["varied"] = archive.certifier_varied_outcomes
+    under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_numbers(varied[number])}
     return under_varied | {
-        "resolved": rate_of(resolved) if resolved.any() else None,
+        "resolved": rate_numbers(resolved) if resolved.any() else None,
         "certificates": [
             {"controller": name, "policy_sha256": digest}
-            | {kind: rate_of(counts[number, column]) for kind, counts in kinds.items()}
-            for column, (name, digest) in enumerate(zip(faults.certifiers, faults.certifier_sha256, strict=True))
-            if faults.certificates()[number, column]
+            | {kind: rate_numbers(counts[number, column]) for kind, counts in kinds.items()}
+            for column, (name, digest) in enumerate(zip(archive.certifiers, archive.certifier_sha256, strict=True))
+            if archive.certificates[number, column]
         ],
     }

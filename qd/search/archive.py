@@ -1,10 +1,10 @@
-"""The archive of a search as data: terrains that break the controller, one a cell, and the file that holds them.
+"""The archive of a search: a table of terrains that break the controller, one a cell, and the file that holds it.
 
+Its columns come in groups. The search fills the first; each stage of judging (:mod:`qd.faults.stages`) adds one.
 Training and figures read archives without the search's libraries.
 """
 
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,13 @@ ARCHIVE_FILE = "archive.npz"
 
 @dataclass(frozen=True, kw_only=True)
 class FreshValues(Evaluation):
-    """What fresh episodes say of N elites, free of the luck that made them elites; a collision bit as searched."""
+    """N elites by fresh episodes, free of the luck that made them elites; the collision bit is of 20 episodes."""
 
     reproduced: NDArray[np.bool_]
-    """Whether an elite lands in its cell or a neighbour of it again, shape (N,)."""
+    """Whether an elite lands in its cell or in a neighbour again, shape (N,)."""
 
     def corrected_elites(self) -> NDArray[np.int64]:
-        """Rows of the archive that fresh episodes alone would make: the fittest elite of each cell that one lands in.
+        """Rows of the archive that fresh episodes alone would make: the fittest elite of each cell.
 
         It is the "corrected archive" of Flageat and Cully 2023.
         """
@@ -38,41 +38,8 @@ class FreshValues(Evaluation):
         return order[np.unique(self.cell[order], return_index=True)[1]]
 
 
-FRESH = tuple(field.name for field in fields(FreshValues))
-"""Names of the arrays of fresh values; in the file ``fresh_`` goes before them."""
-
 OUTCOMES = ("goal", "base_collision", "other", "invalid")
-"""How episodes are counted: ``other`` are those out of time or off the terrain."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FaultCounts:
-    """How further episodes on N elites ended, by :data:`OUTCOMES`; an elite that was not crossed has none."""
-
-    resolved_outcomes: NDArray[np.int64]
-    """By the controller that was searched, with contact resolved, shape (N, 4)."""
-    certifiers: tuple[str, ...] = ()
-    """Names of C other controllers."""
-    certifier_sha256: tuple[str, ...] = ()
-    certifier_outcomes: NDArray[np.int64]
-    """By them at the search's settings, shape (N, C, 4)."""
-    certifier_resolved_outcomes: NDArray[np.int64]
-    """By them with contact resolved, shape (N, C, 4)."""
-    varied_outcomes: NDArray[np.int64] | None = None
-    """By the controller that was searched under varied conditions
-    (:func:`sim.terrains.spaces.under_conditions.varied_genes`), shape (N, 4); None where nobody has crossed so."""
-    certifier_varied_outcomes: NDArray[np.int64] | None = None
-    """By the others under the same ones, shape (N, C, 4); None likewise."""
-
-    def certificates(self) -> NDArray[np.bool_]:
-        """Whether a controller reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
-        both = (self.certifier_outcomes, self.certifier_resolved_outcomes)
-        return np.all([goal_rates(counts) >= FAILING_GOAL_RATE for counts in both], axis=0)
-
-
-COUNTS = tuple(field.name for field in fields(FaultCounts) if field.name.endswith("_outcomes"))
-"""Names of the arrays of counts, which have one row an elite."""
-_VARIED = tuple(name for name in COUNTS if "varied" in name)  # they may be None
+"""How an episode counts: ``other`` is out of time or off the terrain."""
 
 
 def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -81,13 +48,16 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     NaN where nothing was crossed, or too many episodes are invalid.
     """
     episodes, invalid = counts.sum(axis=-1), counts[..., OUTCOMES.index("invalid")]
-    known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
-    return np.where(known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
+    is_known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
+    return np.where(is_known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Archive(Evaluation):
-    """Elites as they were found, by descending fitness, the corrected one if there are fresh values."""
+    """N elites by descending fitness: by the corrected one if there are fresh episodes, else as they were found.
+
+    Outcomes count episodes by :data:`OUTCOMES`; they are 0 for an elite that was not crossed.
+    """
 
     robot: str
     robot_sha256: str
@@ -104,23 +74,43 @@ class Archive(Evaluation):
     collision_bit: bool
     """Whether base collision is a descriptor too."""
     iterations: int
-    genes: NDArray[np.float32]
-    """Clipped genes, shape (N, num_genes)."""
-    iteration: NDArray[np.int64]
-    """Iteration that found the elite, from 1, shape (N,)."""
     policy_sha256: str | None = None
     """Hash of its controller; None where it has no file."""
     space_sha256: str | None = None
     """Hash of the code of the terrain space; None of a shipped one."""
+
+    # As found, beside the evaluation.
+    genes: NDArray[np.float32]
+    """Clipped genes, shape (N, num_genes)."""
+    iteration: NDArray[np.int64]
+    """Iteration that found the elite, from 1, shape (N,)."""
+
+    # By fresh episodes; None before.
     fresh: FreshValues | None = None
-    """What fresh episodes say of the elites; None if there were none."""
-    faults: FaultCounts | None = None
-    """What became of those that fail under other conditions; only beside fresh values."""
     family: NDArray[np.int64] | None = None
-    """Family of each elite (:func:`qd.faults.families.families_of`), shape (N,); None where nobody has judged them."""
+    """Family of each elite (:func:`qd.faults.families.find_families`), shape (N,)."""
     cause: NDArray[np.str_] | None = None
-    """What stops the robot where its typical episode ends (:func:`qd.faults.causes.causes_at`), shape (N,); empty of an
-    elite that does not fail; None likewise."""
+    """What stops the robot where its typical episode ends (:func:`qd.faults.causes.find_causes`), shape (N,); empty
+    where the elite does not fail."""
+
+    # With contact resolved, by the controller that was searched.
+    resolved_outcomes: NDArray[np.int64]
+    """Shape (N, 4)."""
+
+    # By C other controllers.
+    certifiers: tuple[str, ...] = ()
+    """Their names."""
+    certifier_sha256: tuple[str, ...] = ()
+    certifier_outcomes: NDArray[np.int64]
+    """At the search's settings, shape (N, C, 4)."""
+    certifier_resolved_outcomes: NDArray[np.int64]
+    """With contact resolved, shape (N, C, 4)."""
+
+    # Under varied conditions (:func:`sim.terrains.spaces.under_conditions.varied_genes`); None before.
+    varied_outcomes: NDArray[np.int64] | None = None
+    """By the controller that was searched, shape (N, 4)."""
+    certifier_varied_outcomes: NDArray[np.int64] | None = None
+    """By the others, shape (N, C, 4)."""
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and penalties: keys of :func:`sim.controllers.spec.controller_identity`."""
@@ -150,32 +140,30 @@ class Archive(Evaluation):
         return float(self.fitness.mean()) if len(self) else 0.0
 
     @property
-    def counts(self) -> FaultCounts:
-        """``faults``, or counts of 0 where nobody has crossed the elites under other conditions."""
-        none, nobody = np.zeros((len(self), 4), np.int64), np.zeros((len(self), 0, 4), np.int64)
-        return self.faults or FaultCounts(
-            resolved_outcomes=none, certifier_outcomes=nobody, certifier_resolved_outcomes=nobody
-        )
-
-    @property
     def failing(self) -> NDArray[np.bool_]:
-        """Whether fresh episodes say that the controller fails an elite, shape (N,)."""
+        """Whether the controller fails an elite by its fresh episodes, shape (N,)."""
         fresh = self.fresh
         return np.zeros(len(self), bool) if fresh is None else fresh.valid & (fresh.goal_rate < FAILING_GOAL_RATE)
 
     @property
     def confirmed(self) -> NDArray[np.bool_]:
         """Whether it fails an elite with contact resolved too, shape (N,)."""
-        return self.failing & (goal_rates(self.counts.resolved_outcomes) < FAILING_GOAL_RATE)
+        return self.failing & (goal_rates(self.resolved_outcomes) < FAILING_GOAL_RATE)
+
+    @property
+    def certificates(self) -> NDArray[np.bool_]:
+        """Whether a certifier reaches the goal in at least half of both kinds of episodes, shape (N, C)."""
+        both = (self.certifier_outcomes, self.certifier_resolved_outcomes)
+        return np.all([goal_rates(counts) >= FAILING_GOAL_RATE for counts in both], axis=0)
 
     @property
     def certified(self) -> NDArray[np.bool_]:
         """Whether it fails an elite that another controller crosses, shape (N,)."""
-        return self.failing & self.counts.certificates().any(axis=1)
+        return self.failing & self.certificates.any(axis=1)
 
     @property
     def is_fault(self) -> NDArray[np.bool_]:
-        """Whether it is a fault: confirmed and certified, shape (N,)."""
+        """Whether an elite is a fault: confirmed and certified, shape (N,)."""
         return self.confirmed & self.certified
 
     @property
@@ -184,69 +172,87 @@ class Archive(Evaluation):
 
         The controller crosses in under half of them, and one with a certificate in at least half.
         """
-        faults = self.counts
-        if faults.varied_outcomes is None or faults.certifier_varied_outcomes is None:
+        if self.varied_outcomes is None or self.certifier_varied_outcomes is None:
             return np.zeros(len(self), bool)
-        fails = goal_rates(faults.varied_outcomes) < FAILING_GOAL_RATE
-        crosses = faults.certificates() & (goal_rates(faults.certifier_varied_outcomes) >= FAILING_GOAL_RATE)
+        fails = goal_rates(self.varied_outcomes) < FAILING_GOAL_RATE
+        crosses = self.certificates & (goal_rates(self.certifier_varied_outcomes) >= FAILING_GOAL_RATE)
         return self.is_fault & fails & crosses.any(axis=1)
 
-    def has_elites_of(self, other: "Archive") -> bool:
-        """Whether the elites and all that was found of them are another's too, in whatever order."""
+    @property
+    def is_judged(self) -> bool:
+        """Whether anything was crossed with contact resolved or by other controllers."""
+        return bool(self.certifiers) or bool(self.resolved_outcomes.any())
+
+    def has_same_elites(self, other: "Archive") -> bool:
+        """Whether another archive found the same elites with the same values, in whatever order."""
         if len(self) != len(other):
             return False
         order, other_order = np.argsort(self.cell), np.argsort(other.cell)
-        return all(np.array_equal(getattr(self, name)[order], getattr(other, name)[other_order]) for name in PER_ELITE)
+        return all(np.array_equal(getattr(self, name)[order], getattr(other, name)[other_order]) for name in _FOUND)
 
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-
-        def of(values: Any, names: Iterable[str]) -> Any:
-            return replace(values, **{name: getattr(values, name)[chosen] for name in names})
-
-        known = [name for name in _JUDGED if getattr(self, name) is not None]
-        fresh = None if self.fresh is None else of(self.fresh, FRESH)
-        faults = self.faults
-        if faults is not None:
-            faults = of(faults, [name for name in COUNTS if getattr(faults, name) is not None])
-        return replace(of(self, (*PER_ELITE, *known)), fresh=fresh, faults=faults)
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        fresh = self.fresh
+        if fresh is not None:
+            fresh = FreshValues(**{name: values[chosen] for name, values in vars(fresh).items()})
+        return replace(
+            self, fresh=fresh, **{name: values[chosen] for name, values in columns.items() if values is not None}
+        )
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
-        """The archive with what fresh episodes say, by descending corrected fitness, the invalid elites last."""
+        """The archive with fresh values, by descending corrected fitness, the invalid elites last."""
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-_JUDGED = ("family", "cause")  # of elites that were judged
-_BESIDE = ("fresh", "faults", *_JUDGED)
-_OPTIONAL = ("policy_sha256", "space_sha256", *_JUDGED)
+def no_outcomes(num_elites: int) -> dict[str, NDArray[np.int64]]:
+    """Columns of an :class:`Archive` whose elites nobody has crossed under other conditions."""
+    nobody = np.zeros((num_elites, 0, 4), np.int64)
+    return {
+        "resolved_outcomes": np.zeros((num_elites, 4), np.int64),
+        "certifier_outcomes": nobody,
+        "certifier_resolved_outcomes": nobody,
+    }
+
+
+# Arrays of the file by group, with their dimensions: N elites, G genes, P penalties, C certifiers, or a size.
 _TEXTS = ("robot", "robot_sha256", "penalty_definition", "space", "policy_sha256", "space_sha256")
-_SETTINGS = (*_TEXTS, "penalties", "scales", "intervals", "collision_bit", "iterations")
-_PREFIX = "fresh_"
-_CERTIFIERS = ("certifiers", "certifier_sha256")
-_SHAPES = {
+_OPTIONAL = ("policy_sha256", "space_sha256")
+_SETTINGS = {
     **dict.fromkeys((*_TEXTS, "intervals", "collision_bit", "iterations"), ""),
     **dict.fromkeys(("penalties", "scales"), "P"),
+}
+_VALUES = dict.fromkeys([field.name for field in fields(Evaluation)], "N") | {
+    **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
+    "end_position": "N2",
+}
+_FOUND = {**_VALUES, "genes": "NG", "iteration": "N"}
+_PREFIX = "fresh_"
+_FRESH = {_PREFIX + name: shape for name, shape in {**_VALUES, "reproduced": "N"}.items()}
+_GROUPED = {"family": "N", "cause": "N"}
+_CERTIFIERS = ("certifiers", "certifier_sha256")
+_CROSSED = {
+    "resolved_outcomes": "N4",
     **dict.fromkeys(_CERTIFIERS, "C"),
-    "genes": "NG", "end_position": "N2", **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
-    **{name: "NC4" if name.startswith("certifier") else "N4" for name in COUNTS},
-}  # fmt: skip
-"""Dimensions of arrays in N elites, G genes, P penalties and C certifiers; N alone of all others."""
-PER_ELITE = tuple(field.name for field in fields(Archive) if field.name not in (*_SETTINGS, *_BESIDE))
-"""Names of the arrays that have one row an elite."""
+    **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
+}
+_VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
+_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED)  # groups that a file has whole, or not at all
+_SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
+_COLUMNS = [name for name in _SHAPES if _SHAPES[name].startswith("N") and name not in _FRESH]
 
 
 def write_archive(path: Path, archive: Archive) -> None:
     """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
-    known = {name: getattr(archive, name) for name in (*_SETTINGS, *PER_ELITE, *_JUDGED)}
-    content = {name: np.asarray(value) for name, value in known.items() if value is not None}
+    groups = [_SETTINGS, _FOUND, _GROUPED, *([_CROSSED, _VARIED] if archive.is_judged else [])]
+    values = {name: getattr(archive, name) for group in groups for name in group}
     if archive.fresh is not None:
-        content |= {_PREFIX + name: np.asarray(getattr(archive.fresh, name)) for name in FRESH}
-    if archive.faults is not None:
-        content |= {name: np.array(getattr(archive.faults, name), dtype=np.str_) for name in _CERTIFIERS}
-        counts = {name: getattr(archive.faults, name) for name in COUNTS}
-        content |= {name: values for name, values in counts.items() if values is not None}
-        content |= {"confirmed": archive.confirmed, "certified": archive.certified}
-    write_atomically(path, npz_bytes(content))
+        values |= {_PREFIX + name: column for name, column in vars(archive.fresh).items()}
+    arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
+    if archive.is_judged:
+        arrays |= {name: np.array(getattr(archive, name), dtype=np.str_) for name in _CERTIFIERS}
+        arrays |= {"confirmed": archive.confirmed, "certified": archive.certified}
+    write_atomically(path, npz_bytes(arrays))
 
 
 def read_archive(path: str | Path) -> Archive:
@@ -257,37 +263,31 @@ def read_archive(path: str | Path) -> Archive:
         raise FileNotFoundError(f"no archive at {file}: give a run directory or the {ARCHIVE_FILE} of one")
     try:
         stored = set(array_names(file))
-        names = [name for name in (*_SETTINGS, *PER_ELITE, *_JUDGED) if name not in _OPTIONAL or name in stored]
-        fresh_names = [_PREFIX + name for name in FRESH] if any(name.startswith(_PREFIX) for name in stored) else []
-        fault_names = [*_CERTIFIERS, *COUNTS] if not stored.isdisjoint((*_CERTIFIERS, *COUNTS)) else []
-        fault_names = [name for name in fault_names if name not in _VARIED or name in stored]
-        arrays = read_arrays(file, [*names, *fresh_names, *fault_names])
-        _check_shapes(arrays)
-        fresh = {name.removeprefix(_PREFIX): arrays[name] for name in fresh_names}
-        faults = {name: _as_field(name, arrays[name]) for name in fault_names}
-        return Archive(
-            **{name: _as_field(name, arrays[name]) for name in names},
-            fresh=FreshValues(**fresh) if fresh else None,
-            faults=FaultCounts(**faults) if faults else None,
-        )
+        names = [name for name in (*_SETTINGS, *_FOUND) if name not in _OPTIONAL or name in stored]
+        names += [name for group in _BY_JUDGING if not stored.isdisjoint(group) for name in group]
+        arrays = read_arrays(file, names)
+        _check(arrays)
+        values = {name: _to_field(name, array) for name, array in arrays.items()}
+        fresh = {name.removeprefix(_PREFIX): values.pop(name) for name in _FRESH if name in values}
+        values = no_outcomes(len(arrays["fitness"])) | values
+        return Archive(**values, fresh=FreshValues(**fresh) if fresh else None)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         raise ValueError(
             f"{file} must be the archive of a search, but it is damaged or another file: {error}"
         ) from None
 
 
-def _as_field(name: str, array: NDArray[Any]) -> Any:
-    """A field as the dataclass has it: settings and names as Python values, arrays as they are."""
+def _to_field(name: str, array: NDArray[Any]) -> Any:
+    """A field as the dataclass has it: settings and names as Python values, columns as they are."""
     if name not in (*_SETTINGS, *_CERTIFIERS):
         return array
     return tuple(array.tolist()) if array.ndim else array.item()
 
 
-def _check_shapes(arrays: dict[str, NDArray[Any]]) -> None:
+def _check(arrays: dict[str, NDArray[Any]]) -> None:
     """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
     sizes = {"2": 2, "4": len(OUTCOMES)}
-    dimensions = {name: _SHAPES.get(name.removeprefix(_PREFIX), "N") for name in arrays}
-    check_shapes(arrays, {name: [sizes.get(size, size) for size in shape] for name, shape in dimensions.items()})
+    check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
     for name, array in arrays.items():
         is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties", "cause")
         if array.dtype.kind not in ("U" if is_text else "bif"):

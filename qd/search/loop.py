@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.families import rank, summary_of
+from qd.faults.families import rank, summarise
 from qd.faults.minimise.results import read_minimal
 from qd.faults.numbers import fault_numbers, found_numbers
-from qd.search.archive import Archive, read_archive
+from qd.search.archive import Archive, no_outcomes, read_archive
 from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
 from qd.search.fitness import Evaluation, evaluation_of, join_evaluations
 from qd.search.pool import chance_to_stay
@@ -25,7 +25,7 @@ from qd.workers.shards import join_results
 from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import Interrupted, command_line, say
-from sim.robots.find import get_robot, scaled_by_another
+from sim.robots.find import get_robot, robot_of, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import get_space, is_own
@@ -229,6 +229,7 @@ def archive_of(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive
         scales=cfg.fitness.scales,
         iterations=iterations,
         **elites,
+        **no_outcomes(len(elites["cell"])),
     )
 
 
@@ -241,13 +242,16 @@ def say_what_stops_the_robot(
     """
     if not len(archive):
         return
-    ranking = rank(archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive), judged=True)
-    if not len(ranking.elites):
+    ranking = rank(
+        archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive), judged=True,
+        half_width=robot_of(archive.named(), robot, run).footprint[1],
+    )  # fmt: skip
+    if not len(ranking):
         return
-    say((summary_of(ranking, archive), "bold"), "." if archive.fresh else ", as found, not crossed again.")
+    say((summarise(ranking, archive), "bold"), "." if archive.fresh else ", as found, not crossed again.")
     number = ranking.worst(1)[0]
-    if ranking.elites.failing.any():
-        say(f"Worst: elite {number}, {ranking.name(ranking.elites.place_of(number))}.")
+    if ranking.failing.any():
+        say(f"Worst: elite {number}, {ranking.name(ranking.find_row(number))}.")
     flags = {"run": run, "robot": robot, "space": space}
     view = command_line("view", **flags, policies=[f"searched={policy}"] if policy else [])
     report = command_line("report", **flags, policy=policy)
@@ -255,7 +259,7 @@ def say_what_stops_the_robot(
     say("Next: ", (view, "cyan"), ", ", (report, "cyan"), " or ", (replay, "cyan"))
     if archive.fresh is None:
         say((command_line("judge", **flags, policy=policy), "cyan"), " says which of them are faults.")
-    elif not archive.counts.certifiers:
+    elif not archive.certifiers:
         train = command_line("finetune", robot=robot, specialist=run, policy=policy, space=space)
         say((train, "cyan"), " trains a controller to cross them: without another one no fault is known.")
 
@@ -266,7 +270,7 @@ def _written_archive(run: RunDirectory, archive: Archive) -> Archive | None:
         stored = read_archive(run.path)
     except (OSError, ValueError):
         return None  # it is made again
-    is_whole = stored.has_elites_of(archive) and run.read_summary().get("iterations") == archive.iterations
+    is_whole = stored.has_same_elites(archive) and run.read_summary().get("iterations") == archive.iterations
     return stored if is_whole else None
 
 

@@ -174,7 +174,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
 
     def _make_pack(self) -> None:
         from qd.evaluate.make_pack import make_pack
-        from qd.faults.judge import find_search
+        from qd.faults.searches import find_search
         from qd.search.directory import find_run
         from qd.workers.evaluator import Compute
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import UNCLEAR
 from qd.faults.families import rank
-from qd.faults.judge import CERTIFIERS_FOLDER, controllers_in
 from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
-from qd.faults.numbers import certifier_of
+from qd.faults.numbers import best_certifier
+from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.archive import Archive, read_archive
 from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
 from qd.search.fitness import FitnessCfg
@@ -101,15 +101,15 @@ class OpenedRun:
 
         They are of the robot's panel, of the run, or beside a published run.
         """
-        faults, folder = self.archive.counts, self.folder
-        names = dict(zip(faults.certifier_sha256, faults.certifiers, strict=True))
+        archive, folder = self.archive, self.folder
+        names = dict(zip(archive.certifier_sha256, archive.certifiers, strict=True))
         own = [*controllers_in(folder / CERTIFIERS_FOLDER).values(), str(folder.parent / f"{folder.name}.pt")]
         files = [*controllers_in(self.robot.panel).values(), *own]
         return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
 
     def certifier(self, number: int) -> str | None:
         """Name of the one of :meth:`certifiers` that crosses an elite most often; None if none has a certificate."""
-        return certifier_of(self.archive, number, self.certifiers())
+        return best_certifier(self.archive, number, self.certifiers())
 
     def minima(self) -> MinimalTerrains:
         """The minimal terrains of its elites."""
@@ -124,16 +124,17 @@ class OpenedRun:
         Without a number it is the worst elite. Labels name what stops the robot, where that is known.
         """
         archive, minima = self.archive, read_minimal(self.folder, self.archive)
+        half_width = self.robot.footprint[1]
         if minimal is not None:
             minima = self.minima()
-            numbers = minima.chosen(minimal, self.path)
+            numbers = minima.choose(minimal, self.path)
             known = [(minima.genes[n], f"minimal-{n}", f"minimal terrain {n}", minima.entry(n)) for n in numbers]
         else:
             if not elite and len(archive):
-                elite = str(rank(archive, self.space, minima).worst(1)[0])
+                elite = str(rank(archive, self.space, minima, half_width=half_width).worst(1)[0])
             numbers = choose_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
             known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
-        causes = rank(archive, self.space, minima, numbers=numbers).causes
+        causes = rank(archive, self.space, minima, half_width=half_width, numbers=numbers).causes
         return [
             EliteTerrain(n, genes, stem, label if cause in ("", UNCLEAR) else f"{label} ({cause})", entry)
             for n, (genes, stem, label, entry), cause in zip(numbers, known, causes, strict=True)

@@ -45,7 +45,9 @@ def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | Non
     archive, space, robot = opened_run.archive, opened_run.space, opened_run.robot
     terrains = opened_run.terrains(elite, minimal)
     minima = read_minimal(opened_run.folder, archive)
-    ranking = rank(archive, space, minima, numbers=[terrain.number for terrain in terrains])
+    ranking = rank(
+        archive, space, minima, half_width=robot.footprint[1], numbers=[terrain.number for terrain in terrains]
+    )
 
     if space.conditions:
         raise ValueError(
@@ -150,7 +152,7 @@ def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwri
 
 def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
     """An elite's verdict, cause, ending and numbers as JSON values: as found, and as 40 fresh episodes say, if any."""
-    elite, elites = int(ranking.elites.numbers[row]), ranking.elites
+    elite = int(ranking.numbers[row])
     names = ("fitness", "collision_rate", "goal_rate", "fallen_rate", "episodes")
 
     def numbers(values: Any) -> dict[str, Any]:
@@ -160,9 +162,9 @@ def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
     return {
         "robot": archive.robot,
         "elite": elite,
-        "verdict": VERDICTS[elites.verdict[row]] or "not failing",
+        "verdict": VERDICTS[ranking.verdict[row]] or "not failing",
         "cause": ranking.causes[row] or None,
-        "ending": elites.ending(row)[0] if elites.failing[row] else "crossed",
+        "ending": ranking.ending(row)[0] if ranking.failing[row] else "crossed",
         "in_words": ranking.name(row),
         "iteration": int(archive.iteration[elite]),
         **numbers(archive),

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
 from qd.faults.families import way_to_end
-from qd.faults.judge import CERTIFIERS_FOLDER, controllers_in
+from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
 from qd.show.replay import ReplaySource, save

@@ -19,6 +19,7 @@ from qd.search.directory import RUNS
 from qd.search.progress import Bar
 from qd.workers.cross import Cache
 from qd.workers.evaluator import episode_seeds
+from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.files.provenance import code_fingerprint
 from sim.recording.file import read_recording, write_recording
@@ -32,7 +33,6 @@ from sim.terrains.spaces.registry import get_space, identity, load_space
 FOLDER = RUNS / "recordings"
 AT_ONCE = 32
 """Terrains crossed side by side on a GPU."""
-_STREAM, _OWN_STREAM = 2, 4  # of the seeds of episodes on elites, and on a user's own terrains
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ def on_elite(
         label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
         terrain=archive.genes[number] if minimal is None else minimal,
         seed=seed,
-        terrain_seed=int(episode_seeds(seed, number, 1, stream=_STREAM)[0]),
+        terrain_seed=int(episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)[0]),
         space=get_space(archive.space, archive.space_sha256).name,
         **crossing,
     )
@@ -87,7 +87,7 @@ def on_elite(
 
 def on_heights(heights: NDArray[np.float32], *, seed: int = 0, **crossing: Any) -> Wanted:
     """Crossings of a user's own terrain; further arguments as of :class:`Wanted`."""
-    terrain_seed = int(episode_seeds(seed, 0, 1, stream=_OWN_STREAM)[0])
+    terrain_seed = int(episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)[0])
     return Wanted(terrain=heights, seed=seed, terrain_seed=terrain_seed, **crossing)
 
 

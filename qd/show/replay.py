@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from kernels.episode import Outcome
-from qd.faults.numbers import elite_words
+from qd.faults.numbers import describe_elite
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, folder_for
 from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of
@@ -270,8 +270,8 @@ def _describe_elite(run: OpenedRun, terrain: EliteTerrain, now: Evaluation) -> d
         "archive": archive,
         "elite": number,
         "terrain": minimal["words"] if minimal else run.space.describe(terrain.genes).splitlines(),
-        "minimal": run.minima().words(number) if minimal else "",
+        "minimal": run.minima().describe(number) if minimal else "",
         "verdict": (minimal or {}).get("verdict", "not judged"),
         "same_cell": same_cell,
-        "verdicts": elite_words(archive, number),
+        "verdicts": describe_elite(archive, number),
     }

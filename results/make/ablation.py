@@ -10,28 +10,31 @@ from typing import Any
 
 import numpy as np
 
-from qd.faults.families import families_of
-from qd.faults.judge import FRESH_STREAM, elite_seeds, fresh_values
+from qd.faults.families import find_families
 from qd.faults.numbers import FRESH_EPISODES, fresh_numbers
+from qd.faults.stages.base import elite_seeds
+from qd.faults.stages.fresh import fresh_values
 from qd.search.archive import Archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg
 from qd.workers.cross import Crossings
+from qd.workers.seeds import Stream
 from qd.workers.shards import arrays_of
 from results.make.common import ONCE, parse
 from sim.terrains.spaces.registry import get_space
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
-MOST_ELITES, STREAM = 200, 3  # of the random numbers that choose them
+MAX_ELITES = 200
 
 
 def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossings) -> dict[str, Any]:
     """What fresh episodes say of some of the elites that a search has found so far."""
-    rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=(STREAM,)))
-    some = archive.rows(np.sort(rng.choice(len(archive), min(len(archive), MOST_ELITES), replace=False)))
-    some = replace(some, family=families_of(some.genes, get_space(cfg.space)))
+    stream = (Stream.ABLATED_ELITES,)
+    rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=stream))
+    some = archive.rows(np.sort(rng.choice(len(archive), min(len(archive), MAX_ELITES), replace=False)))
+    some = replace(some, family=find_families(some.genes, get_space(cfg.space)))
     times = -(-FRESH_EPISODES // cfg.replicas)
-    genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=FRESH_STREAM)
+    genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=Stream.FRESH)
     label = "fresh episodes"
     result = crossings.cross(policy, genes, seeds, replicas=cfg.replicas, space=cfg.space, label=label)
     by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in arrays_of(result).items()}

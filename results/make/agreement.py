@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.families import families_of
+from qd.faults.families import find_families
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings, How
 from results.make.common import Script, agreement, crossing_rates, parse
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     return script.write(
         {
             **{
-                name: compare(of_set, families_of(genes, get_space(space)), script.seed)
+                name: compare(of_set, find_families(genes, get_space(space)), script.seed)
                 for (name, of_set), (genes, space) in zip(outcome.items(), sets.values(), strict=True)
             },
             "failing": int(fails["search"].sum()),

@@ -8,9 +8,10 @@ The first two are judged: contact resolved, a specialist trained on what fails, 
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from qd.faults.judge import Stage, judge
+from qd.faults.judge import judge
+from qd.faults.stages import STAGES
 from qd.search.directory import RunDirectory
 from results.make.common import CURVE_FILE, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically
@@ -52,7 +53,7 @@ def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
     What today's sources have judged in all stages is read.
     """
     numbers = RunDirectory(run).read_summary()
-    judged_by = [numbers.get("judged_by", {}).get(stage, {}) for stage in get_args(Stage)]
+    judged_by = [numbers.get("judged_by", {}).get(stage, {}) for stage in STAGES]
     if all(origin.get("sources_sha256") == script.origin["sources_sha256"] for origin in judged_by):
         return numbers
     archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)

@@ -20,7 +20,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.faults.judge import Stage, judge
+from qd.faults.judge import judge
 from qd.search.archive import Archive
 from qd.search.directory import RunDirectory, read_archive_of
 from qd.search.loop import search
@@ -169,7 +169,7 @@ def follow_search(
     cfg: SearchCfg,
     points: Sequence[int],
     counts: Sequence[str],
-    last_stages: Sequence[Stage] = ("fresh",),
+    last_stages: Sequence[str] = ("fresh",),
 ) -> list[dict[str, Any]]:
     """Extends a search to so many iterations one by one, and lets its elites cross fresh episodes after each.
 

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.judge import elite_seeds, judge, outcome_counts
+from qd.faults.judge import judge
 from qd.faults.minimise.minimise import minimise
 from qd.faults.numbers import EPISODES
+from qd.faults.stages.base import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.directory import RunDirectory
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.loop import search
 from qd.workers.cross import Crossings
+from qd.workers.seeds import Stream
 from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
 from sim.terrains.conditions.base import CONDITIONS
@@ -26,7 +28,6 @@ from sim.terrains.ground import joined_name
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 
 EPISODES_SEARCHED = 400_000
-_STREAM = 2000
 _EXAMPLES = 2
 """Of each kind of condition."""
 SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
@@ -47,7 +48,7 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
     """Which failing elites are crossed under nominal conditions, and which of these without one kind of condition."""
     space, rows = get_space(SPACE), np.flatnonzero(archive.failing)
     first = len(space.parts(archive.genes[0])) - len(space.conditions) if len(archive) else 0
-    seeds = elite_seeds(archive, script.seed, stream=_STREAM)
+    seeds = elite_seeds(archive, script.seed, stream=Stream.ABOUT_CONDITIONS)
     run = script.runs / "conditions"
     with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
 
@@ -57,7 +58,7 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             result = crossings.cross(
                 script.policy, genes, seeds[rows], replicas=EPISODES, space=SPACE, label=label, invalid_ok=True
             )
-            return goal_rates(outcome_counts(result))
+            return goal_rates(count_outcomes(result))
 
         again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]
         cured = again[rates(again, range(len(space.conditions)), "nominal conditions") >= FAILING_GOAL_RATE]
@@ -82,7 +83,7 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
                 "needs": kind,
                 "fault": bool(archive.is_fault[number]),
                 "conditions": space.condition_text(archive.genes[number]),
-                "minimal": minima.words(number) if minima else None,
+                "minimal": minima.describe(number) if minima else None,
             }
             for number, kind in examples.items()
         ],

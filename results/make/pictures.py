@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from qd.faults.judge import controllers_in
+from qd.faults.searches import controllers_in
 from qd.show.crossed import find_typical_episode, make_title
 from qd.show.elites import open_run
 from qd.show.figures import save_figure

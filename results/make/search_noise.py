@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from qd.faults.families import families_of
-from qd.faults.judge import FRESH_STREAM, elite_seeds, fresh_values, judge
+from qd.faults.families import find_families
+from qd.faults.judge import judge
 from qd.faults.numbers import FRESH_EPISODES
+from qd.faults.stages.base import elite_seeds
+from qd.faults.stages.fresh import fresh_values
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.pool import chance_to_stay
 from qd.workers.cross import Crossings
+from qd.workers.seeds import Stream
 from results.make.common import ONCE, Script, file_name, parse
 from sim.terrains.spaces.registry import get_space
 
@@ -51,7 +54,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     archive = judge(run, stages=("fresh",), compute=script.compute)
     assert archive.fresh is not None
     with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
-        seeds = elite_seeds(archive, cfg.seed, stream=FRESH_STREAM + 1000)
+        seeds = elite_seeds(archive, cfg.seed, stream=Stream.FRESH_AGAIN)
         again = crossings.cross(
             script.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=archive.space, label="once more",
             invalid_ok=True,
@@ -72,7 +75,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
         "two_lots_agree": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
         "failing_corrected": int(archive.failing[corrected].sum()),
         "families_corrected": len(
-            np.unique(families_of(archive.genes[corrected], get_space(archive.space, archive.space_sha256)))
+            np.unique(find_families(archive.genes[corrected], get_space(archive.space, archive.space_sha256)))
         ),
         "episodes_of_an_elite": float(np.median(archive.episodes)) if len(archive) else None,
     }

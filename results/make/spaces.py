@@ -9,6 +9,7 @@ from qd.search.archive import Archive
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from results.make.common import parse
+from sim.robots.shipped import ROBOTS
 from sim.terrains.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")
@@ -20,7 +21,8 @@ COUNTS = (
 
 def causes_of(archive: Archive) -> dict[str, int]:
     """How many elites fail by which cause, the commonest first."""
-    ranking = rank(archive, get_space(archive.space, archive.space_sha256), judged=True)
+    half_width = ROBOTS[archive.robot].footprint[1]
+    ranking = rank(archive, get_space(archive.space, archive.space_sha256), half_width=half_width, judged=True)
     return {cause: len(rows) for cause, rows in ranking.by_cause().items()}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qd.commands import ArchiveCommand
-from qd.faults.causes import causes_at, effects_of
+from qd.faults.causes import find_causes, find_effects
 from qd.faults.minimise.minimise import minimise
 from qd.search import settings
 from qd.search.archive import read_archive, write_archive
@@ -76,11 +76,11 @@ def test_effects_of_patches_are_parts_like_bumps():
     genes[64:96], genes[96:] = 1.0, -1.0
     genes[64 + 8 + 3] = -1.0  # slippery, right of the way
     genes[96 + 24] = 1.0  # soft, at the left edge
-    effects = effects_of(genes, range(72), SPACE)
+    effects = find_effects(genes, range(72), SPACE)
     changing = np.flatnonzero(effects.changes(1e-4)).tolist()
     assert changing == [8 + 8 + 3, 8 + 32 + 24]
     assert [effects.way(part, 0.3) for part in changing] == [(0.0, True), (0.0, False)]
     assert [effects.shape(part, 0.3).kind for part in changing] == ["slippery ground", "soft ground"]
     # Robots end on each of the three patches, of which one is as ground always is.
     ends = np.array([[7.0, 3.0], [1.0, 7.0], [7.0, 5.0]])
-    assert causes_at(genes[None].repeat(3, axis=0), ends, SPACE) == ["slippery ground", "soft ground", "unclear"]
+    assert find_causes(genes[None].repeat(3, axis=0), ends, SPACE, 0.4) == ["slippery ground", "soft ground", "unclear"]

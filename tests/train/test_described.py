@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.faults.judge import controllers_in
+from qd.faults.searches import controllers_in
 from sim.controllers.described import read_controller
 from sim.controllers.loaders import load_policy
 from sim.mujoco_c.crossing import cross, draw_starts

@@ -1,4 +1,4 @@
-"""Minimal terrains of a run, as its files have them."""
+"""Minimal terrains of a run, as its files hold them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,42 +21,43 @@ _ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "go
 
 @dataclass(frozen=True, kw_only=True)
 class MinimalTerrains:
-    """Minimal terrains of elites that are in an archive."""
+    """Minimal terrains of elites of an archive."""
 
     numbers: dict[str, Any]
-    """As ``minimal.json`` has them."""
+    """The content of ``minimal.json``."""
     genes: dict[int, NDArray[np.float32]]
     """By number of the elite, each of shape (num_genes,)."""
 
-    def chosen(self, text: str, run: object) -> list[int]:
+    def choose(self, text: str, run: object) -> list[int]:
         """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
         return choose_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
 
     def entry(self, number: int) -> dict[str, Any]:
-        """What ``minimal.json`` says of the minimal terrain of an elite."""
+        """The entry of an elite in ``minimal.json``."""
         return next(entry for entry in self.numbers["elites"] if entry["elite"] == number)
 
-    def words(self, number: int) -> str:
+    def describe(self, number: int) -> str:
         """What is known of the minimal terrain of an elite, in a sentence."""
         entry = self.entry(number)
         rate = format_value(entry["goal_rate"], entry["goal_interval"], ".0%")
-        words = f"{len(entry['bumps'])} of {entry['of']} parts; goal reached {rate} when they were found"
+        phrases = [f"{len(entry['bumps'])} of {entry['of']} parts", f"goal reached {rate} when they were found"]
         if entry["cause"]:
-            words += f"; cause: {entry['cause']['kind']}"
-        return words + (f"; margin {100 * entry['margin_m']:.1f} cm" if entry["margin_m"] is not None else "")
+            phrases.append(f"cause: {entry['cause']['kind']}")
+        if entry["margin_m"] is not None:
+            phrases.append(f"margin {100 * entry['margin_m']:.1f} cm")
+        return "; ".join(phrases)
 
 
 def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
-    """The minimal terrains of a run's folder; None where nobody looked for them.
-
-    What is of other elites than the archive's is left out; None if all are.
-    """
+    """The minimal terrains in a run's folder that are of elites of the archive; None if there are none."""
     file = folder / NUMBERS_FILE
     if not file.exists():
         return None
     try:
-        numbers, arrays = read_json(file), read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
-        entries, genes = numbers["elites"], arrays["genes"]
+        numbers = read_json(file)
+        arrays = read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
+        entries = numbers["elites"]
+        genes = arrays["genes"]
         shape = (len(entries), archive.genes.shape[1])
         if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
             raise ValueError(f"{NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")

@@ -6,31 +6,32 @@ it. Then its heights are scaled down together as long as it still fails.
 """
 
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Collection, Generator, Mapping
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, cycle
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.causes import effects_of
-from qd.faults.judge import Search, elite_seeds, outcome_counts
+from qd.faults.causes import find_effects
 from qd.faults.numbers import EPISODES, FRESH_EPISODES, fresh_counts
+from qd.faults.searches import Search
+from qd.faults.stages.base import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.cross import Crossings
+from qd.workers.seeds import Stream
 from sim.terrains.spaces.base import TerrainSpace
 
 SCALE_STEPS = 5
 """Halvings of the interval that holds the least scale which still fails: it is known to 1/32."""
-MOST_PARTS = 10
+MAX_PARTS = 10
 """Parts of a terrain whose subsets, 1,024 at most, are all crossed if need be."""
 LEAST_EFFECT_M = 1e-4
 """A part that changes no height by more is none [m]."""
 
 _ROW_EPISODES = 5  # of a row of genes; the episodes of a trial are spread over workers by rows
-_STREAM, _FRESH_STREAM = 11, 12
 
 How = Literal["exhaustive", "greedy"]
 Parts = tuple[int, ...]
@@ -38,13 +39,13 @@ Parts = tuple[int, ...]
 
 
 class Trial(NamedTuple):
-    """What is left of a terrain, to be crossed."""
+    """Some parts of a terrain, to be crossed."""
 
     parts: Parts
     scale: float = 1.0
     """What their heights are multiplied by."""
     fresh: bool = False
-    """Whether by 40 episodes, with other seeds than the 20 by which a subset is found."""
+    """Whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found."""
 
     @property
     def rows(self) -> int:
@@ -54,17 +55,17 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A failing terrain that is taken apart; episodes are counted by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
+    """A failing terrain that is taken apart; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
 
     parts: Parts
-    """Parts that shape its ground, in the order in which they are taken away."""
+    """Parts that change it, in the order in which they are taken away."""
     how: How
     """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
     scalable: bool
     flat: Parts = ()
-    """Parts that change no height, such as slippery patches. Where they alone are left, nothing is scaled."""
+    """Parts that change no height: slippery patches, conditions. A terrain of these alone is not scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
-    """Episodes of what was crossed; those of all parts together, the elite's fresh ones, are there from the start."""
+    """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
 
     @property
     def whole(self) -> Parts:
@@ -75,42 +76,39 @@ class Case:
         """Whether the controller fails it; too many invalid episodes say nothing."""
         return bool(goal_rates(self.counts[trial]) < FAILING_GOAL_RATE)
 
-    def known_best(self, parts: Parts) -> Trial:
-        """The fresh episodes of some parts if they were crossed, else the 20."""
+    def best_trial(self, parts: Parts) -> Trial:
+        """The fresh trial of some parts if it was crossed, else that of 20 episodes."""
         fresh = Trial(parts, fresh=True)
         return fresh if fresh in self.counts else Trial(parts)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Minimal:
-    """A minimal terrain; episodes are counted by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
+    """A minimal terrain; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
 
     parts: Parts
     """Parts that it takes to fail."""
     counts: NDArray[np.int64]
-    """Its 40 fresh episodes."""
+    """Of its 40 fresh episodes."""
     without: dict[int, NDArray[np.int64]]
-    """Episodes without one of the parts, by its number."""
+    """Outcomes without one of the parts, by its number."""
     scale: float | None
-    """Least scale of the heights that was crossed and fails; None if there are none, or they cannot be scaled."""
+    """Least scale of the heights that was crossed and fails; None if they cannot be scaled."""
     passing_scale: float | None
-    """Largest scale below it that was crossed and does not fail; None if none was."""
+    """Largest scale below it that was crossed and does not fail; None if there is none."""
     scales: dict[float, NDArray[np.int64]]
-    """Episodes by scale."""
+    """Outcomes by scale."""
     subsets: int
     """How many subsets were crossed for it."""
 
     def cause(self, rank: Mapping[int, float]) -> int | None:
-        """The part without which most robots arrive; None if the terrain fails without any part.
-
-        Of parts without which equally many do, it is that of the largest ``rank``.
-        """
+        """The part without which most robots arrive, among equals that of the largest ``rank``; None without parts."""
         rates = {part: float(goal_rates(counts)) for part, counts in self.without.items()}
         return max(rates, key=lambda part: (np.nan_to_num(rates[part], nan=-1.0), rank[part]), default=None)
 
 
 Steps = Generator[list[Trial], None, Any]
-"""Yields trials to be crossed, whose episodes are in the counts of the case when it goes on."""
+"""Yields trials to be crossed; their outcomes are in the counts of the case when it goes on."""
 
 
 def find_minimal(case: Case) -> Steps:
@@ -121,7 +119,7 @@ def find_minimal(case: Case) -> Steps:
     return Minimal(
         parts=parts,
         counts=case.counts[Trial(parts, fresh=True)],
-        without={part: case.counts[case.known_best(_rest(parts, part))] for part in parts},
+        without={part: case.counts[case.best_trial(_rest(parts, part))] for part in parts},
         scale=scale,
         passing_scale=passing,
         scales={trial.scale: case.counts[trial] for trial in case.counts if trial.scale != 1.0},
@@ -156,14 +154,18 @@ def _exhaustive(case: Case) -> Steps:
 def _greedy(case: Case) -> Steps:
     """A subset that fails, of which no part can be taken away."""
     while True:
-        parts, place, needed = case.whole, 0, 0
-        while needed < len(parts):  # each part is needed since one was taken away the last time
-            part, place = case.parts[place % len(case.parts)], place + 1
+        parts, num_needed = case.whole, 0
+        for part in cycle(case.parts):
+            if num_needed == len(parts):  # each is needed since one was taken away the last time
+                break
             if part not in parts:
                 continue
             rest = _rest(parts, part)
-            yield from _missing(case, case.known_best(rest))
-            parts, needed = (rest, 0) if case.fails(case.known_best(rest)) else (parts, needed + 1)
+            yield from _missing(case, case.best_trial(rest))
+            if case.fails(case.best_trial(rest)):
+                parts, num_needed = rest, 0
+            else:
+                num_needed += 1
         fresh = Trial(parts, fresh=True)
         yield from _missing(case, fresh)
         if case.fails(fresh) or parts == case.whole:
@@ -176,12 +178,15 @@ def _scaled(case: Case, parts: Parts) -> Steps:
     for _ in range(SCALE_STEPS):
         trial = Trial(parts, scale=(passing + failing) / 2)
         yield from _missing(case, trial)
-        passing, failing = (passing, trial.scale) if case.fails(trial) else (trial.scale, failing)
+        if case.fails(trial):
+            failing = trial.scale
+        else:
+            passing = trial.scale
     return failing, passing or None
 
 
-def genes_of(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> NDArray[np.float32]:
-    """Genes of what is left of a terrain, shape (num_genes,)."""
+def cut_genes(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> NDArray[np.float32]:
+    """Genes of the parts of a terrain that a trial crosses, shape (num_genes,)."""
     gone = [part for part in range(len(space.parts(genes))) if part not in trial.parts]
     left = space.without(genes[None], gone)
     scaled = space.scaled(left, trial.scale) if trial.scale != 1.0 else left
@@ -189,20 +194,21 @@ def genes_of(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> N
     return scaled[0]
 
 
-def case_of(
+def open_case(
     archive: Archive, number: int, space: TerrainSpace, half_width: float, how: How | None, *, on_gpu: bool
 ) -> Case:
-    """A failing elite, which has fresh values, that is to be taken apart; ``how`` is what suits the device if None."""
+    """The case of a failing elite, which has fresh values; ``how`` is what suits the device if None."""
     genes = archive.genes[number]
-    if not (words := space.parts(genes)):
+    num_parts = len(space.parts(genes))
+    if not num_parts:
         raise ValueError(f"space must have parts(genes) and without(genes, parts), got {space.name} without parts")
-    effects = effects_of(genes, range(len(words)), space)
+    effects = find_effects(genes, range(num_parts), space)
     parts = np.flatnonzero(effects.changes(LEAST_EFFECT_M)).tolist()
-    if how == "exhaustive" and len(parts) > MOST_PARTS:
-        raise ValueError(f"how must be greedy with over {MOST_PARTS} parts, got {len(parts)} of elite {number}")
+    if how == "exhaustive" and len(parts) > MAX_PARTS:
+        raise ValueError(f"how must be greedy with over {MAX_PARTS} parts, got {len(parts)} of elite {number}")
     return Case(
         parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
-        how=how or ("exhaustive" if on_gpu and len(parts) <= MOST_PARTS else "greedy"),
+        how=how or ("exhaustive" if on_gpu and len(parts) <= MAX_PARTS else "greedy"),
         scalable=space.scaled(genes[None], 0.5) is not None,
         flat=tuple(part for part in parts if np.abs(effects.heights[part]).max() <= LEAST_EFFECT_M),
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
@@ -212,33 +218,41 @@ def case_of(
 def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crossings: Crossings) -> dict[int, Minimal]:
     """Finds the minimal terrains of some elites, all of them together, by number of the elite; counts of cases grow.
 
-    All subsets of an elite are crossed from the same starts; the fresh episodes have others. Starts follow from the
+    All subsets of an elite are crossed from the same starts, fresh episodes from others. Starts follow from the
     search's seed and from what names the elite.
     """
     seeds = {}
-    for fresh, stream in ((False, _STREAM), (True, _FRESH_STREAM)):
+    for fresh, stream in ((False, Stream.MINIMISED), (True, Stream.MINIMISED_FRESH)):
         times = Trial((), fresh=fresh).rows
         seeds[fresh] = elite_seeds(archive, search.cfg.seed, times, stream=stream).reshape(-1, times)
-    subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values() if case.how == "exhaustive"]
-    most_rows = max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
     minima = dict[int, Minimal]()
-    while True:
-        trials = list[tuple[int, Trial]]()
-        for number, step in list(steps.items()):
-            try:
-                trials += [(number, trial) for trial in next(step)]
-            except StopIteration as end:
-                minima[number] = end.value
-                del steps[number]
-        if not trials:
-            return dict(sorted(minima.items()))
-        rows = [[genes_of(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
+    while trials := _next_trials(steps, minima):
+        rows = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
         result = crossings.cross(
             search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
-            replicas=_ROW_EPISODES, space=search.space.name, at_most=most_rows, invalid_ok=True,
+            replicas=_ROW_EPISODES, space=search.space.name, at_most=_max_rows(cases.values()), invalid_ok=True,
             label=f"{len(minima)} of {len(cases)} elites done",
         )  # fmt: skip
         ends = np.cumsum([trial.rows for _, trial in trials])
-        for (number, trial), counts in zip(trials, np.split(outcome_counts(result), ends[:-1]), strict=True):
+        for (number, trial), counts in zip(trials, np.split(count_outcomes(result), ends[:-1]), strict=True):
             cases[number].counts[trial] = counts.sum(axis=0)
+    return dict(sorted(minima.items()))
+
+
+def _next_trials(steps: dict[int, Steps], minima: dict[int, Minimal]) -> list[tuple[int, Trial]]:
+    """Trials of all elites that are not done, by number; adds the minimal terrains of those that are."""
+    trials = list[tuple[int, Trial]]()
+    for number, step in list(steps.items()):
+        try:
+            trials += [(number, trial) for trial in next(step)]
+        except StopIteration as end:
+            minima[number] = end.value
+            del steps[number]
+    return trials
+
+
+def _max_rows(cases: Collection[Case]) -> int:
+    """Rows of genes that one call crosses at most."""
+    subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases if case.how == "exhaustive"]
+    return max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)

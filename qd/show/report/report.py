@@ -49,8 +49,10 @@ def write_report(
         return write_rounds(run, robot, out)
     opened_run = open_run(robot, run, space=space)
     archive, minima = opened_run.archive, read_minimal(opened_run.folder, opened_run.archive)
-    ranking, missing = rank(archive, opened_run.space, minima, judged=True), list[str]()
-    if not len(ranking.elites):
+    half_width = opened_run.robot.footprint[1]
+    ranking = rank(archive, opened_run.space, minima, half_width=half_width, judged=True)
+    missing = list[str]()
+    if not len(ranking):
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
     crosser = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
     suffix = "" if policy is None else opened_run.suffix(crosser)
@@ -61,10 +63,10 @@ def write_report(
         about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
         compared = compare_controllers(read_tables(tables, opened_run.robot), **about)
     content = collect_content(opened_run, ranking, minima, crosser, is_searched=not suffix)
-    heads = [n for n in ranking.worst(num_elites) if ranking.elites.failing[ranking.elites.place_of(n)]]
+    heads = [n for n in ranking.worst(num_elites) if ranking.failing[ranking.find_row(n)]]
     heads = heads or ranking.worst(num_elites)
-    causes = {ranking.causes[ranking.elites.place_of(number)] for number in heads}
-    firsts = [int(ranking.elites.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
+    causes = {ranking.causes[ranking.find_row(number)] for number in heads}
+    firsts = [int(ranking.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
     others, cases = firsts[:_OTHER_CAUSES], {}
     if reason := _why_not_crossed(opened_run, policy, device):
         missing.append(reason)
@@ -149,12 +151,12 @@ def _case(
     if other is not None:
         rate = count_rates(other[1])[ARRIVED]
         beside = {"name": other[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
-    arrived, row = count_rates(recording)[ARRIVED], ranking.elites.place_of(number)
+    arrived, row = count_rates(recording)[ARRIVED], ranking.find_row(number)
     title = f"{archive.robot}, elite {number} of {len(archive):,}: {arrived.count} crossings"
     return {
         "number": number,
         "name": ranking.name(row),
-        "verdict": VERDICTS[int(ranking.elites.verdict[row])],
+        "verdict": VERDICTS[int(ranking.verdict[row])],
         "source": sources[0],
         "time_s": failure.time_s,
         "conditions": opened_run.space.condition_text(archive.genes[number]),
@@ -166,9 +168,9 @@ def _case(
 
 def _rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
     """Who reaches the goal how often: here, when the elite was found or judged, and under other conditions."""
-    elites, number = ranking.elites, int(ranking.elites.numbers[row])
-    tries = "fresh tries" if elites.fresh[row] else "tries of the search"
-    rates = {"for this page": arrived, tries: Rate(elites.hits("goal_rate", row), int(elites.counted[row]))}
+    number = int(ranking.numbers[row])
+    tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
+    rates = {"for this page": arrived, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
     rates |= {who: Rate(*rate) for who, rate in further_rates(archive, number).items()}
     rows = [[name, f"{rate.hits} of {rate.count}", rate.limits] for name, rate in rates.items()]
     return Table(head=["goal reached", "", "95 % interval"], rows=rows)

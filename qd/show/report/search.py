@@ -1,12 +1,12 @@
 """The page about a search, in data: how the controller fails, on which terrains, and where the numbers come from."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.families import VERDICTS, Ranking, summary_of
+from qd.faults.causes import describe_cause
+from qd.faults.families import VERDICTS, Ranking, summarise
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.faults.numbers import fault_numbers
 from qd.search.archive import Archive
@@ -31,7 +31,7 @@ def collect_content(
 ) -> dict[str, Any]:
     """What the template takes, beside the terrains that a controller crossed for the page."""
     archive, search, run = opened_run.archive, opened_run.search(), RunDirectory(opened_run.folder)
-    elites, space, (searched, _) = ranking.elites, opened_run.space, opened_run.as_searched()
+    space, (searched, _) = opened_run.space, opened_run.as_searched()
     metrics = _metrics_of(run, archive)
     controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
     if search is None and opened_run.suffix(resolve_policy(SHIPPED, opened_run.robot)):
@@ -45,14 +45,14 @@ def collect_content(
         "controller": controller,
         "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
         "place": without_machine(str(opened_run.path)),
-        "summary": summary_of(ranking, archive),
-        "failing": int(elites.failing.sum()),
-        "certifiers": " or ".join(archive.counts.certifiers),
+        "summary": summarise(ranking, archive),
+        "failing": int(ranking.failing.sum()),
+        "certifiers": " or ".join(archive.certifiers),
         "numbers": fault_numbers(archive),
-        "fault_families": len(np.unique(ranking.families[elites.verdict == _FAULT])),
-        "means": {name: format_mean(getattr(elites, f"{name}_rate"), ranking.families) for name in _MEANS},
+        "fault_families": len(np.unique(ranking.families[ranking.verdict == _FAULT])),
+        "means": {name: format_mean(getattr(ranking, f"{name}_rate"), ranking.families) for name in _MEANS},
         "causes": causes_of(ranking),
-        "tiles": draw_sheet(archive.genes[elites.numbers], space),
+        "tiles": draw_sheet(archive.genes[ranking.numbers], space),
         "elites": _listed_elites(ranking),
         "minimal_tiles": None if minima is None else draw_sheet(np.array([*minima.genes.values()]), space),
         "minimal": None if minima is None else _listed_minima(minima),
@@ -98,7 +98,7 @@ def causes_of(ranking: Ranking) -> list[dict[str, Any]]:
         {
             "name": name,
             "failing": len(rows),
-            "faults": int((ranking.elites.verdict[rows] == _FAULT).sum()),
+            "faults": int((ranking.verdict[rows] == _FAULT).sum()),
             "share": 100.0 / longest,
             "tile": tile,
         }
@@ -108,14 +108,14 @@ def causes_of(ranking: Ranking) -> list[dict[str, Any]]:
 
 def _listed_elites(ranking: Ranking) -> dict[str, Any]:
     """Every elite, faults first, then what fails most: places of pictures with words, and columns not for a phone."""
-    elites, rows = ranking.elites, []
-    for row in elites.by_severity().tolist():
-        rates = (elites.collision_rate[row], elites.fallen_rate[row])
-        rate = Rate(elites.hits("goal_rate", row), int(elites.counted[row]))
+    rows = []
+    for row in ranking.by_severity().tolist():
+        rates = (ranking.collision_rate[row], ranking.fallen_rate[row])
+        rate = Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))
         cells = [
-            f"{elites.numbers[row]}", ranking.name(row), VERDICTS[int(elites.verdict[row])],
-            f"{100 * elites.goal_rate[row]:.0f}", rate.limits, *(f"{100 * value:.0f}" for value in rates),
-            f"{ranking.families[row]}", f"{elites.fitness[row]:.1f}",
+            f"{ranking.numbers[row]}", ranking.name(row), VERDICTS[int(ranking.verdict[row])],
+            f"{100 * ranking.goal_rate[row]:.0f}", rate.limits, *(f"{100 * value:.0f}" for value in rates),
+            f"{ranking.families[row]}", f"{ranking.fitness[row]:.1f}",
         ]  # fmt: skip
         rows.append((row, cells))
     head = ["elite", "what happens", "verdict", "goal [%]", "95 % interval", "base collision [%]", "fallen [%]",
@@ -129,7 +129,7 @@ def _listed_minima(minima: MinimalTerrains) -> dict[str, Any]:
     for place, entry in enumerate(minima.numbers["elites"]):
         cells = [
             f"{entry['elite']}",
-            _shape_words(entry["cause"]),
+            describe_cause(entry["cause"]),
             f"{len(entry['bumps'])} of {entry['of']}",
             "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
             "{:.0f} to {:.0f} %".format(*(100 * limit for limit in entry["goal_interval"])),
@@ -139,15 +139,3 @@ def _listed_minima(minima: MinimalTerrains) -> dict[str, Any]:
         rows.append((place, cells))
     head = ["elite", "cause", "parts left", "goal [%]", "95 % interval", "margin [cm]", "verdict"]
     return {"head": head, "rows": rows, "wide": (3, 5, 6)}
-
-
-def _shape_words(cause: Mapping[str, Any] | None) -> str:
-    """A cause with its size: ``ridge, 0.25 m high, 53 degrees steep``."""
-    if cause is None:
-        return "unclear"
-    height = cause.get("height_m")
-    if not height:
-        return cause["kind"]
-    steep = f", {cause['slope_deg']:.0f} degrees steep" if "slope_deg" in cause else ""
-    deep = any(word in cause["kind"] for word in ("drop", "hollow", "ditch", "trench"))
-    return f"{cause['kind']}, {abs(height):.2f} m {'deep' if deep else 'high'}{steep}"

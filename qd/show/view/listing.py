@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qd.faults.families import ORDERS, VERDICTS, Ranking, rank
 from qd.faults.minimise.minimise import MinimalTerrains
-from qd.faults.numbers import certifier_of, elite_words
+from qd.faults.numbers import best_certifier, describe_elite
 from qd.search.archive import Archive
 from qd.show.crossed import ARRIVED, FAILED, count_rates
 from sim.crossing import CrossingCfg
@@ -47,12 +47,14 @@ class Listing:
     archive: Archive
     """It has at least one."""
     space: TerrainSpace
+    half_width: float
+    """Of the robot's stance [m]."""
     minima: MinimalTerrains | None = None
 
     @cached_property
     def ranking(self) -> Ranking:
         """All elites, their causes and families."""
-        return rank(self.archive, self.space, self.minima)
+        return rank(self.archive, self.space, self.minima, half_width=self.half_width)
 
     @cached_property
     def _orders(self) -> dict[str, NDArray[np.int64]]:
@@ -74,7 +76,7 @@ class Listing:
 
     def verdict(self, number: int) -> str:
         """One of :data:`qd.faults.families.VERDICTS`."""
-        return VERDICTS[int(self.ranking.elites.verdict[number])]
+        return VERDICTS[int(self.ranking.verdict[number])]
 
     def render_list(self, listed: NDArray[np.int64], picked: int) -> str:
         """HTML of the elites, one below the other; a click on one shows it (``page.js``)."""
@@ -86,7 +88,7 @@ class Listing:
         drawn = [*np.setdiff1d(np.arange(len(self.archive)), listed), *listed[::-1]]
         colors = dict.fromkeys(drawn, _GREY) | dict.fromkeys(listed, _LISTED)
         colors.pop(picked)
-        positions = self.ranking.elites.end_position
+        positions = self.ranking.end_position
         dots = [
             (number, positions[number].tolist(), color, 6 if color == _PICKED else 3)
             for number, color in (colors | {picked: _PICKED}).items()
@@ -97,19 +99,17 @@ class Listing:
 
     def columns(self, number: int) -> Sequence[Column]:
         """Episodes on the whole terrain: fresh, finer contact, varied conditions, and of the best certifier."""
-        elites = self.ranking.elites
-        faults = self.archive.faults
-        head = "fresh" if elites.fresh[number] else "as found"
+        ranking = self.ranking
+        archive = self.archive
+        head = "fresh" if ranking.is_fresh[number] else "as found"
         columns: list[Column] = [
-            (head, int(elites.counted[number]), {name: elites.hits(name, number) for name in _RATES})
+            (head, int(ranking.counted[number]), {name: ranking.hits(name, number) for name in _RATES})
         ]
-        if faults is None:
-            return columns
-        outcomes_by_head = {"finer contact": faults.resolved_outcomes[number]}
-        if faults.varied_outcomes is not None:
-            outcomes_by_head["varied"] = faults.varied_outcomes[number]
-        if name := certifier_of(self.archive, number):
-            outcomes_by_head[name] = faults.certifier_outcomes[number, faults.certifiers.index(name)]
+        outcomes_by_head = {"finer contact": archive.resolved_outcomes[number]}
+        if archive.varied_outcomes is not None:
+            outcomes_by_head["varied"] = archive.varied_outcomes[number]
+        if name := best_certifier(archive, number):
+            outcomes_by_head[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
         for head, outcomes in outcomes_by_head.items():
             if outcomes.any():
                 goal, collided, other, _ = outcomes.tolist()
@@ -122,13 +122,13 @@ class Listing:
         ranking = self.ranking
         kin = int((ranking.families == ranking.families[number]).sum()) - 1
         paragraphs = [
-            *elite_words(self.archive, number),
+            *describe_elite(self.archive, number),
             f"{kin or 'No'} other elite{'s' * (kin > 1)} like it (within 6 cm).",
-            f"Fitness **{ranking.elites.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
+            f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
             f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",
         ]
         if self.minima is not None and number in self.minima.genes:
-            paragraphs.insert(0, f"**Minimal terrain**: {self.minima.words(number)}.")
+            paragraphs.insert(0, f"**Minimal terrain**: {self.minima.describe(number)}.")
         return "\n\n".join(paragraphs)
 
 

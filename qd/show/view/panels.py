@@ -15,7 +15,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from viser import uplot
 
-from qd.faults.families import ORDERS, summary_of
+from qd.faults.families import ORDERS, summarise
 from qd.show.crossed import ENDINGS
 from qd.show.figures import get_penalty_label, get_penalty_look
 from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
@@ -110,7 +110,7 @@ class ArchivePanel:
         if tab.window[0] < _WIDE:
             panel.minimize()
         with panel.add_tab("Archive"):
-            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary_of(listing.ranking, listing.archive))}.</b>"))
+            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summarise(listing.ranking, listing.archive))}.</b>"))
             orders = {label: name for name, label in ORDERS.items()}
             choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", listing.causes(), partial(choose, "cause"))

@@ -39,7 +39,10 @@ class ViewedRun:
     @cached_property
     def listing(self) -> Listing:
         """All elites, and the orders to list them in."""
-        return Listing(archive=self.opened_run.archive, space=self.opened_run.space, minima=self.minima)
+        return Listing(
+            archive=self.opened_run.archive, space=self.opened_run.space, minima=self.minima,
+            half_width=self.robot.footprint[1],
+        )  # fmt: skip
 
     @property
     def robot(self) -> RobotCfg:
@@ -63,9 +66,9 @@ class ViewedRun:
         name = self.opened_run.certifier(number)
         if name is not None and self.controllers.get(name) == self.opened_run.certifiers()[name]:
             return name, ""
-        if archive.faults is None or not archive.certified[number]:
+        if not archive.certified[number]:
             return None, "No other controller is known to cross it." if archive.failing[number] else ""
-        names = compress(archive.faults.certifiers, archive.faults.certificates()[number].tolist())
+        names = compress(archive.certifiers, archive.certificates[number].tolist())
         return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."
 
 

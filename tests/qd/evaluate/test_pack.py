@@ -20,8 +20,9 @@ from qd.evaluate.pack import (
     summarise_rates,
     write_terrains,
 )
-from qd.faults.judge import find_search, judge
+from qd.faults.judge import judge
 from qd.faults.minimise.minimise import minimise
+from qd.faults.searches import find_search
 from qd.search.archive import read_archive
 from sim.controllers.spec import controller_identity
 from sim.files.command import run_command

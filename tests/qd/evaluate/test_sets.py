@@ -110,8 +110,10 @@ def test_elites_carry_the_certificates_of_their_rows():
     # The controller fails all of 30 elites, a certifier crosses the first 20.
     ends = np.repeat([[[20, 0, 0, 0]], [[0, 20, 0, 0]]], [20, 10], axis=0)
     counts = {"certifier_outcomes": ends, "certifier_resolved_outcomes": ends}
-    faults = replace(make_archive(30).counts, certifiers=("C-G",), certifier_sha256=("a" * 64,), **counts)
-    archive = replace(make_archive(30), fresh=fresh_values(make_archive(30)), faults=faults, policy_sha256="f" * 64)
+    archive = replace(
+        make_archive(30), fresh=fresh_values(make_archive(30)), certifiers=("C-G",), certifier_sha256=("a" * 64,),
+        policy_sha256="f" * 64, **counts,
+    )  # fmt: skip
     generated = generated_set(archive, 300, 0)
     certified = split_elites(archive).test < 20
     np.testing.assert_array_equal(generated.certified, certified)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qd.faults.causes import effects_of, on_the_way, shape_of
+from qd.faults.causes import find_effects, largest_height, measure_shape
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -20,7 +20,7 @@ def plateau(x_from, x_to, height, *, y_from=-1.0, y_to=9.0, run=0.5, turn=0.0):
 
 
 def test_a_ramp_by_hand():
-    shape = shape_of(plateau(6.0, 12.0, 0.2), HALF_WIDTH)  # .2 m over .5 m: 21.8 degrees
+    shape = measure_shape(plateau(6.0, 12.0, 0.2), HALF_WIDTH)  # .2 m over .5 m: 21.8 degrees
     assert shape.kind == "rise"
     assert (shape.height_m, shape.across_deg) == (0.2, 0.0)
     assert shape.slope_deg == shape.along_deg == pytest.approx(np.rad2deg(np.arctan(0.4)), abs=1e-3)
@@ -50,21 +50,21 @@ def test_a_ramp_by_hand():
     ],
 )
 def test_kinds(field, kind):
-    assert shape_of(field, HALF_WIDTH).kind == kind
+    assert measure_shape(field, HALF_WIDTH).kind == kind
 
 
 def test_the_angle_to_the_way_and_the_reach_to_either_side():
-    shape = shape_of(plateau(6.0, 12.0, 0.2, turn=np.deg2rad(40)), HALF_WIDTH)
+    shape = measure_shape(plateau(6.0, 12.0, 0.2, turn=np.deg2rad(40)), HALF_WIDTH)
     assert shape.oblique_deg == pytest.approx(40, abs=2)  # a little more at the foot of the ramp
     assert shape.slope_deg == pytest.approx(np.rad2deg(np.arctan(0.4)), abs=0.5)
     for sides, reach in (((3.8, 9.0), (4.05, 0.25)), ((-1.0, 4.12), (0.15, 4.05))):  # the way is at y = 4
-        shape = shape_of(plateau(7.0, 7.6, 0.2, run=0.05, y_from=sides[0], y_to=sides[1]), HALF_WIDTH)
+        shape = measure_shape(plateau(7.0, 7.6, 0.2, run=0.05, y_from=sides[0], y_to=sides[1]), HALF_WIDTH)
         assert (shape.left_m, shape.right_m) == pytest.approx(reach)
 
 
 def test_parts_are_told_from_the_rest():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
-    fields = effects_of(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
+    fields = find_effects(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
     others = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
     np.testing.assert_allclose(fields.sum(axis=0), others, atol=1e-6)
-    assert on_the_way(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
+    assert largest_height(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()

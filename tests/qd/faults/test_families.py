@@ -5,11 +5,16 @@ import dataclasses
 import numpy as np
 
 from kernels.super_gaussian import LOWER, UPPER
-from qd.faults.families import KIN_M, ORDERS, elites_of, families_of, rank, summary_of
+from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise
 from qd.faults.minimise.minimise import MinimalTerrains
+from qd.search.archive import no_outcomes
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
+
+
+def ranked(archive, minima=None, **chosen):
+    return rank(archive, SUPER_GAUSSIAN, minima, half_width=0.4, **chosen)
 
 
 def bump(*, x, sigma_x, height, y=4.0):
@@ -20,19 +25,19 @@ def bump(*, x, sigma_x, height, y=4.0):
 
 def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid():
     archive = small_archive(4)
-    elites = elites_of(archive)
-    assert not elites.fresh.any() and elites.numbers.tolist() == [0, 1, 2, 3]
+    elites = ranked(archive)
+    assert not elites.is_fresh.any() and elites.numbers.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(elites.goal_rate, archive.goal_rate)
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 40, 8, 0]))
-    corrected = elites_of(dataclasses.replace(archive, fresh=fresh), judged=True)
-    assert corrected.fresh.all() and corrected.numbers.tolist() == [0, 2, 3]
+    corrected = ranked(dataclasses.replace(archive, fresh=fresh), judged=True)
+    assert corrected.is_fresh.all() and corrected.numbers.tolist() == [0, 2, 3]
     assert corrected.counted.tolist() == [40, 32, 40]
     np.testing.assert_array_equal(corrected.fitness, archive.fitness[[0, 2, 3]] / 2)
-    assert [corrected.place_of(number) for number in (0, 2, 3)] == [0, 1, 2]
+    assert [corrected.find_row(number) for number in (0, 2, 3)] == [0, 1, 2]
 
 
 def test_verdicts_come_before_rates_and_rates_before_fitness():
-    elites = elites_of(judged_archive())
+    elites = ranked(judged_archive())
     assert elites.verdict.tolist() == [4, 3, 2, 1, 0]  # fault, confirmed, certified, failing, not failing
     assert elites.by_severity().tolist() == [0, 1, 2, 3, 4]
     archive = dataclasses.replace(
@@ -42,18 +47,18 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
         fallen_rate=np.array([0.0, 0.0, 0.5, 0.0, 0.1]),
         fitness=np.array([9.0, 5.0, 4.0, 3.0, 2.0]),
     )
-    elites = elites_of(archive)
+    elites = ranked(archive)
     assert elites.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
     assert elites.by_severity().tolist() == [4, 3, 2, 1, 0]
 
 
-def minima_of(causes):
+def minima_with(causes):
     """Minimal terrains with causes of some kinds, by number of the elite."""
     entries = [{"elite": number, "cause": cause and {"kind": cause}} for number, cause in causes.items()]
     return MinimalTerrains(numbers={"elites": entries}, genes={})
 
 
-def ranked(ends=(np.nan, np.nan)):
+def six_elites(ends=(np.nan, np.nan)):
     """Six elites, worse from the first to the fifth, of which the third is a fault; the last is crossed."""
     archive = dataclasses.replace(
         small_archive(6),
@@ -62,20 +67,17 @@ def ranked(ends=(np.nan, np.nan)):
         fallen_rate=np.array([0.0, 0.0, 0.25, 0.75, 1.0, 0.0]),
         end_position=np.full((6, 2), ends, np.float32),
     )
-    fresh = fresh_values(archive)
-    faults = archive.counts
     crossed = np.array([[0, 20, 0, 0], [20, 0, 0, 0]])[[0, 0, 1, 0, 0, 0]][:, None]
-    faults = dataclasses.replace(
-        faults, resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",), certifier_sha256=("a" * 64,),
-        certifier_outcomes=crossed, certifier_resolved_outcomes=crossed,
+    archive = dataclasses.replace(
+        archive, fresh=fresh_values(archive), resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",),
+        certifier_sha256=("a" * 64,), certifier_outcomes=crossed, certifier_resolved_outcomes=crossed,
     )  # fmt: skip
-    archive = dataclasses.replace(archive, fresh=fresh, faults=faults)
     causes = {0: "ridge", 1: "drop", 2: "ridge", 3: "ridge", 4: None, 5: "ridge"}
-    return rank(archive, SUPER_GAUSSIAN, minima_of(causes)), archive
+    return ranked(archive, minima_with(causes)), archive
 
 
 def test_an_elite_is_named_by_its_own_cause_and_ending():
-    ranking, _ = ranked()
+    ranking, _ = six_elites()
     assert ranking.causes == ("ridge", "drop", "ridge", "ridge", "unclear", "")
     assert [ranking.name(row) for row in range(6)] == [
         "ridge: gets stuck, 30 of 40",
@@ -85,32 +87,29 @@ def test_an_elite_is_named_by_its_own_cause_and_ending():
         "unclear: topples, 40 of 40",
         "crossed, 30 of 40",
     ]
-    fallen = dataclasses.replace(ranking.elites, fallen_rate=np.array([0.75] + 5 * [0.0]))
-    lying = dataclasses.replace(ranking, elites=fallen)  # on their legs until the time is over
+    lying = dataclasses.replace(ranking, fallen_rate=np.array([0.75] + 5 * [0.0]))  # standing until the time is over
     assert lying.name(0) == "ridge: topples, 30 of 40"
-    outside, _ = ranked((9.0, 10.01))
+    outside, _ = six_elites((9.0, 10.01))
     assert outside.name(0) == "ridge: leaves the terrain, 30 of 40"
 
 
 def test_causes_are_by_number_and_the_unclear_last():
-    ranking, archive = ranked()
+    ranking, archive = six_elites()
     by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
     assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
     words, crosses = (
         "5 of 6 terrains stop the robot; ridges are the commonest cause",
         "another controller of this robot",
     )
-    assert summary_of(ranking, archive) == f"{words}; 1 is a fault: {crosses} crosses it"
-    assert archive.faults is not None
-    unresolved = dataclasses.replace(archive.faults, resolved_outcomes=np.zeros((6, 4), np.int64))
-    judged = dataclasses.replace(archive, faults=unresolved)
-    assert summary_of(ranking, judged) == f"{words}; {crosses} crosses 1 of them"
-    alone = dataclasses.replace(archive, faults=None, fresh=None)
-    assert summary_of(rank(alone, SUPER_GAUSSIAN), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
+    assert summarise(ranking, archive) == f"{words}; 1 is a fault: {crosses} crosses it"
+    judged = dataclasses.replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
+    assert summarise(ranking, judged) == f"{words}; {crosses} crosses 1 of them"
+    alone = dataclasses.replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
+    assert summarise(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
     one = alone.rows(np.array([0]))
-    assert summary_of(rank(one, SUPER_GAUSSIAN), one) == "The only terrain stops the robot"
+    assert summarise(ranked(one), one) == "The only terrain stops the robot"
     crossed = dataclasses.replace(alone, goal_rate=np.ones(6))
-    assert summary_of(rank(crossed, SUPER_GAUSSIAN), crossed) == "The robot crosses all 6 terrains"
+    assert summarise(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
@@ -122,7 +121,7 @@ def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_th
     genes = np.concatenate([*bumps, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 5])[None].repeat(4, axis=0)
     ends = np.array([[5.6, 4.0], [7.8, 4.0], [9.2, 4.0], [2.0, 4.0]], np.float32)
     archive = dataclasses.replace(small_archive(4), genes=genes, goal_rate=np.zeros(4), end_position=ends)
-    assert rank(archive, SUPER_GAUSSIAN).causes == ("ridge", "ditch", "drop", "unclear")
+    assert ranked(archive).causes == ("ridge", "ditch", "drop", "unclear")
 
 
 def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families():
@@ -133,7 +132,7 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
         archive, genes=genes, goal_rate=np.array([*np.linspace(0.01, 0.06, 6), 0.0, 0.0, *[0.05] * 7, *[1.0] * 5]),
         collision_rate=np.repeat([0.0, 1.0, 0.0], (6, 9, 5)), fallen_rate=np.zeros(20),
     )  # fmt: skip
-    ranking = rank(archive, SUPER_GAUSSIAN, minima_of({n: "drop" if n < 6 else "ridge" for n in range(15)}))
+    ranking = ranked(archive, minima_with({n: "drop" if n < 6 else "ridge" for n in range(15)}))
     order = ranking.order()
     assert sorted(order.tolist()) == list(range(20))
     assert ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6
@@ -144,11 +143,11 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
     assert len(set(ranking.families[order[:count]])) == count  # other families come first
     assert set(order[15:].tolist()) == set(range(15, 20))
     assert ranking.order("fault").tolist()[:2] == [6, 7]
-    assert ranked()[0].order().tolist()[:3] == [2, 1, 4]  # a fault is the worst ridge, and comes before other causes
+    assert six_elites()[0].order().tolist()[:3] == [2, 1, 4]  # the fault comes before other causes
     families = ranking.families[ranking.order("family")]
     assert families.tolist() == sorted(families) and families[0] == families[1] == 1
     for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
-        values = getattr(ranking.elites, name)[ranking.order(name)]
+        values = getattr(ranking, name)[ranking.order(name)]
         assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
 
 
@@ -160,5 +159,5 @@ def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
     first, second, third = heights_of(genes[[1, 4, 5]])
     near = [float(np.sqrt(((heights - others) ** 2).mean())) for heights, others in ((first, second), (second, third))]
     assert max(near) < KIN_M < np.sqrt(((first - third) ** 2).mean())
-    assert families_of(genes[[0, 5, 1, 2, 4, 3]], SUPER_GAUSSIAN).tolist() == [0, 1, 1, 2, 1, 3]
-    assert families_of(genes[:0], SUPER_GAUSSIAN).tolist() == []
+    assert find_families(genes[[0, 5, 1, 2, 4, 3]], SUPER_GAUSSIAN).tolist() == [0, 1, 1, 2, 1, 3]
+    assert find_families(genes[:0], SUPER_GAUSSIAN).tolist() == []

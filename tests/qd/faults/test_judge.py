@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from qd.faults import judge as judging
-from qd.faults.judge import elite_seeds, fresh_values, judge, outcome_counts, seen_by
+from qd.faults.judge import find_seen, judge
+from qd.faults.stages.base import count_outcomes, elite_seeds
+from qd.faults.stages.fresh import fresh_values
 from qd.search.archive import read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
@@ -72,7 +74,7 @@ def test_outcomes_are_counted_by_hand():
     collided, invalid, late = np.zeros((3, 1, 10), bool)
     collided[0, :2], invalid[0, 2:5], late[0, 5:9] = True, True, True
     result = make_result(np.ones((1, 10, 6)), base_collision=collided, invalid=invalid, late=late)
-    assert outcome_counts(result).tolist() == [[1, 2, 4, 3]]
+    assert count_outcomes(result).tolist() == [[1, 2, 4, 3]]
 
 
 def crosses(policy, resolved, genes):
@@ -164,16 +166,14 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
 
     space, robots = get_space("super_gaussian+payload+motors+delay+noise+grip"), Robots(rule)
     archive = judged(path, robots, stages=("varied",))
-    assert archive.faults.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
-    assert 0 < archive.faults.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
+    assert archive.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
+    assert 0 < archive.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
     assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
     assert numbers_in(path)["robust"] == numbers_in(path)["crossed_varied"] - 1 == len(rows) - 1 > 0
     assert np.array_equal(read_archive(path).robust, archive.robust)
-    half = archive.faults.varied_outcomes.copy()
+    half = archive.varied_outcomes.copy()
     half[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
-    assert not dataclasses.replace(archive, faults=dataclasses.replace(archive.faults, varied_outcomes=half)).robust[
-        rows[-1]
-    ]
+    assert not dataclasses.replace(archive, varied_outcomes=half).robust[rows[-1]]
     # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
     assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
     assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)
@@ -192,17 +192,18 @@ def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, 
     nobody = Robots(result_of, stop_after=0)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
         judged(path, nobody, stages=("fresh", "resolved", "others", "varied"))
-    with pytest.raises(ValueError, match="begin with the stages resolved, others"):
-        judged(path, nobody, stages=("varied",))
+    for stages in (("varied",), ("others", "fresh", "varied"), ("fresh", "soon")):
+        with pytest.raises(ValueError, match="stages"):
+            judged(path, nobody, stages=stages)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
     first = judged(path)
     copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), str(ROBOTS["anymal"].panel / "S.pt")
     both = judged(path, stages=("others",), certifiers={"specialist": str(copy)})
-    assert both.faults.certifiers == ("C-G", "specialist")
+    assert both.certifiers == ("C-G", "specialist")
     for column in (0, 1):
-        assert np.array_equal(both.faults.certifier_outcomes[:, column], first.faults.certifier_outcomes[:, 0])
+        assert np.array_equal(both.certifier_outcomes[:, column], first.certifier_outcomes[:, 0])
     assert numbers_in(path)["faults"] == numbers_in(path)["faults_panel"] > 0
     # Another controller of that name crosses nothing. What it was not asked, nobody knows: elites that fail no more
     archive = read_archive(path)
@@ -213,10 +214,10 @@ def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_re
         dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=goal_rate)),
     )
     last = judged(path, stages=("others",), certifiers={"specialist": weak})
-    assert last.faults.certifiers == ("C-G", "specialist")
-    assert last.faults.certifier_sha256[1] == controller_hash(weak)
-    assert not last.faults.certificates()[:, 1].any() and last.faults.certificates()[:, 0].any()
-    rows = np.flatnonzero(last.faults.certifier_outcomes[:, 1].any(axis=1))
+    assert last.certifiers == ("C-G", "specialist")
+    assert last.certifier_sha256[1] == controller_hash(weak)
+    assert not last.certificates[:, 1].any() and last.certificates[:, 0].any()
+    rows = np.flatnonzero(last.certifier_outcomes[:, 1].any(axis=1))
     assert rows.tolist() == np.flatnonzero(archive.failing)[:1].tolist()
 
 
@@ -227,7 +228,7 @@ def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_contro
         shutil.copy(SHIPPED, folder / "base.pt")
         shutil.copy(file, folder)
     monkeypatch.setattr(RobotCfg, "panel", panel)
-    assert judged(path, certifiers=None).faults.certifiers == ("S", "C-G")
+    assert judged(path, certifiers=None).certifiers == ("S", "C-G")
 
 
 def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
@@ -236,10 +237,10 @@ def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(judging, "read_trained_on", lambda policy: trained_on[Path(policy).name])
     certifiers = {"C-G": str(tmp_path / "a.pt"), "S": str(tmp_path / "b.pt")}
     families = np.array([0, 1, 1, 2, 0])
-    assert seen_by(archive, families, certifiers) is None  # nobody knows what S was trained on
+    assert find_seen(archive, families, certifiers) is None  # nobody knows what S was trained on
     (tmp_path / "b.train.json").write_text("{}")
-    assert seen_by(archive, families, certifiers).tolist() == [[row in (1, 2), False] for row in range(5)]
-    assert seen_by(archive, families, {"C-G": certifiers["C-G"]}) is None
+    assert find_seen(archive, families, certifiers).tolist() == [[row in (1, 2), False] for row in range(5)]
+    assert find_seen(archive, families, {"C-G": certifiers["C-G"]}) is None
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,12 @@ import pytest
 from qd.faults.numbers import (
     SPECIALIST,
     count_faults,
-    elite_words,
+    describe_elite,
     fault_numbers,
     fresh_counts,
     fresh_numbers,
     judgement,
-    rate_of,
+    rate_numbers,
 )
 from tests.builders import fresh_values, judged_archive, small_archive
 
@@ -37,7 +37,7 @@ def test_numbers_by_hand():
 @pytest.mark.parametrize(("certifiers", "expected"), [(("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))])
 def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expected):
     archive = judged_archive()
-    archive = dataclasses.replace(archive, faults=dataclasses.replace(archive.faults, certifiers=certifiers))
+    archive = dataclasses.replace(archive, certifiers=certifiers)
     assert numbers_of(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
 
 
@@ -53,12 +53,12 @@ def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
 def test_numbers_of_what_nobody_looked_at_are_none():
     archive, names = judged_archive(), ("failing", "certified", "confirmed", "faults_panel")
     assert numbers_of(small_archive(), *names) == (None,) * 4
-    fresh_alone = dataclasses.replace(archive, faults=None)
+    fresh_alone = dataclasses.replace(small_archive(5), fresh=archive.fresh)
     assert numbers_of(fresh_alone, *names) == (4, None, None, None)
     fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(5)))
     assert numbers_of(fine, *names) == (0,) * 4
-    faults = dataclasses.replace(archive.faults, resolved_outcomes=0 * archive.faults.resolved_outcomes)
-    assert numbers_of(dataclasses.replace(archive, faults=faults), *names) == (4, 2, None, None)
+    unresolved = dataclasses.replace(archive, resolved_outcomes=0 * archive.resolved_outcomes)
+    assert numbers_of(unresolved, *names) == (4, 2, None, None)
 
 
 def test_numbers_of_fresh_episodes_by_hand():
@@ -81,14 +81,13 @@ def test_numbers_of_fresh_episodes_by_hand():
 
 def test_words_say_counts_and_verdicts():
     archive = judged_archive()
-    words = [elite_words(archive, number) for number in range(5)]
+    words = [describe_elite(archive, number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
     assert [("a fault" in text[-1], "not known" in text[-1]) for text in words] == [
         (True, False), (False, True), (False, False), (False, True), (False, False),
     ]  # fmt: skip
     assert "9 of 20 (45%, 26 to 66%)" in words[0][0]
-    unjudged = dataclasses.replace(archive, faults=None)
-    assert elite_words(unjudged, 0) == []
+    assert describe_elite(small_archive(5), 0) == []
 
 
 def test_rates_and_certificates_of_an_elite():
@@ -100,8 +99,8 @@ def test_rates_and_certificates_of_an_elite():
     assert (certificate["controller"], certificate["searched"]["goal_rate"]) == ("S", 0.5)
     (certificate,) = judgement(archive, 2)["certificates"]
     assert (certificate["searched"]["goal_rate"], certificate["resolved"]["goal_rate"]) == (1.0, 0.5)
-    assert judgement(dataclasses.replace(archive, faults=None), 0) == {"resolved": None, "certificates": []}
-    assert rate_of(np.array([14, 0, 0, 6]))["goal_rate"] is None  # 6 of 20 are invalid
+    assert judgement(small_archive(), 0) == {"resolved": None, "certificates": []}
+    assert rate_numbers(np.array([14, 0, 0, 6]))["goal_rate"] is None  # 6 of 20 are invalid
 
 
 def test_fresh_episodes_of_an_elite_are_counted():

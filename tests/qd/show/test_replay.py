@@ -173,7 +173,7 @@ def test_terrains_and_archives_that_are_not_there_are_refused(tmp_path, cassie):
     opened_run = open_run(None, archive)
     assert [terrain.number for terrain in opened_run.terrains("2 0")] == [2, 0]
     (terrain,) = opened_run.terrains()
-    assert terrain.number == rank(opened_run.archive, opened_run.space).worst(1)[0] != 0
+    assert terrain.number == rank(opened_run.archive, opened_run.space, half_width=0.4).worst(1)[0] != 0
     assert [terrain.stem for terrain in opened_run.terrains("all")] == ["elite-0", "elite-1", "elite-2"]
     with pytest.raises(FileNotFoundError, match="minimal"):
         opened_run.terrains("0", "all")
@@ -213,7 +213,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     with pytest.raises(ValueError, match="out"):
         replay(source, out=Path("a.jpg"))
     words = " ".join(capsys.readouterr().out.split())
-    assert f"Of the minimal terrain: {opened_run.minima().words(number)}; failing." in words
+    assert f"Of the minimal terrain: {opened_run.minima().describe(number)}; failing." in words
     assert words.count("- bump of") == 1 and "- bump of <0.24> m" in words  # those that are left alone
     ExportCommand(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}

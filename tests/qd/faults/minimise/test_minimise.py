@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.faults.families import elites_of
+from qd.faults.families import rank
 from qd.faults.minimise.minimise import minimise, read_minimal
 from qd.search.archive import read_archive
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.stand_in import compute_by
 
@@ -53,10 +54,10 @@ def test_minimal_terrains_from_end_to_end(path, elites, capsys):
     assert (path / "minimal.png").read_bytes().startswith(b"\x89PNG")
     stored = read_minimal(path, read_archive(path))
     assert list(stored.genes) == elites and np.array_equal(stored.genes[elites[0]], genes)
-    assert stored.chosen("all", path) == elites and stored.chosen(f"{elites[1]}", path) == elites[1:]
+    assert stored.choose("all", path) == elites and stored.choose(f"{elites[1]}", path) == elites[1:]
     with pytest.raises(ValueError, match="999"):
-        stored.chosen(f"{elites[0]} 999", path)
-    assert all(part in stored.words(elites[0]) for part in ("1 of 8 parts", "0% (0 to 9%)", "rise", "13.5 cm"))
+        stored.choose(f"{elites[0]} 999", path)
+    assert all(part in stored.describe(elites[0]) for part in ("1 of 8 parts", "0% (0 to 9%)", "rise", "13.5 cm"))
 
 
 def test_stopped_it_goes_on_and_results_of_several_calls_add_up(path, elites):
@@ -83,7 +84,7 @@ def test_minimal_terrains_are_judged_like_elites(path, elites):
     (certificate,) = first["certificates"]
     assert certificate["controller"] == "C-G" and certificate["searched"]["goal_rate"] == 1.0
     assert certificate["policy_sha256"] == controller_hash(OTHER["C-G"])
-    assert read_archive(path).faults is None  # the elites' own counts are another thing
+    assert not read_archive(path).is_judged  # the elites' own counts are another thing
 
 
 def test_elites_that_are_not_named_are_some_that_fail_and_without_scales_there_is_no_margin(path, monkeypatch):
@@ -98,14 +99,14 @@ def test_what_cannot_be_minimised_is_refused_before_anything_is_crossed(path, ma
     nobody, fine = Robots(bump_stops, stop_after=0), np.flatnonzero(~read_archive(path).failing)[:1].tolist()
     with pytest.raises(ValueError, match="fresh"):
         minimised(made / "found", elites, nobody)
-    worst = elites_of(read_archive(path)).by_severity()[0]
+    worst = rank(read_archive(path), SUPER_GAUSSIAN, half_width=0.4).worst(1)[0]
     for numbers, named in ((fine, f"worst are {worst},"), ([999], "")):
         with pytest.raises(ValueError, match=f"elite .*{numbers[0]}.*{named}"):
             minimised(path, numbers, nobody)
     with pytest.raises(ValueError, match="certifier same"):
         minimised(path, elites, nobody, judged=True, certifiers={"same": str(get_robot("anymal").policy_file)})
     with monkeypatch.context() as patch, pytest.raises(ValueError, match="how"):
-        patch.setattr("qd.faults.minimise.subsets.MOST_PARTS", 7)
+        patch.setattr("qd.faults.minimise.subsets.MAX_PARTS", 7)
         minimised(path, elites, nobody, how="exhaustive")
     monkeypatch.setattr(f"{SPACE}.parts", lambda self, genes: ())
     with pytest.raises(ValueError, match="parts"):

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.faults.causes import effects_of
-from qd.faults.judge import Search
-from qd.faults.minimise.subsets import Case, Trial, case_of, find_minimal, take_apart
+from qd.faults.causes import find_effects
+from qd.faults.minimise.subsets import Case, Trial, find_minimal, open_case, take_apart
+from qd.faults.searches import Search
 from qd.workers.cross import Crossings
 from sim.robots.find import get_robot
 from sim.terrains.conditions.base import condition_column
@@ -144,7 +144,7 @@ def test_parts_go_from_the_lowest_under_the_robot_on(on_gpu, how):
     archive = replace(archive, fresh=fresh_values(archive), genes=np.zeros((1, 64), np.float32))
     for bump, height in ((4, 0.96), (6, 0.7), (1, 0.4)):
         archive.genes[0, 8 * bump : 8 * bump + 8] = (0.0, 0.0, -0.5, 1.0, 1.0, 1.0, 0.0, height)  # across the way
-    case = case_of(archive, 0, SUPER_GAUSSIAN, 0.3, None, on_gpu=on_gpu)
+    case = open_case(archive, 0, SUPER_GAUSSIAN, 0.3, None, on_gpu=on_gpu)
     assert (case.parts, case.how, case.scalable, case.flat) == ((1, 6, 4), how, True, ())
     assert [(trial, counts.sum()) for trial, counts in case.counts.items()] == [(Trial((1, 4, 6), fresh=True), 40)]
 
@@ -193,13 +193,13 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
         """With this payload, on the bump where it is higher than .6 of what the elite has."""
         return (space.condition_rows(genes)[:, condition_column("payload")] > 0.1) & (genes[:, 31] > 0.42)
 
-    case = case_of(archive, 0, space, 0.3, how, on_gpu=True)
+    case = open_case(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
     search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
     with Crossings(ROBOT, compute_by(Robots(fails))) as crossings:
         minimal = take_apart(archive, {0: case}, search, crossings)[0]
     assert (minimal.parts, minimal.scale) == ((3, 8), 0.625)
-    effects = effects_of(genes[0], range(11), space)
+    effects = find_effects(genes[0], range(11), space)
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")
     assert [effects.shape(part, 0.3).kind for part in (8, 10)] == ["payload", "push"]
     assert effects.shape(3, 0.3).height_m > 0.1

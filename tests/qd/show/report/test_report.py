@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.faults.families import VERDICTS, Ranking, elites_of, rank, summary_of
-from qd.search.archive import FaultCounts, read_archive, write_archive
+from qd.faults.families import VERDICTS, rank, summarise
+from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.page import percent
 from qd.show.report.pictures import TILE, draw_sheet, find_failure, find_same_moment
@@ -49,24 +49,24 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
 
 def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whole):
     content, archive = whole[0].read_text(), read_archive(whole[0].parent)
-    ranking, text = rank(archive, SUPER_GAUSSIAN, judged=True), text_of(content.encode())
-    assert text.startswith(f"anymal: terrains that stop it {summary_of(ranking, archive)}")
+    ranking, text = rank(archive, SUPER_GAUSSIAN, half_width=0.4, judged=True), text_of(content.encode())
+    assert text.startswith(f"anymal: terrains that stop it {summarise(ranking, archive)}")
     failing = int((archive.fresh.goal_rate < 0.5).sum())
     for part in (f"stop the robot {failing}", "40 terrains and 160 episodes in 10 s", "for this page 1 of 4 5 to 70 %"):
         assert part in text
     for number in ranking.worst(2):
-        row = ranking.elites.place_of(number)
-        assert f"{ranking.name(row)} Terrain {number}, {VERDICTS[int(ranking.elites.verdict[row])]}, after" in text
+        row = ranking.find_row(number)
+        assert f"{ranking.name(row)} Terrain {number}, {VERDICTS[int(ranking.verdict[row])]}, after" in text
     listed = re.findall(r'<td><i class="tile elites"[^>]*></i></td><td>(\d+)</td>', content)
     assert sorted(map(int, listed)) == list(range(20))
 
 
 def test_bars_count_terrains_and_faults_by_cause():
-    elites = elites_of(grouped_archive())
-    verdict = elites.verdict.copy()
+    ranking = rank(grouped_archive(), SUPER_GAUSSIAN, half_width=0.4)
+    verdict = ranking.verdict.copy()
     verdict[[0, 6, 7]] = VERDICTS.index("fault")
     causes = ("ridge",) * 6 + ("drop",) * 9 + ("",) * 5
-    ranking = Ranking(elites=dataclasses.replace(elites, verdict=verdict), causes=causes, families=np.arange(20))
+    ranking = dataclasses.replace(ranking, verdict=verdict, causes=causes)
     drop, ridge = causes_of(ranking)
     assert drop == {"name": "drop", "failing": 9, "faults": 2, "share": 100 / 9, "tile": 6}
     assert ridge == {"name": "ridge", "failing": 6, "faults": 1, "share": 100 / 9, "tile": 0}
@@ -81,12 +81,12 @@ def test_the_controller_that_crosses_a_terrain_is_shown_beside(reported, run):
     certifier.write_bytes(b"another controller")
     # all are confirmed; C-G crosses the first ten
     counts = np.where(np.arange(20)[:, None] < 10, [20, 0, 0, 0], [0, 20, 0, 0])
-    faults = FaultCounts(
-        resolved_outcomes=np.tile([9, 11, 0, 0], (20, 1)), certifiers=("C-G",),
+    judged = dataclasses.replace(
+        archive, resolved_outcomes=np.tile([9, 11, 0, 0], (20, 1)), certifiers=("C-G",),
         certifier_sha256=(str(controller_hash(certifier)),), certifier_outcomes=counts[:, None],
         certifier_resolved_outcomes=counts[:, None],
     )  # fmt: skip
-    write_archive(run / "archive.npz", dataclasses.replace(archive, faults=faults))
+    write_archive(run / "archive.npz", judged)
     opened_run, failing = open_run(None, run), np.flatnonzero(archive.failing)
     assert opened_run.certifiers() == {"C-G": str(certifier)}
     assert [opened_run.certifier(number) for number in (failing[0], failing[-1])] == ["C-G", None]

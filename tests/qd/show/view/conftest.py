@@ -27,4 +27,4 @@ def listing():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return Listing(archive=archive, space=SUPER_GAUSSIAN)
+    return Listing(archive=archive, space=SUPER_GAUSSIAN, half_width=0.4)

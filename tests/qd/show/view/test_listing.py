@@ -35,7 +35,7 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(lis
 
 
 def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
-    listing = Listing(archive=judged_archive(), space=SUPER_GAUSSIAN)
+    listing = Listing(archive=judged_archive(), space=SUPER_GAUSSIAN, half_width=0.4)
     assert "It is a fault" in listing.details(0)
     fresh, resolved, certifier = listing.columns(0)
     assert all(len(listing.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
@@ -55,7 +55,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
 def test_an_elite_whose_fresh_episodes_are_invalid_is_listed_as_found():
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 0, 39]))
-    listing = Listing(archive=dataclasses.replace(archive, fresh=fresh), space=SUPER_GAUSSIAN)
+    listing = Listing(archive=dataclasses.replace(archive, fresh=fresh), space=SUPER_GAUSSIAN, half_width=0.4)
     ((head, count, hits),) = listing.columns(2)
     assert (head, count, hits["collision_rate"]) == ("as found", 4, 4)
 

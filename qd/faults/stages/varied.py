@@ -1,0 +1,85 @@
+"""Varied conditions: is a fault one under other loads, motors, delays, noise and friction, too."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.faults.numbers import EPISODES
+from qd.faults.stages.base import Judging, Stage, count_outcomes, elite_seeds, put_rows
+from qd.search.archive import OUTCOMES, Archive
+from qd.workers.seeds import Stream
+from sim.controllers.spec import controller_hash
+from sim.rollout import Rollout
+from sim.terrains.spaces.registry import load_space
+from sim.terrains.spaces.under_conditions import varied_genes, varied_name
+
+
+class Varied(Stage):
+    """Crosses each fault under 20 draws of conditions, an episode each, by its controller and those that certify it."""
+
+    name = "varied"
+    needs = ("fresh", "others")
+    with_certifiers = True
+
+    def is_done(self, archive: Archive) -> bool:
+        """Whether anything was crossed so."""
+        return archive.varied_outcomes is not None
+
+    def count_crossings(self, certifiers: Mapping[str, str]) -> int:
+        """One by the controller that was searched, one each by the others."""
+        return 1 + len(certifiers)
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses a search that cannot have conditions, and faults whose certifier is not at hand."""
+        _check_certifiers(archive, judging, renewed="others" in before)
+        if before:  # else the stage itself finds out at once
+            search, device = judging.search, judging.crossings.compute.device
+            space = load_space(varied_name(search.space))
+            Rollout(search.robot, search.policy, num_terrains=1, num_replicas=1, device=device, space=space)
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with outcomes of all controllers under the same conditions."""
+        _check_certifiers(archive, judging)
+        search, rows = judging.search, np.flatnonzero(archive.is_fault)
+        space = load_space(varied_name(search.space))
+        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
+        drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]
+        genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, space.num_genes)
+
+        def cross(policy: str, chosen: NDArray[np.bool_], label: str) -> NDArray[np.int64]:
+            result = judging.crossings.cross(
+                policy, genes[chosen].reshape(-1, space.num_genes), seeds[chosen].ravel(), replicas=1,
+                space=space.name, label=f"{label}, varied conditions", invalid_ok=True,
+            )  # fmt: skip
+            return count_outcomes(result).reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
+
+        searched = cross(search.policy, np.ones(len(rows), bool), "searched")
+        others = np.zeros_like(archive.certifier_outcomes)
+        for column, name in enumerate(archive.certifiers):
+            certified = archive.certificates[rows, column]
+            if certified.any():
+                others[rows[certified], column] = cross(judging.certifiers[name], certified, name)
+        archive = replace(
+            archive,
+            varied_outcomes=put_rows(np.zeros_like(archive.resolved_outcomes), rows, searched),
+            certifier_varied_outcomes=others,
+        )
+        num_robust = archive.robust.sum()
+        print(f"{num_robust} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
+        return archive
+
+
+def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
+    """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
+    hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
+    certifies = archive.certificates[archive.is_fault].any(axis=0)
+    stored = zip(archive.certifiers, archive.certifier_sha256, certifies, strict=True)
+    names = [name for name, digest, is_needed in stored if is_needed and hashes.get(name) != digest]
+    if lost := [name for name in names if not (renewed and name in hashes)]:
+        raise ValueError(
+            f"certifiers must be those that certify faults of {judging.search.run}, got none or another file for "
+            f"{', '.join(lost)}: give the files by --certifiers, or other controllers of these names and the stages "
+            "others, varied"
+        )
