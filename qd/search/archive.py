@@ -205,7 +205,7 @@ class Archive(Evaluation):
         return replace(self, fresh=fresh).rows(np.lexsort((-fresh.fitness, ~fresh.valid)))
 
 
-def no_outcomes(num_elites: int) -> dict[str, NDArray[np.int64]]:
+def no_outcomes(num_elites: int) -> dict[str, Any]:
     """Columns of an :class:`Archive` whose elites nobody has crossed under other conditions."""
     nobody = np.zeros((num_elites, 0, 4), np.int64)
     return {
