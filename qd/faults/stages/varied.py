@@ -74,9 +74,8 @@ class Varied(Stage):
 def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
     """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
     hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
-    certifies = archive.certificates[archive.is_fault].any(axis=0)
-    stored = zip(archive.certifiers, archive.certifier_sha256, certifies, strict=True)
-    names = [name for name, digest, is_needed in stored if is_needed and hashes.get(name) != digest]
+    stored = zip(archive.certifiers, archive.certifier_sha256, archive.certificates[archive.is_fault].T, strict=True)
+    names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
     if lost := [name for name in names if not (renewed and name in hashes)]:
         raise ValueError(
             f"certifiers must be those that certify faults of {judging.search.run}, got none or another file for "
