@@ -9,11 +9,18 @@ import tyro
 from msgspec import Meta
 
 from qd.evaluate.labels import SetsCfg
-from qd.search.presets import PRESETS, SchedulerCfg, preset_of
+from qd.search.methods.registry import METHODS
+from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
 from sim.robots.find import get_robot, robot_of
+
+_METHOD_HELP = (
+    f"Where new terrains come from: {'; '.join(f'{name}, {method.text}' for name, method in METHODS.items())}. Several "
+    "are joined by +: emitters take them in turn."
+)
+_SETTINGS = ("preset", "iterations", "seed", "replicas", "intervals", "scheduler")
 
 
 def _compute(flags: WorkerFlags) -> Any:
@@ -21,20 +28,6 @@ def _compute(flags: WorkerFlags) -> Any:
     from qd.workers.evaluator import Compute
 
     return Compute.resolve(flags.device, flags.workers, flags.num_envs)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArchiveFitness:
-    """What makes a terrain an elite."""
-
-    penalties: tuple[str, ...] = ()
-    """Penalties that count, for fitness, ratios and cells; all of the robot's if left out."""
-    alpha: float = 1.0
-    """Weight of the standard deviations."""
-    lam: float = 2.0
-    """Weight of u, the share of episodes without base collision; u is 0 if none collided."""
-    intervals: int = 10
-    """Intervals of each ratio."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,11 +62,16 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     for shipped robots; for yours the height of the penalty scales: about 80 % of hard-random terrains are crossed."""
     replicas: PositiveInt = 4
     """Episodes a terrain."""
-    method: str | None = None
-    """Where terrains come from: surrogate (the default), cma_mae (the paper's), cma_me, map_elites, hard_random,
-    uniform_random; several joined by +."""
+    method: Annotated[str | None, tyro.conf.arg(help=f"{_METHOD_HELP} surrogate if left out.")] = None
     scheduler: SchedulerCfg = PRESETS["small"]["scheduler"]
-    fitness: ArchiveFitness = ArchiveFitness()
+    penalties: Annotated[tuple[str, ...], tyro.conf.arg(name="fitness.penalties")] = ()
+    """Penalties that count, for fitness, ratios and cells; all of the robot's if left out."""
+    alpha: Annotated[float, tyro.conf.arg(name="fitness.alpha")] = 1.0
+    """Weight of the standard deviations in the fitness."""
+    lam: Annotated[float, tyro.conf.arg(name="fitness.lam")] = 2.0
+    """Weight of u in the fitness, the share of episodes without base collision; u is 0 if none collided."""
+    intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
+    """Intervals of each ratio."""
 
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:
@@ -81,14 +79,13 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         folder = peek(argv, "--resume")
         if folder is None:
             preset = peek(argv, "--preset") or default_preset(argv)
-            return cls(preset=preset, **preset_of(preset))
+            return cls(preset=preset, **read_preset(preset))
         from qd.search.directory import RunDirectory
 
         cfg = RunDirectory(Path(folder)).read_cfg()
-        weights = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam")}
-        fitness = ArchiveFitness(**weights, intervals=cfg.intervals)
-        sizes = {name: getattr(cfg, name) for name in ("preset", "iterations", "seed", "replicas", "scheduler")}
-        return cls(**sizes, fitness=fitness)
+        settings = {name: getattr(cfg, name) for name in _SETTINGS}
+        fitness = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam")}
+        return cls(**settings, **fitness)
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
@@ -119,17 +116,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
             space = None if self.space is None else load_space(self.space)
             if space is not None and (space.sha256 is None or space.sha256 != cfg.space_sha256):
                 cfg = replace(cfg, space=space.name, space_sha256=space.sha256)
-        fitness = cfg.fitness.of_penalties(self.fitness.penalties or cfg.fitness.penalties)
-        cfg = replace(
-            cfg,
-            preset=self.preset,
-            iterations=self.iterations,
-            seed=self.seed,
-            replicas=self.replicas,
-            intervals=self.fitness.intervals,
-            fitness=replace(fitness, alpha=self.fitness.alpha, lam=self.fitness.lam),
-            scheduler=scheduler,
-        )
+        fitness = cfg.fitness.with_penalties(self.penalties or cfg.fitness.penalties)
+        settings = {name: getattr(self, name) for name in _SETTINGS} | {"scheduler": scheduler}
+        cfg = replace(cfg, **settings, fitness=replace(fitness, alpha=self.alpha, lam=self.lam))
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         if cfg.preset != "small":

@@ -4,6 +4,9 @@ A test that takes the ``device`` fixture, by itself or through another fixture, 
 CPU, and on a GPU where FAULTLINE_DEVICE names one.
 """
 
+import tests.toys  # noqa: F401  before anything reads the registries
+
+# isort: split
 import os
 import shutil
 from collections.abc import Iterator

@@ -22,7 +22,7 @@ LIBRARY_DOORS = {  # a room, or a folder of one
     "rsl_rl": ("train",),
     "PIL": ("sim", "qd"),
     "imageio_ffmpeg": ("qd",),
-    "torch": ("sim", "train", "qd/search/surrogate.py", "qd/search/networks.py"),
+    "torch": ("sim", "train", "qd/search/surrogate"),
     "onnx": ("sim", "train"),
     "onnxruntime": ("sim",),
     "viser": ("qd/show/view",),

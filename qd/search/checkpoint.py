@@ -11,10 +11,11 @@ import pickle
 from pathlib import Path
 from typing import Any
 
+from qd.search.methods.registry import METHODS
 from sim.files.atomic import write_atomically
 
 _KIND = b"faultline search checkpoint "
-_MAGIC = _KIND + b"5\n"
+_MAGIC = _KIND + b"6\n"
 _HASH_BYTES = 32
 _REMEDY = "put a copy of it back, or start a new run"
 
@@ -35,17 +36,19 @@ _ADMITTED = {
     "qd.search.descriptors": ("Cells",),
     "qd.search.fitness": ("Evaluation", "FitnessCfg"),
     "qd.search.pool": ("Pool",),
-    "qd.search.scheduler": ("Asked", "RandomEmitter", "Scheduler", "SurrogateEmitter"),
-    "qd.search.surrogate": ("Surrogate",),
+    "qd.search.presets": ("SchedulerCfg",),
+    "qd.search.scheduler": ("Asked", "Scheduler"),
+    "qd.search.surrogate.surrogate": ("Surrogate",),
 }
-"""Classes that a state may hold, by their modules."""
+"""Classes that a state may hold, by their modules; methods of search beside them."""
 
 
 class _StateUnpickler(pickle.Unpickler):
     """Builds plain values and the admitted classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if name not in _ADMITTED.get(module, ()):
+        is_method = any((module, name) == (method.__module__, method.__name__) for method in METHODS.values())
+        if not is_method and name not in _ADMITTED.get(module, ()):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is no part of a search")
         return super().find_class(module, name)
 

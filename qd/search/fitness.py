@@ -41,7 +41,7 @@ class FitnessCfg:
         if len(self.scales) != len(self.penalties):
             raise ValueError(f"scales must be one for each of {', '.join(self.penalties)}, got {self.scales}")
 
-    def of_penalties(self, names: Sequence[str]) -> "FitnessCfg":
+    def with_penalties(self, names: Sequence[str]) -> "FitnessCfg":
         """The same of some of the penalties alone, which must be at least 2: a single ratio is always 1."""
         scales = dict(zip(self.penalties, self.scales, strict=True))
         if not scales.keys() >= {*names} or len(names) < 2:
@@ -110,12 +110,12 @@ def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
 
 
-def rows_of(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
+def select_terrains(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
     """Some rows of an evaluation, copied."""
     return Evaluation(**{name: np.array(values[rows]) for name, values in vars(terrains).items()})
 
 
-def evaluation_of(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evaluation:
+def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evaluation:
     """Fitness, ratios, cells and rates of the terrains of a rollout; ``cells`` have one ratio a penalty of ``cfg``.
 
     The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
@@ -142,7 +142,7 @@ def evaluation_of(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evalu
     )
 
 
-def merged(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
+def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
     """The evaluation by all episodes of two evaluations of the same terrains; ends are the second's, if it has any."""
     share = second.counted / np.maximum(first.counted + second.counted, 1)
 
@@ -178,7 +178,7 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     return replace(
         some,
         fitness=np.where(some.valid, fitness, FITNESS_FLOOR),
-        cell=cells.cell_of(some.ratios, some.collides),
+        cell=cells.find_cells(some.ratios, some.collides),
     )
 
 

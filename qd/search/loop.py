@@ -13,7 +13,7 @@ from qd.faults.minimise.results import read_minimal
 from qd.faults.numbers import fault_numbers, found_numbers
 from qd.search.archive import Archive, no_outcomes, read_archive
 from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory, claimed
-from qd.search.fitness import Evaluation, evaluation_of, join_evaluations
+from qd.search.fitness import Evaluation, evaluate_rollout, join_evaluations
 from qd.search.pool import chance_to_stay
 from qd.search.progress import Bar, clock, describe_iteration, describe_search
 from qd.search.scheduler import Scheduler
@@ -83,8 +83,7 @@ def search(
             metrics = []
         else:
             scheduler, metrics = saved
-        if scheduler.surrogate is not None:
-            scheduler.surrogate.compute_on(compute.device)
+        scheduler.compute_on(compute.device)
         done, last = len(metrics), _last_iteration(cfg, metrics, until)
         say(describe_search(replace(cfg, iterations=last), path, done, compute.device, evaluator.num_workers))
         if note := scaled_by_another(robot, policy):
@@ -131,7 +130,7 @@ def _run_iterations(
 
     def put(genes: NDArray[np.float32], iteration: int, group: int) -> None:
         """Its seeds are those of the group's places in the iteration."""
-        seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.places(group)]
+        seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.group_rows(group)]
         pipeline.put(genes, seeds[: len(genes)])
 
     pipeline.clear()
@@ -145,7 +144,7 @@ def _run_iterations(
         for group in range(num_groups):
             result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
             refuse_all_invalid(result)
-            evaluation = evaluation_of(result, cfg.cells, cfg.fitness)
+            evaluation = evaluate_rollout(result, cfg.cells, cfg.fitness)
             emitters_began = time.perf_counter()
             num_new += scheduler.tell(evaluation, iteration, group)
             # Behind the last iteration as well: if more follow, they begin with new terrains.

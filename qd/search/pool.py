@@ -1,8 +1,8 @@
-"""Which terrain holds a cell while all that is known of a terrain is noisy.
+"""Which terrain holds a cell when evaluations are noisy.
 
-A search that keeps the best draw keeps the luckiest. Here each cell has a few terrains, which are crossed again as the
-search goes on, and the one that is expected to add most to the QD score of fresh episodes holds it. Both parts are of
-Flageat and Cully 2023, "Uncertain Quality-Diversity": cells that are deep, and elites that are sampled again.
+A search that keeps the best draw keeps the luckiest. Here each cell has a few terrains, and the search crosses them
+again. The one that is expected to add most to the QD score of fresh episodes holds the cell. Deep cells and resampled
+elites are of Flageat and Cully 2023, "Uncertain Quality-Diversity".
 """
 
 import numpy as np
@@ -11,22 +11,30 @@ from scipy.special import ndtr
 
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.descriptors import Cells
-from qd.search.fitness import BIT_EPISODES, FITNESS_FLOOR, Evaluation, FitnessCfg, join_evaluations, merged, rows_of
+from qd.search.fitness import (
+    BIT_EPISODES,
+    FITNESS_FLOOR,
+    Evaluation,
+    FitnessCfg,
+    join_evaluations,
+    merge_evaluations,
+    select_terrains,
+)
 
 DEPTH = 3
 """Terrains that each cell has at most."""
 _RATIO_SPREAD = 0.22
 """Standard deviation of a ratio r over episodes, divided by sqrt(r (1 - r)); it differs little between terrains."""
-_LEAST_VARIANCE = 1e-3  # of r (1 - r), where all episodes so far have a ratio of 0
+_MIN_VARIANCE = 1e-3  # of r (1 - r), where all episodes so far have a ratio of 0
 
 
 def chance_to_stay(terrains: Evaluation, cells: Cells) -> NDArray[np.float64]:
     """The chance that 40 fresh episodes put a terrain into the cell that it has now, shape (T,).
 
-    Its own episodes and the fresh ones spread ratios about the true ones, each by itself and normally.
+    Ratios of its own episodes and of the fresh ones are independent and normal about the true ones.
     """
     counted = np.maximum(terrains.counted, 1)
-    variance = _RATIO_SPREAD**2 * (terrains.ratios * (1.0 - terrains.ratios) + _LEAST_VARIANCE)
+    variance = _RATIO_SPREAD**2 * (terrains.ratios * (1.0 - terrains.ratios) + _MIN_VARIANCE)
     std = np.sqrt(variance * (1.0 / counted + 1.0 / FRESH_EPISODES)[:, None])
     collides, index = np.divmod(terrains.cell, len(cells.tuples))
     intervals = cells.tuples[index]
@@ -56,7 +64,7 @@ class Pool:
     """The terrains that hold a cell, or may come to.
 
     Attributes:
-        terrains: What is known of N terrains, by all of their episodes.
+        terrains: What is known of N terrains, by all of their episodes; None before the first.
         solutions: Their unclipped genes, shape (N, num_genes).
         iteration: When each was found, shape (N,).
         number: By which each is known, ascending, shape (N,).
@@ -67,71 +75,71 @@ class Pool:
         self.terrains: Evaluation | None = None
         self.solutions = np.zeros((0, num_genes), np.float32)
         self.iteration, self.number = np.zeros(0, np.int64), np.zeros(0, np.int64)
-        self._next = 0
+        self._next_number = 0
         self._crossings = np.zeros(0, np.int64)
 
     def __len__(self) -> int:
         return len(self.number)
 
-    def solutions_of(self, number: NDArray[np.int64]) -> NDArray[np.float32]:
+    def get_solutions(self, number: NDArray[np.int64]) -> NDArray[np.float32]:
         """Unclipped genes of terrains by their numbers."""
         return self.solutions[np.searchsorted(self.number, number)]
 
     def tell(
-        self, solutions: NDArray[np.float32], number: NDArray[np.int64], told: Evaluation, iteration: int
+        self, solutions: NDArray[np.float32], number: NDArray[np.int64], crossed: Evaluation, iteration: int
     ) -> Evaluation:
         """Takes in crossings of T terrains, and returns what is known of these now.
 
         Args:
             solutions: Unclipped genes, shape (T, num_genes).
             number: Of those that were crossed again, perhaps several times; -1 of new ones, shape (T,).
-            told: What the crossings showed.
+            crossed: What the crossings showed.
             iteration: In which they were, from 1.
         """
-        known = rows_of(told, np.arange(len(number)))
+        merged = select_terrains(crossed, np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
-        time = _rank(number[again], again)
-        for k in range(time.max(initial=-1) + 1):
+        repeat = _rank(number[again], again)
+        for k in range(repeat.max(initial=-1) + 1):
             assert self.terrains is not None
-            now = again[time == k]
-            rows = np.searchsorted(self.number, number[now])
-            joined = merged(rows_of(self.terrains, rows), rows_of(told, now), self.cells, self.fitness)
-            for name, values in vars(joined).items():
-                getattr(self.terrains, name)[rows] = getattr(known, name)[now] = values
+            chosen = again[repeat == k]
+            rows = np.searchsorted(self.number, number[chosen])
+            before, after = select_terrains(self.terrains, rows), select_terrains(crossed, chosen)
+            for name, values in vars(merge_evaluations(before, after, self.cells, self.fitness)).items():
+                getattr(self.terrains, name)[rows] = getattr(merged, name)[chosen] = values
             self._crossings[rows] += 1
-        before = () if self.terrains is None else (self.terrains,)
-        self.terrains = join_evaluations([*before, rows_of(told, new)])
+        first = select_terrains(crossed, new)
+        self.terrains = first if self.terrains is None else join_evaluations([self.terrains, first])
         self.solutions = np.concatenate([self.solutions, solutions[new]])
         self.iteration = np.append(self.iteration, np.full(len(new), iteration))
-        self.number = np.append(self.number, self._next + np.arange(len(new)))
+        self.number = np.append(self.number, self._next_number + np.arange(len(new)))
         self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
-        self._next += len(new)
-        return known
+        self._next_number += len(new)
+        return merged
 
-    def least_known(self, count: int, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Numbers of ``count`` terrains to cross again, those with the fewest crossings; none while there is none.
+    def least_known(self, count: int, pending: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers of ``count`` terrains to cross again, those with the fewest crossings; none of an empty pool.
 
-        Crossings that are ``under_way`` count already, by the numbers of their terrains. If there are few terrains,
-        some come several times.
+        Crossings that are ``pending`` count already, by the numbers of their terrains. If there are few terrains, some
+        come several times.
         """
         if self.terrains is None or not len(self):
             return self.number[:0]
         best_first = np.argsort(-expected_score(self.terrains, self.cells, self.fitness), kind="stable")
-        rows, times = np.unique(np.searchsorted(self.number, under_way), return_counts=True)
+        rows, times = np.unique(np.searchsorted(self.number, pending), return_counts=True)
         crossings = self._crossings.copy()
         crossings[rows] += times
         further = np.arange(-(-count // len(self)) + crossings.max() - crossings.min())
         order = np.argsort((crossings[best_first, None] + further).ravel(), kind="stable")[:count]
         return self.number[best_first[order // len(further)]]
 
-    def settle(self, under_way: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Leaves each cell its best terrains, and those ``under_way``; rows of the ones that hold a cell."""
+    def settle(self, pending: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Leaves each cell its best terrains, and those ``pending``; rows of the ones that hold a cell."""
         assert self.terrains is not None
         score = expected_score(self.terrains, self.cells, self.fitness)
         rank = _rank(self.terrains.cell, -score)
         holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
-        stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, under_way)
-        self.terrains = rows_of(self.terrains, stays)
+        stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, pending)
+        self.terrains = select_terrains(self.terrains, stays)
         for name in ("solutions", "iteration", "number", "_crossings"):
             setattr(self, name, getattr(self, name)[stays])
         return np.flatnonzero(holds[stays])

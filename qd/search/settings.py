@@ -8,7 +8,7 @@ from typing import Any
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FitnessCfg
-from qd.search.presets import SchedulerCfg, preset_of
+from qd.search.presets import SchedulerCfg, read_preset
 from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, resolve_policy
 from sim.files.settings import NonNegativeInt, PositiveInt, check_settings, from_builtins
 from sim.robots.find import read_penalty_scales
@@ -88,7 +88,7 @@ def preset(
         space_sha256=space_sha256,
         collision_bit=robot.collision_bit,
         fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy)),
-        **preset_of(name),
+        **read_preset(name),
     )
 
 

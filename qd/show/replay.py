@@ -11,7 +11,7 @@ from kernels.episode import Outcome
 from qd.faults.numbers import describe_elite
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, folder_for
-from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
 from qd.show.figures import get_penalty_label, get_penalty_look
@@ -209,7 +209,7 @@ def describe(source: ReplaySource, k: int, recording: Recording) -> str:
     """How robots crossed a terrain and what it cost them; an elite's numbers as found and as corrected beside."""
     run = source.opened_run
     cells = Cells(len(source.fitness.penalties)) if run is None else run.archive.cells
-    now = evaluation_of(recording.result(), cells, source.fitness)
+    now = evaluate_rollout(recording.result(), cells, source.fitness)
     columns: list[tuple[str, Evaluation, int]] = [("now", now, 0)]
     if run is not None:
         whole = "whole, " if source.terrains[k].minimal else ""

@@ -16,6 +16,7 @@ from qd.faults.judge import judge
 from qd.search import settings
 from qd.search.archive import read_archive
 from qd.search.loop import say_what_stops_the_robot
+from qd.search.methods.registry import METHODS
 from qd.workers.evaluator import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
@@ -113,6 +114,19 @@ def test_flags_come_to_the_settings_of_the_run():
     assert archive("--resume", "a", *MORE, "2") == 0  # all of these are defaults now
     stored = read_archive("a")
     assert (stored.iterations, stored.ratios.shape[1]) == (2, 3)
+
+
+def test_a_method_of_one_file_is_searched_by_its_name_and_listed_with_its_settings(capsys):
+    assert archive(*TINY, "--method", "toy+map_elites", "--scheduler.toy-step", "0.5", "--run-dir", "a") == 0
+    assert archive("--resume", "a", *MORE, "2") == 0
+    scheduler = config_of("a")["settings"]["scheduler"]
+    assert (scheduler["method"], scheduler["toy_step"]) == ("toy+map_elites", 0.5)
+    stored = read_archive("a")
+    assert stored.iterations == 2 and len(stored)
+    with pytest.raises(SystemExit):
+        archive("--help")
+    text = capsys.readouterr().out
+    assert "--scheduler.toy-step" in text and all(name in text for name in METHODS)
 
 
 def test_a_preset_has_its_own_defaults():

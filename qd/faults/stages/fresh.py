@@ -9,7 +9,7 @@ from qd.faults.numbers import FRESH_EPISODES
 from qd.faults.searches import Search
 from qd.faults.stages.base import Judging, Stage, elite_seeds
 from qd.search.archive import Archive, FreshValues
-from qd.search.fitness import BIT_EPISODES, FitnessCfg, evaluation_of
+from qd.search.fitness import BIT_EPISODES, FitnessCfg, evaluate_rollout
 from qd.workers.seeds import Stream
 from sim.rollout import RolloutResult
 
@@ -39,9 +39,9 @@ class Fresh(Stage):
 def fresh_values(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> FreshValues:
     """The values of an archive's elites by 40 fresh episodes on each."""
     cells = archive.cells
-    fresh = evaluation_of(result, cells, fitness)
+    fresh = evaluate_rollout(result, cells, fitness)
     collided = (result.base_collision & ~result.invalid)[:, :BIT_EPISODES].any(axis=1)
-    cell = cells.cell_of(fresh.ratios, collided)
+    cell = cells.find_cells(fresh.ratios, collided)
     reproduced = fresh.valid & cells.are_neighbours(archive.cell, cell)
     return FreshValues(**{**vars(fresh), "cell": cell}, reproduced=reproduced)
 

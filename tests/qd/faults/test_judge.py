@@ -34,7 +34,7 @@ def archive_of(ratios, *, collided=None):
     archive = small_archive(len(ratios))
     columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
     archive = dataclasses.replace(archive, ratios=columns, scales=(1.0, 1.0), collision_bit=collided is not None)
-    return dataclasses.replace(archive, cell=archive.cells.cell_of(columns, collided))
+    return dataclasses.replace(archive, cell=archive.cells.find_cells(columns, collided))
 
 
 def fresh_at(archive, ratios, **kwargs):

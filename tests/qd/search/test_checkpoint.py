@@ -8,7 +8,7 @@ from qd.search.checkpoint import load_checkpoint
 
 def wrap(payload: bytes) -> bytes:
     """A file with a right magic and hash around any payload, as an attacker would make it."""
-    return b"faultline search checkpoint 5\n" + hashlib.sha256(payload).digest() + payload
+    return b"faultline search checkpoint 6\n" + hashlib.sha256(payload).digest() + payload
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_foreign_files(tmp_path, content):
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("version", [b"4\n", b"55\n", b""])
+@pytest.mark.parametrize("version", [b"5\n", b"55\n", b""])
 def test_of_another_version_a_new_run_is_the_remedy_not_a_copy(tmp_path, version):
     path = tmp_path / "checkpoint.bin"
     path.write_bytes(b"faultline search checkpoint " + version + bytes(40))

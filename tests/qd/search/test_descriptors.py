@@ -35,7 +35,7 @@ def test_every_reachable_cell_is_hit_by_a_point_in_its_middle(num_ratios, interv
     assert cells.num_cells == count
     lower = cells.tuples / intervals
     inside = lower + (1.0 - lower.sum(axis=1, keepdims=True)) / num_ratios
-    assert cells.cell_of(inside).tolist() == list(range(cells.num_cells))
+    assert cells.find_cells(inside).tolist() == list(range(cells.num_cells))
 
 
 @pytest.mark.parametrize(
@@ -57,30 +57,30 @@ def test_every_reachable_cell_is_hit_by_a_point_in_its_middle(num_ratios, interv
 )
 def test_knife_edges(ratios, expected):
     cells = Cells(5)
-    assert cells.tuples[cells.cell_of([ratios])[0]].tolist() == expected
+    assert cells.tuples[cells.find_cells([ratios])[0]].tolist() == expected
 
 
 def test_edges_of_other_intervals_are_exact():
     cells = Cells(2, 49)  # floor(1/49 * 49) = 0 in float64; the edge belongs to interval 1
-    assert cells.tuples[cells.cell_of([[1 / 49, 48 / 49]])[0]].tolist() == [1, 47]
+    assert cells.tuples[cells.find_cells([[1 / 49, 48 / 49]])[0]].tolist() == [1, 47]
 
 
 def test_collision_bit_selects_the_upper_half():
     cells = Cells(5, collision_bit=True)
     ratios = [[0.25, 0.25, 0.25, 0.15, 0.1]] * 2
-    without, with_collision = cells.cell_of(ratios, [False, True])
+    without, with_collision = cells.find_cells(ratios, [False, True])
     assert with_collision == without + 1750 and cells.num_cells == 3500
     assert cells.describe(int(with_collision)).endswith("with collision")
     assert not cells.are_neighbours([without], [with_collision])[0]
     with pytest.raises(ValueError, match="collided must be given"):
-        cells.cell_of(ratios)
+        cells.find_cells(ratios)
 
 
 def test_neighbours():
     cells = Cells(3)
 
     def cell(*ratios: float) -> int:
-        return int(cells.cell_of([ratios])[0])
+        return int(cells.find_cells([ratios])[0])
 
     here = cell(0.35, 0.35, 0.30)
     assert cells.are_neighbours([here], [here])[0]
@@ -91,4 +91,4 @@ def test_neighbours():
 @pytest.mark.parametrize("ratios", [[[0.5, 0.6]], [[-0.1, 1.1]], [[np.nan, 1.0]], [[0.5, 0.25, 0.25]], [0.5, 0.5]])
 def test_ratios_that_are_none_are_refused(ratios):
     with pytest.raises(ValueError, match="ratios must"):
-        Cells(2).cell_of(ratios)
+        Cells(2).find_cells(ratios)

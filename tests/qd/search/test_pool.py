@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of, rows_of
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, select_terrains
 from qd.search.pool import DEPTH, Pool, chance_to_stay, expected_score
 from tests.qd.stand_in import make_result
 
@@ -15,7 +15,7 @@ def crossed(ratios, *, episodes=3, total=8.0, collides=0, cells=CELLS) -> Evalua
     """A terrain whose episodes are all alike: their penalties sum to ``total`` in these ratios."""
     penalties = np.broadcast_to(np.asarray(ratios) * total, (1, episodes, 3))
     result = make_result(penalties, base_collision=[np.arange(episodes) < collides], names=CFG.penalties)
-    return evaluation_of(result, cells, CFG)
+    return evaluate_rollout(result, cells, CFG)
 
 
 def tell(pool: Pool, evaluation: Evaluation, number: int = -1, iteration: int = 1, solution=SOLUTION) -> Evaluation:
@@ -29,7 +29,7 @@ def holders(pool: Pool) -> dict[int, int]:
 
 
 def cell_of(*ratios: float) -> int:
-    return int(CELLS.cell_of([ratios])[0])
+    return int(CELLS.find_cells([ratios])[0])
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_a_cell_has_a_few_terrains_and_those_under_way():
 def test_an_invalid_terrain_holds_no_cell_and_is_forgotten():
     result = make_result(np.full((1, 3, 3), np.nan), invalid=np.ones((1, 3), bool), names=CFG.penalties)
     pool = Pool(2, CELLS, CFG)
-    tell(pool, evaluation_of(result, CELLS, CFG))
+    tell(pool, evaluate_rollout(result, CELLS, CFG))
     assert holders(pool) == {} and len(pool) == 0
     assert len(pool.least_known(4, pool.number)) == 0
 
@@ -120,4 +120,4 @@ def test_a_terrain_that_was_crossed_again_several_times_at_once_has_all_episodes
     pool.tell(np.zeros((2, 2), np.float32), np.zeros(2, np.int64), told, 2)
     assert pool.terrains.episodes.tolist() == [9]
     assert pool.terrains.penalty_mean.sum() == pytest.approx((8.0 + 2.0 + 5.0) / 3)
-    assert rows_of(told, [0]).penalty_mean.sum() == pytest.approx(2.0)  # what it was told stays as it was
+    assert select_terrains(told, [0]).penalty_mean.sum() == pytest.approx(2.0)  # what it was told stays as it was

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
-from ribs.emitters import EvolutionStrategyEmitter
 
-from qd.search import surrogate
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.descriptors import Cells
-from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluation_of
-from qd.search.presets import METHODS, SchedulerCfg
-from qd.search.scheduler import RandomEmitter, Scheduler
+from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluate_rollout
+from qd.search.methods.registry import METHODS
+from qd.search.presets import SchedulerCfg
+from qd.search.scheduler import Scheduler
+from qd.search.surrogate import surrogate
 from tests.qd import stand_in
 
 CELLS = Cells(6)
@@ -31,7 +31,7 @@ def advance(search: Scheduler, first: int, last: int) -> None:
     for iteration in range(first, last + 1):
         genes = search.ask()
         seeds = np.random.SeedSequence([0, iteration]).generate_state(len(genes))
-        search.tell(evaluation_of(stand_in.evaluate(genes, seeds), CELLS, FITNESS), iteration)
+        search.tell(evaluate_rollout(stand_in.evaluate(genes, seeds), CELLS, FITNESS), iteration)
 
 
 def evaluation_with(cell, fitness, invalid=None) -> Evaluation:
@@ -99,20 +99,19 @@ def test_random_terrains_are_new_each_time_and_hard_ones_have_their_heights_at_t
     assert not np.isin(hard.ask(), first).all(axis=1).any()
 
 
-def test_joined_methods_take_turns_each_judged_by_its_own_archive():
+def test_emitters_take_joined_methods_in_turn():
     search = make_search(emitters=5, batch_size=2, method="cma_me+cma_mae+uniform_random")
-    assert [type(emitter) for emitter in search.emitters] == [
-        EvolutionStrategyEmitter, EvolutionStrategyEmitter, RandomEmitter,
-        EvolutionStrategyEmitter, EvolutionStrategyEmitter,
-    ]  # fmt: skip
-    archives = [emitter.archive for emitter in search.emitters if isinstance(emitter, EvolutionStrategyEmitter)]
-    assert [archive is search.result for archive in archives] == [True, False, True, False]
-    assert search.archive is not search.result
+    assert {type(method): method.emitters for method in search.methods} == {
+        METHODS["cma_me"]: (0, 3), METHODS["cma_mae"]: (1, 4), METHODS["uniform_random"]: (2,),
+    }  # fmt: skip
+    genes = search.ask()
+    clips = (np.abs(genes) == 1.0).any(axis=1)  # evolution strategies begin wide, with steps of 2
+    assert clips.tolist() == [True] * 4 + [False] * 2 + [True] * 4
 
 
 def test_terrains_are_crossed_again_behind_new_ones_and_alone_where_nothing_new_is_wanted():
     search = make_search(method="hard_random", again=3)
-    assert search.places(0) == slice(0, 2 * (6 + 3))
+    assert search.group_rows(0) == slice(0, 2 * (6 + 3))
     first = search.ask()
     assert len(first) == 12  # there is nothing to cross again yet
     advance(search, 1, 1)
@@ -126,7 +125,7 @@ def test_terrains_are_crossed_again_behind_new_ones_and_alone_where_nothing_new_
     assert len(settling) == 18
     assert all((genes == np.concatenate([first, second])).all(axis=1).any() for genes in settling)
     assert len(known) and search.elites()["episodes"].max() == 8
-    evaluation = evaluation_of(stand_in.evaluate(settling, np.arange(18)), CELLS, FITNESS)
+    evaluation = evaluate_rollout(stand_in.evaluate(settling, np.arange(18)), CELLS, FITNESS)
     assert search.tell(evaluation, 3) == 0
 
 
@@ -134,6 +133,6 @@ def test_a_group_crosses_nothing_again_that_another_one_crosses_already_while_th
     search = make_search(method="hard_random", emitters=2, again=3, groups=2)
     for group in (0, 1):
         genes = search.ask(group)
-        search.tell(evaluation_of(stand_in.evaluate(genes, np.arange(len(genes))), CELLS, FITNESS), 1, group)
+        search.tell(evaluate_rollout(stand_in.evaluate(genes, np.arange(len(genes))), CELLS, FITNESS), 1, group)
     again = [search.ask(group)[6:] for group in (0, 1)]
     assert len(np.unique(np.concatenate(again), axis=0)) == 6

@@ -11,7 +11,7 @@ import pytest
 from qd.faults.judge import judge
 from qd.search.archive import read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
-from qd.search.fitness import FitnessCfg, evaluation_of
+from qd.search.fitness import FitnessCfg, evaluate_rollout
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from tests.builders import fresh_values
@@ -58,7 +58,7 @@ def test_files_agree_with_each_other(tmp_path, monkeypatch):
 
 def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_been_longer_from_the_start(tmp_path):
     columns = [0, 1, 3, 5]  # without vel_y and stumble
-    fitness = CFG.fitness.of_penalties(("yaw_rate", "vel_x", "contact_force", "collision"))
+    fitness = CFG.fitness.with_penalties(("yaw_rate", "vel_x", "contact_force", "collision"))
     settings = {"fitness": fitness, "intervals": 5}
     archive = run(tmp_path / "whole", iterations=5, **settings)
     run(tmp_path / "pieces", iterations=2, **settings)
@@ -67,7 +67,7 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     # Of 4 indices of 0 to 4, those that sum to 2, 3 and 4: C(5, 3) + C(6, 3) + C(7, 3) = 10 + 20 + 35.
     assert json.loads((tmp_path / "whole/archive.json").read_text())["reachable_cells"] == 65
     assert archive.ratios.sum(axis=1) == pytest.approx(np.ones(len(archive)))
-    assert np.array_equal(archive.cells.cell_of(archive.ratios), archive.cell)
+    assert np.array_equal(archive.cells.find_cells(archive.ratios), archive.cell)
     # The stand-in's penalties are scale * 4 * hardness^3 of genes k, k + 6, ..., but for noise of 10 %.
     hardness = np.stack([np.abs(archive.genes[:, k::6]).mean(axis=1) for k in columns], axis=1)
     assert archive.penalty_mean == pytest.approx(4.0 * hardness**3, rel=0.1)
@@ -267,7 +267,7 @@ def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
     again = run(tmp_path / "again", opener=opener, scheduler=scheduler, iterations=20)
 
     def share_in_the_same_cell(archive):
-        fresh = evaluation_of(noisy(archive.genes, np.arange(len(archive)), 40), CFG.cells, CFG.fitness)
+        fresh = evaluate_rollout(noisy(archive.genes, np.arange(len(archive)), 40), CFG.cells, CFG.fitness)
         return (fresh.cell == archive.cell).mean()
 
     assert share_in_the_same_cell(again) > 1.3 * share_in_the_same_cell(once)

@@ -88,4 +88,4 @@ def test_robot_and_controller_are_part_of_the_settings(tmp_path):
 @pytest.mark.parametrize("names", [("vel_x", "torque"), ("vel_x",)])  # unknown; a single ratio is always 1
 def test_penalties_that_cannot_count_are_refused(names):
     with pytest.raises(ValueError, match="penalties"):
-        FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES).of_penalties(names)
+        FitnessCfg(penalties=stand_in.PENALTIES, scales=stand_in.SCALES).with_penalties(names)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from qd.search import surrogate as module
 from qd.search.descriptors import Cells
-from qd.search.fitness import Evaluation, FitnessCfg, evaluation_of, rows_of
-from qd.search.networks import MEMBERS, Networks, Training
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, select_terrains
 from qd.search.presets import SchedulerCfg
-from qd.search.surrogate import Surrogate, vary_elites
+from qd.search.surrogate import surrogate as module
+from qd.search.surrogate.networks import MEMBERS, Networks, Training
+from qd.search.surrogate.surrogate import Surrogate, vary_elites
 from sim.terrains.corridor import SHAPE, corridor_heights
 from sim.terrains.spaces.base import clipped
 from sim.terrains.spaces.registry import get_space, load_space
@@ -32,7 +32,7 @@ def crossed(genes, seed: int, space=SUPER_GAUSSIAN) -> Evaluation:
     high = np.stack([np.abs(part).mean(axis=(1, 2)) for part in parts], axis=1)
     noise = np.random.default_rng(seed).uniform(0.9, 1.1, (len(genes), 4, 6))
     result = stand_in.make_result((0.0005 + 0.1 * (30.0 * steep + 4.0 * high) ** 2)[:, None] * noise * stand_in.SCALES)
-    return evaluation_of(result, CELLS, FITNESS)
+    return evaluate_rollout(result, CELLS, FITNESS)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -89,7 +89,7 @@ def test_it_learns_from_a_payload_alone():
         genes[:, 64] = np.random.default_rng(seed).uniform(-1.0, 1.0, count)
         shares = np.full((count, 4, 6), 1.0)
         shares[..., 0] += 4.0 * (1.0 + genes[:, 64, None])
-        return genes, evaluation_of(stand_in.make_result(shares * stand_in.SCALES), CELLS, FITNESS)
+        return genes, evaluate_rollout(stand_in.make_result(shares * stand_in.SCALES), CELLS, FITNESS)
 
     for seed in range(6):
         search.learn(*loaded(64, seed))
@@ -162,7 +162,7 @@ def test_it_learns_and_proposes_on_every_device(device, name, tmp_path):
 def archive_cells(ratios: torch.Tensor) -> np.ndarray:
     """By the archive's own rule, in double precision."""
     ratios = ratios.double().numpy()
-    return CELLS.cell_of(ratios / ratios.sum(axis=-1, keepdims=True))
+    return CELLS.find_cells(ratios / ratios.sum(axis=-1, keepdims=True))
 
 
 def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
@@ -213,7 +213,7 @@ def test_cells_are_the_archives(cells):
     rng = np.random.default_rng(1)
     ratios, collided = rng.dirichlet(np.full(cells.num_ratios, 0.5), 3000), rng.random(3000) < 0.5
     numbers = search.cells_of(torch.from_numpy(ratios), torch.from_numpy(collided)).numpy()
-    assert np.array_equal(numbers, cells.cell_of(ratios, collided))
+    assert np.array_equal(numbers, cells.find_cells(ratios, collided))
     edge = torch.zeros(1, cells.num_ratios)
     edge[0, :2] = 0.5  # 5 + 5 intervals leave nothing for the others: a single point, in no cell
     assert search.cells_of(edge, torch.tensor([False])).tolist() == [-1]
@@ -239,7 +239,7 @@ def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name,
         invalid = np.zeros((40, 4), bool)
         invalid[1:3] = True
         result = stand_in.make_result(np.ones((40, 4, 6)), invalid=invalid)
-        search.learn(genes, evaluation_of(result, CELLS, FITNESS))
+        search.learn(genes, evaluate_rollout(result, CELLS, FITNESS))
         assert len(search) == length
 
 
@@ -259,7 +259,7 @@ def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(m
     heights = (corridor_heights(torch.from_numpy(genes), SUPER_GAUSSIAN) / 0.25).flatten(1)
     for first in range(0, 420, 60):
         part = slice(first, first + 60)
-        search.learn(genes[part], rows_of(evaluation, part))
+        search.learn(genes[part], select_terrains(evaluation, part))
     assert [len(maps) for maps, _, _ in given] == [128, 256, 256, 300, 300, 300]
     for told, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
         places = drawn.unique()

@@ -40,7 +40,7 @@ def folder(tmp_path, monkeypatch):
 def opened_run(tmp_path, anymal):
     ratios = np.array([[0.35, 0.65]])
     archive = dataclasses.replace(
-        small_archive(1), ratios=ratios, cell=Cells(2).cell_of(ratios), penalty_mean=np.array([[2.0, 3.0]]),
+        small_archive(1), ratios=ratios, cell=Cells(2).find_cells(ratios), penalty_mean=np.array([[2.0, 3.0]]),
         penalty_std=np.array([[1.0, 0.5]]), fitness=np.array([3.25]), collision_rate=np.array([0.25]),
         goal_rate=np.array([0.75]), fallen_rate=np.array([0.0]),
     )  # fmt: skip

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation
-from qd.search.networks import MEMBERS, Moments, Networks, Training
 from qd.search.presets import SchedulerCfg
+from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Training
 from sim.controllers.loaders import on_stream, prepare_torch
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
 from sim.terrains.spaces.base import TerrainSpace, clipped

@@ -1,0 +1,1 @@
+"""Methods of search, one file each: where new terrains come from."""

@@ -1,0 +1,1 @@
+"""A surrogate of the simulation: networks, and the search that they judge."""
