@@ -1,4 +1,4 @@
-"""Descriptors: in which proportions a controller is penalised, and the cell of the archive that this falls into.
+"""Descriptors: in which proportions a controller is penalised, and the archive's cell of these ratios.
 
 The ratios of a terrain sum to 1, so most tuples of intervals can never occur. Cells are numbered over the reachable
 tuples alone: those that hold more than single points of the plane sum(ratios) = 1.
@@ -23,7 +23,8 @@ def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64
     """
     valid = np.asarray(valid, dtype=bool)[..., None]
     penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)
-    equal, sums = np.full_like(penalties, 1.0 / penalties.shape[-1]), penalties.sum(axis=-1, keepdims=True)
+    sums = penalties.sum(axis=-1, keepdims=True)
+    equal = np.full_like(penalties, 1.0 / penalties.shape[-1])
     ratios = np.divide(penalties, sums, out=equal, where=sums > 0.0)
     count = valid.sum(axis=1)
     total = np.where(valid, ratios, 0.0).sum(axis=1)
@@ -35,13 +36,13 @@ class Cells:
 
     A tuple of interval indices i_1 .. i_n (each in 0 .. intervals - 1) spans a box whose lower corner sums to
     sum(i) / intervals and whose upper corner to (sum(i) + n) / intervals. The plane sum(ratios) = 1 passes through
-    the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple of which it only touches a corner does
-    not count. With a collision bit every tuple is two cells, the one with a collision in the upper half of the numbers.
+    the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple does not count if the plane only touches
+    a corner of its box. With a collision bit every tuple is two cells, the one with a collision in the upper half of the numbers.
 
     Args:
         num_ratios: Number of ratio descriptors, at least 2.
         intervals: Intervals that [0, 1] is divided into; 1.0 belongs to the last.
-        collision_bit: Whether a base collision is a descriptor too: in any of 20 episodes, as far as those crossed say
+        collision_bit: Whether a base collision in any of 20 episodes is a descriptor too
             (:attr:`qd.search.fitness.Evaluation.collides`).
     """
 
@@ -75,14 +76,14 @@ class Cells:
 
     @cached_property
     def codes(self) -> NDArray[np.int64]:
-        """One number a reachable tuple, its digits to the base of the intervals, ascending, shape (num_tuples,)."""
+        """One number a reachable tuple, with its indices as digits, ascending, shape (num_tuples,)."""
         return self._code(self.tuples)
 
     def _code(self, tuples: NDArray[np.int64]) -> NDArray[np.int64]:
-        """One number a tuple, in lexicographic order."""
+        """One number a tuple, with its indices as digits to the base of the intervals."""
         return np.asarray(np.ravel_multi_index(tuple(tuples.T), (self.intervals,) * self.num_ratios), dtype=np.int64)
 
-    def cell_of(self, ratios: ArrayLike, collided: ArrayLike | None = None) -> NDArray[np.int64]:
+    def find_cells(self, ratios: ArrayLike, collided: ArrayLike | None = None) -> NDArray[np.int64]:
         """Index of the reachable cell of each row of ratios, shape (batch,).
 
         Args:
@@ -91,7 +92,7 @@ class Cells:
         """
         ratios = np.asarray(ratios, dtype=np.float64)
         self._check_ratios(ratios)
-        tuples = self._to_reachable(self._intervals_of(ratios), ratios)
+        tuples = self._to_reachable(self._find_intervals(ratios), ratios)
         cells = np.searchsorted(self.codes, self._code(tuples))
         if not self.collision_bit:
             return cells
@@ -107,7 +108,7 @@ class Cells:
             row = int(np.argmin(good))
             raise ValueError(f"ratios must not be negative and must sum to 1, got {ratios[row].tolist()} in row {row}")
 
-    def _intervals_of(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _find_intervals(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
         """Interval of each ratio: [i / intervals, (i + 1) / intervals), with 1.0 in the last."""
         # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
         edges = np.arange(self.intervals + 1) / self.intervals
@@ -133,7 +134,7 @@ class Cells:
         return close & (bit_a == bit_b)
 
     def describe(self, cell: int) -> str:
-        """A cell in words, e.g. ``.0-.1 .3-.4 .5-.6 collision``."""
+        """A cell as text, for example ``0-0.1 0.3-0.4 0.5-0.6 with collision``."""
         bit, index = divmod(cell, len(self.tuples))
         ranges = [f"{low / self.intervals:.3g}-{(low + 1) / self.intervals:.3g}" for low in self.tuples[index]]
         return " ".join(ranges + (["with" if bit else "without", "collision"] if self.collision_bit else []))

@@ -1,4 +1,4 @@
-"""The surrogate's networks, and steps of their training: on CUDA each is one launch of a captured graph."""
+"""The surrogate's networks and their training; on CUDA a step is one launch of a captured graph."""
 
 import math
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from sim.terrains.corridor import SHAPE
 MEMBERS = 4
 """Networks of the ensemble. Each begins with weights of its own, and learns from draws of its own."""
 _CONVOLUTIONS = ((5, (3, 3), 12), (3, (2, 2), 24), (3, (2, 1), 32))  # size, strides across and along the way, channels
-_FEATURES = 64  # of each place along the way
-_WAVES = 4  # cosines by which a place is known
+_FEATURES = 64  # of each position along the way
+_WAVES = 4  # cosines that encode a position
 _EAGER_STEPS = 3  # before the capture: they allocate the optimiser's state and choose the convolutions' kernels
 _LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam
@@ -26,10 +26,9 @@ _Layers = tuple[tuple[Tensor, Tensor], ...]
 class Networks(nn.Module):
     """Small convolutional networks side by side, as groups of channels.
 
-    They slide along the way, and then keep mean and maximum, so that an obstacle is the same wherever it lies. What
-    depends on where it lies can be learned, too: the last convolution that slides also sees how far along the way each
-    place lies, as cosines. These separate parts of the way in fewer steps of training than one coordinate does. Of
-    ``num_maps`` maps of a terrain each network says ``num_out`` numbers.
+    Convolutions slide along the way, and mean and maximum pool what they find, so that an obstacle is the same wherever
+    it lies. The last convolution also sees the position along the way, as cosines: networks learn from these in fewer
+    steps than from one coordinate. Each network maps ``num_maps`` maps of a terrain to ``num_out`` numbers.
 
     Parameters are weights and biases of each layer in turn, all zero, of shapes (MEMBERS * out, in, *size) and
     (MEMBERS * out,). Weights lie in memory as convolutions are fastest, on the CPU and on CUDA.
@@ -46,11 +45,11 @@ class Networks(nn.Module):
             weights = torch.zeros(MEMBERS * out, *shape).contiguous(memory_format=torch.channels_last)
             self._weights.extend([weights, torch.zeros(MEMBERS * out)])
         waves = math.pi * torch.arange(1, _WAVES + 1)[:, None] * torch.linspace(0.0, 1.0, cols)  # from start to goal
-        places = nn.functional.unfold(waves.cos()[None, :, None].repeat(1, 1, rows, 1), (rows, 3), padding=(0, 1))
-        self.register_buffer("_places", places[0], persistent=False)
+        positions = nn.functional.unfold(waves.cos()[None, :, None].repeat(1, 1, rows, 1), (rows, 3), padding=(0, 1))
+        self.register_buffer("_positions", positions[0], persistent=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """What each network says of the maps that it sees, (MEMBERS, batch, *SHAPE, num_maps).
+        """Outputs of each network for maps of its own, (MEMBERS, batch, *SHAPE, num_maps).
 
         Shape (batch, MEMBERS, num_out).
         """
@@ -60,7 +59,7 @@ class Networks(nn.Module):
         return torch.cat([*map(self._through, maps, self._layers(1))], dim=1)
 
     def judge(self, maps: Tensor) -> Tensor:
-        """What each network says of the same maps, (batch, *SHAPE, num_maps); on CUDA half precision is enough.
+        """Outputs of each network for the same maps, (batch, *SHAPE, num_maps); on CUDA half precision is enough.
 
         Float32, shape (batch, MEMBERS, num_out).
         """
@@ -69,32 +68,32 @@ class Networks(nn.Module):
         return self._through(maps.half(), *self._layers(MEMBERS))
 
     def _layers(self, count: int) -> list[_Layers]:
-        """Weights and biases of each layer, of ``count`` networks after the other."""
-        parts = [part.unflatten(0, (MEMBERS, -1)).split(count) for part in self._weights]
-        return [tuple(zip(tensors[::2], tensors[1::2], strict=True)) for tensors in zip(*parts, strict=True)]
+        """Weights and biases of each layer, in blocks of ``count`` networks."""
+        blocks = [tensor.unflatten(0, (MEMBERS, -1)).split(count) for tensor in self._weights]
+        return [tuple(zip(tensors[::2], tensors[1::2], strict=True)) for tensors in zip(*blocks, strict=True)]
 
     def _through(self, maps: Tensor, layers: _Layers) -> Tensor:
-        """What networks of some layers say of maps for each of them or for all, shape (batch, networks, num_out)."""
+        """Outputs of some networks for maps of each or of all, shape (batch, networks, num_out)."""
         rows = maps.movedim(-1, 1)
         for (size, strides, _), (weight, bias) in zip(_CONVOLUTIONS, layers, strict=False):
-            alike = rows.shape[1] == weight.shape[2]  # all networks see the same
-            weight = weight.flatten(0, 1) if alike else _block_diagonal(weight)
+            has_same_input = rows.shape[1] == weight.shape[2]  # for all networks
+            weight = weight.flatten(0, 1) if has_same_input else _block_diagonal(weight)
             rows = _activated(rows, weight.to(rows.dtype), bias.flatten().to(rows.dtype), strides, size // 2)
         (weight, bias), (last_weight, last_bias) = layers[-2:]
-        weight, of_places = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
-        places = of_places.flatten(2) @ self.get_buffer("_places") + bias[..., None]  # the same in every row
+        weight, position_weight = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
+        offsets = position_weight.flatten(2) @ self.get_buffer("_positions") + bias[..., None]  # the same in every row
         rows = nn.functional.conv2d(rows, _block_diagonal(weight).to(rows.dtype), padding=(0, 1))
-        rows = (rows.reshape(len(rows), *places.shape) + places.to(rows.dtype)).relu()
+        rows = (rows.reshape(len(rows), *offsets.shape) + offsets.to(rows.dtype)).relu()
         pooled = torch.cat([rows.mean(-1), rows.amax(-1)], dim=2).float()
         return torch.einsum("bni,noi->bno", pooled, last_weight.flatten(2)) + last_bias
 
 
 def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, int], padding: int) -> Tensor:
-    """A convolution and what is positive of it; in half precision one kernel of cuDNN does both, and nothing learns."""
+    """A convolution and a ReLU; in half precision one kernel of cuDNN does both, without gradients."""
     if rows.dtype != torch.half:
         return nn.functional.conv2d(rows, weight, bias, strides, padding).relu()
     if missing := -rows.shape[1] % 8:  # Tensor Cores take eight channels at once
-        rows, weight = (nn.functional.pad(part.movedim(1, -1), (0, missing)).movedim(-1, 1) for part in (rows, weight))
+        rows, weight = (nn.functional.pad(x.movedim(1, -1), (0, missing)).movedim(-1, 1) for x in (rows, weight))
     return torch.cudnn_convolution_relu(rows, weight, bias, strides, (padding, padding), (1, 1), 1)
 
 
@@ -110,13 +109,12 @@ def _block_diagonal(weight: Tensor) -> Tensor:
     return apart.flatten(2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
 
 
-class Training:
+class Trainer:
     """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
 
-    The graph holds the memory of weights and moments. So networks that are moved need a new training, which captures
-    anew. On CUDA all steps must be taken on one stream, other than the default one. ``loss`` is of what the networks
-    say and what they should, both of shape (batch, MEMBERS, num_out). ``moments`` are what Adam remembers from before,
-    of each tensor of weights.
+    The graph holds the memory of weights and moments. So networks that are moved need a new trainer, which captures
+    anew. On CUDA all steps must be taken on one stream, other than the default one. ``loss`` takes outputs and targets,
+    both of shape (batch, MEMBERS, num_out). ``moments`` are what Adam remembered of each tensor of weights.
     """
 
     def __init__(
@@ -152,9 +150,9 @@ class Training:
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
         """Takes a step for each batch that was drawn. All tensors are on the device.
 
-        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets are what the networks should
-        say of them, (N, num_out). ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it
-        sees them mirrored, both (steps, batch, MEMBERS).
+        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets have shape (N, num_out).
+        ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it sees them mirrored, both
+        (steps, batch, MEMBERS).
         """
         terrains, turned = drawn.transpose(1, 2), turned.transpose(1, 2)
         if self._batch is None:  # memory of a batch, the same in every step

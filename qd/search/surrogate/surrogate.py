@@ -5,7 +5,6 @@ al. 2022, "Deep Surrogate Assisted Generation of Environments"). What a terrain 
 expected to add, where its ratios may be as far from the predicted ones as those of earlier terrains were.
 """
 
-from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation
-from qd.search.presets import SchedulerCfg
-from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Training
+from qd.search.surrogate.cfg import SurrogateCfg
+from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Trainer
 from sim.controllers.loaders import on_stream, prepare_torch
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
 from sim.terrains.spaces.base import TerrainSpace, clipped
@@ -24,24 +23,25 @@ from sim.terrains.spaces.registry import get_space
 
 BATCH = 64
 """Terrains of a step of training, for each network, or as many as an iteration has if those are fewer."""
-FEWEST = 64
+MIN_TERRAINS = 64
 """Valid terrains that must be known before the networks are asked."""
-MOST = 200_000
+MAX_TERRAINS = 200_000
 """Terrains that are learned from, the newest ones; fewer where their maps would take more than 8 GB."""
-MOST_BYTES = 8 << 30
-"""Of the maps of these."""
-_AT_ONCE = {"cpu": 1024, "cuda": 8192}  # terrains that are judged at once
+MAX_BYTES = 8 << 30
+"""Memory of the maps of these."""
+_CHUNK = {"cpu": 1024, "cuda": 8192}  # terrains that are judged in one pass
 _GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
-_LEAST_PENALTY = 0.01  # is added before the logarithm
+_MIN_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
 _NUM_RATES = 3  # goal rate, collision rate, collision bit
-_DRAWS = 4  # of the ratios of a terrain, for each network's word on its fitness and collision
-_ERROR_STEP = 0.1  # of the known error of ratios toward that of the terrains told last
+_DRAWS = 4  # of the ratios of a terrain, for each network's fitness and collision
+_STORED = ("cfg", "cells", "space_name", "space_sha256", "squared_error", "_rng", "_genes", "_targets", "_scale")
+_ERROR_STEP = 0.1  # of the known error of ratios toward that of the latest terrains
 
 
 class Prediction(NamedTuple):
-    """What each of the networks says of N terrains, on their device."""
+    """Predictions of each of the networks for N terrains, on their device."""
 
     ratios: Tensor
     """Shape (MEMBERS, N, P), each row summing to 1."""
@@ -66,12 +66,13 @@ class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
     Attributes:
-        squared_error: Of predicted ratios, by the terrains told so far, the noise of their episodes included, shape
-            (P,); None before the networks are asked.
+        squared_error: Mean squared error of predicted ratios so far, the noise of their episodes included, shape (P,);
+            None before the networks are asked.
     """
 
-    def __init__(self, cfg: SchedulerCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
-        self.cfg, self.cells = cfg, cells
+    def __init__(self, cfg: SurrogateCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
+        self.cfg = cfg
+        self.cells = cells
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
@@ -96,9 +97,9 @@ class Surrogate:
         return get_space(self.space_name, self.space_sha256)
 
     @property
-    def _most(self) -> int:
+    def _capacity(self) -> int:
         """Terrains that it learns from at most."""
-        return min(MOST, MOST_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
+        return min(MAX_TERRAINS, MAX_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
 
     def __len__(self) -> int:
         """Terrains that it learns from."""
@@ -108,7 +109,7 @@ class Surrogate:
         """Moves the work to a Warp device; to the CPU where torch does not see such a device."""
         device = device if device.startswith("cuda") and torch.cuda.is_available() else "cpu"
         prepare_torch(device)
-        self._work_on(device, self._training.moments)
+        self._work_on(device, self._trainer.moments)
 
     def _work_on(self, device: str, moments: Moments | None = None) -> None:
         self.device = device
@@ -120,7 +121,7 @@ class Surrogate:
         self._num_mapped, self._num_unmapped = 0, len(self)  # terrains that the ring has taken, and has still to take
         self._codes: Tensor | None = None  # of the cells
         with on_stream(self._stream):
-            self._training = Training(self._networks.to(device), self._loss, device, moments)
+            self._trainer = Trainer(self._networks.to(device), self._loss, device, moments)
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         """Remembers terrains, of genes (N, num_genes), and trains for their share of an iteration's steps.
@@ -130,14 +131,14 @@ class Surrogate:
         valid = evaluation.valid
         if valid.any():
             self._compare(clipped(genes[valid]), evaluation.ratios[valid])
-            self._remember(clipped(genes[valid]), _targets_of(evaluation)[valid])
-        if len(self) >= FEWEST:
+            self._remember(clipped(genes[valid]), _make_targets(evaluation)[valid])
+        if len(self) >= MIN_TERRAINS:
             with on_stream(self._stream):
                 self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
 
     def _compare(self, genes: NDArray[np.float32], ratios: NDArray[np.float64]) -> None:
-        """Notes how far predicted ratios are from those that are told now, the noise of a few episodes included."""
-        if len(self) < FEWEST:
+        """Updates the squared error by ratios that were crossed, before the networks learn from them."""
+        if len(self) < MIN_TERRAINS:
             return
         with on_stream(self._stream):
             predicted = self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
@@ -147,8 +148,8 @@ class Surrogate:
 
     def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
         units = np.rint(genes * _GENE_UNITS).astype(np.int16)
-        self._genes = np.concatenate([self._genes, units])[-self._most :]
-        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-self._most :]
+        self._genes = np.concatenate([self._genes, units])[-self._capacity :]
+        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-self._capacity :]
         self._num_unmapped = min(self._num_unmapped + len(units), len(self))
         numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
@@ -159,25 +160,25 @@ class Surrogate:
         return torch.cat([heights[..., None], corridor_maps(genes, self.space).movedim(1, -1)], dim=-1)
 
     def _map_new(self) -> tuple[Tensor, Tensor]:
-        """The ring of maps, once it has those of all terrains, and the place of each terrain in it."""
+        """The ring of maps, once it has those of all terrains, and the row of each terrain in it."""
         self._num_mapped += self._num_unmapped
         size = len(self._maps)
-        while size < min(self._num_mapped, self._most):
-            size = min(max(FEWEST, 2 * size), self._most)
-        if size > len(self._maps):  # nothing was overwritten yet, so that maps stay in their places
+        while size < min(self._num_mapped, self._capacity):
+            size = min(max(MIN_TERRAINS, 2 * size), self._capacity)
+        if size > len(self._maps):  # nothing was overwritten yet, so that maps stay in their rows
             grown = self._maps.new_empty(size, *self._maps.shape[1:])
             grown[: len(self._maps)] = self._maps
             self._maps = grown
-        places = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
+        rows = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
         new = slice(len(self) - self._num_unmapped, None)
         units = torch.from_numpy(self._genes[new]).to(self.device)
-        for part, rows in zip(units.split(_AT_ONCE["cpu"]), places[new].split(_AT_ONCE["cpu"]), strict=True):
-            self._maps[rows] = self._map_genes(part / _GENE_UNITS).half()
+        for chunk, chunk_rows in zip(units.split(_CHUNK["cpu"]), rows[new].split(_CHUNK["cpu"]), strict=True):
+            self._maps[chunk_rows] = self._map_genes(chunk / _GENE_UNITS).half()
         self._num_unmapped = 0
-        return self._maps, places
+        return self._maps, rows
 
     def _train(self, steps: int) -> None:
-        maps, places = self._map_new()
+        maps, rows = self._map_new()
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         ratios, numbers, rates = self._split(torch.from_numpy(self._targets).to(self.device).float())
         targets = torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
@@ -185,8 +186,8 @@ class Surrogate:
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
         ordered = targets.new_empty(len(maps), targets.shape[1])
-        ordered[places] = targets
-        self._training.run(maps, ordered, places[drawn], turned)
+        ordered[rows] = targets
+        self._trainer.run(maps, ordered, rows[drawn], turned)
 
     def _split(self, columns: Any) -> tuple[Any, Any, Any]:
         """Columns of ratios, numbers and rates."""
@@ -204,11 +205,11 @@ class Surrogate:
 
     @torch.inference_mode()
     def predict(self, genes: Tensor) -> Prediction:
-        """What each network says of terrains, of genes in [-1, 1] on the surrogate's device, (N, num_genes)."""
+        """Predictions of each network, of genes in [-1, 1] on the surrogate's device, shape (N, num_genes)."""
         if self._stream is not None:  # for what was learned, if another one asks
             torch.cuda.current_stream(self.device).wait_stream(self._stream)
-        parts = genes.split(_AT_ONCE[genes.device.type])
-        columns = torch.cat([self._networks.judge(self._map_genes(part)) for part in parts])
+        chunks = genes.split(_CHUNK[genes.device.type])
+        columns = torch.cat([self._networks.judge(self._map_genes(chunk)) for chunk in chunks])
         ratios, numbers, rates = self._split(columns.transpose(0, 1))
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates)
@@ -220,11 +221,11 @@ class Surrogate:
         elites: NDArray[np.float32],
         cell: NDArray[np.int64],
         fitness: NDArray[np.float64],
-        under_way: NDArray[np.float32],
+        pending: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
-        Genes of the ``elites`` have shape (E, num_genes), their cells and fitness (E,). ``under_way`` are genes of
+        Genes of the ``elites`` have shape (E, num_genes), their cells and fitness (E,). ``pending`` are genes of
         terrains that robots are to cross already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes).
         """
         if not len(elites):
@@ -232,12 +233,12 @@ class Surrogate:
         with on_stream(self._stream):
             draw = torch.Generator(self.device).manual_seed(int(self._rng.integers(2**62)))
             parents = torch.from_numpy(np.ascontiguousarray(elites, np.float32)).to(self.device)
-            if len(self) < FEWEST:
+            if len(self) < MIN_TERRAINS:
                 return self._vary(parents, count, draw).cpu().numpy()
             explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
             best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
             np.maximum.at(best, cell, fitness.astype(np.float32))
-            expected = torch.cat([torch.from_numpy(under_way).to(self.device), explored])
+            expected = torch.cat([torch.from_numpy(pending).to(self.device), explored])
             best_expected = self._add_expected(torch.from_numpy(best).to(self.device), expected)
             searched = self._search(count - len(explored), parents, best_expected, count, draw)
             return torch.cat([explored, searched]).cpu().numpy()
@@ -253,19 +254,19 @@ class Surrogate:
 
     def _search(self, num_proposals: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
         """The inner loop: what adds most to the predicted archive, and what the networks disagree about."""
-        each = self.cfg.candidates * count
-        genes = elites.new_empty(self.cfg.generations * each, elites.shape[1])
+        num_children = self.cfg.candidates * count
+        genes = elites.new_empty(self.cfg.generations * num_children, elites.shape[1])
         gain, spread = elites.new_empty(2, len(genes))
         cells = torch.empty(len(genes), dtype=torch.int64, device=genes.device)
         survivors = cells[:0]
-        for first in range(0, len(genes), each):
-            children = slice(first, first + each)
-            genes[children] = self._vary(torch.cat([elites, genes[survivors]]), each, draw)
+        for first in range(0, len(genes), num_children):
+            children = slice(first, first + num_children)
+            genes[children] = self._vary(torch.cat([elites, genes[survivors]]), num_children, draw)
             prediction = self.predict(genes[children])
             gain[children] = self._expected_gain(prediction, best, draw)
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
-            rows = torch.cat([survivors, torch.arange(first, first + each, device=genes.device)])
+            rows = torch.cat([survivors, torch.arange(first, first + num_children, device=genes.device)])
             survivors = rows[_best_of_each(cells[rows], gain[rows], self.cells.num_cells)]
         chosen = survivors[: num_proposals - min(num_proposals, round(self.cfg.disagree_share * count))]
         spread[chosen] = -torch.inf
@@ -282,21 +283,21 @@ class Surrogate:
             noise = torch.randn((_DRAWS, MEMBERS, *ratios.shape), generator=draw, device=self.device)
             drawn = (ratios + error * noise).clamp_min(1e-6)
             drawn = drawn / drawn.sum(-1, keepdim=True)
-        cells = self.cells_of(drawn, prediction.collided)
+        cells = self.find_cells(drawn, prediction.collided)
         return torch.where(cells >= 0, (prediction.fitness - best[cells]).clamp_min(0.0), 0.0).mean((0, 1))
 
     def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
-        return self.cells_of(prediction.ratios.mean(0), prediction.collided.float().mean(0) >= 0.5)
+        return self.find_cells(prediction.ratios.mean(0), prediction.collided.float().mean(0) >= 0.5)
 
-    def cells_of(self, ratios: Tensor, collided: Tensor) -> Tensor:
-        """Cell of each row of ratios, as :meth:`Cells.cell_of` has it; -1 of one on the edge of what can be reached."""
+    def find_cells(self, ratios: Tensor, collided: Tensor) -> Tensor:
+        """Cell of each row of ratios, as :meth:`Cells.find_cells` has it; -1 where it would be moved to a neighbour."""
         if self._codes is None:
             self._codes = torch.from_numpy(self.cells.codes).to(self.device)
         intervals = self.cells.intervals
         digits = (ratios * intervals).long().clamp_max(intervals - 1)
-        places = intervals ** torch.arange(ratios.shape[-1] - 1, -1, -1, device=ratios.device)
-        codes = (digits * places).sum(-1)
+        powers = intervals ** torch.arange(ratios.shape[-1] - 1, -1, -1, device=ratios.device)
+        codes = (digits * powers).sum(-1)
         cells = torch.searchsorted(self._codes, codes).clamp_max(len(self._codes) - 1)
         reached = self._codes[cells] == codes
         if self.cells.collision_bit:
@@ -308,69 +309,52 @@ class Surrogate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Plain values and arrays; maps are made again."""
-        parts = zip(self._networks.parameters(), self._training.moments, strict=True)
         with on_stream(self._stream):  # another one would wait for crossings
             learned = [
                 {name: value.detach().cpu().numpy() for name, value in {"weights": weights, **moments}.items()}
-                for weights, moments in parts
+                for weights, moments in zip(self._networks.parameters(), self._trainer.moments, strict=True)
             ]
-        return {
-            "cfg": asdict(self.cfg),
-            "cells": (self.cells.num_ratios, self.cells.intervals, self.cells.collision_bit),
-            "space": (self.space_name, self.space_sha256),
-            "rng": self._rng,
-            "genes": self._genes,
-            "targets": self._targets,
-            "scale": self._scale,
-            "squared_error": self.squared_error,
-            "learned": learned,
-        }
+        return {name: getattr(self, name) for name in _STORED} | {"learned": learned}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """On the CPU, until :meth:`compute_on` moves it."""
-        num_ratios, intervals, collision_bit = state["cells"]
-        self.cfg = SchedulerCfg(**state["cfg"])
-        self.cells = Cells(num_ratios, intervals, collision_bit=collision_bit)
-        self.space_name, self.space_sha256 = state["space"]
-        self._rng, self._genes, self._targets = state["rng"], state["genes"], state["targets"]
-        self._scale, self.squared_error = state["scale"], state["squared_error"]
+        moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state.pop("learned")]
+        vars(self).update(state)
         self._networks = Networks(1 + num_maps(self.space), self._targets.shape[1])
-        moments = [{name: torch.from_numpy(array) for name, array in arrays.items()} for arrays in state["learned"]]
         for weights, tensors in zip(self._networks.parameters(), moments, strict=True):
             weights.data.copy_(tensors.pop("weights"))
         self._work_on("cpu", moments)
 
 
 def vary_elites(
-    pool: Tensor, count: int, cfg: SchedulerCfg, genes_per_part: int | None, draw: torch.Generator
+    pool: Tensor, count: int, cfg: SurrogateCfg, genes_per_part: int | None, draw: torch.Generator
 ) -> Tensor:
     """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
 
-    A share of them takes each of its parts, such as bumps, from a further elite with a chance of a half, where the
-    space has parts (:attr:`sim.terrains.spaces.base.TerrainSpace.genes_per_part`). Elites' genes have shape (E,
-    num_genes), children's (count, num_genes), in [-1, 1]; ``draw`` is on their device.
+    Where the space has parts (:attr:`sim.terrains.spaces.base.TerrainSpace.genes_per_part`), a share of the children
+    takes each part from a third elite with a chance of a half. Elites' genes have shape (E, num_genes), children's
+    (count, num_genes), in [-1, 1]; ``draw`` is on their device.
     """
-    on = {"generator": draw, "device": pool.device}
-    elites, others, further = pool[torch.randint(len(pool), (3, count), **on)]
-    noise = cfg.iso_sigma * torch.randn(elites.shape, **on)
-    along = cfg.line_sigma * torch.randn((count, 1), **on)
-    children = elites + noise + along * (others - elites)
+    options = {"generator": draw, "device": pool.device}
+    first, second, third = pool[torch.randint(len(pool), (3, count), **options)]
+    noise = cfg.iso_sigma * torch.randn(first.shape, **options)
+    step = cfg.line_sigma * torch.randn((count, 1), **options)
+    children = first + noise + step * (second - first)
     if cfg.crossover_share and genes_per_part:
-        crossed = torch.rand((count, 1), **on) < cfg.crossover_share
-        swapped = (torch.rand((count, pool.shape[1] // genes_per_part), **on) < 0.5) & crossed
+        crossed = torch.rand((count, 1), **options) < cfg.crossover_share
+        swapped = (torch.rand((count, pool.shape[1] // genes_per_part), **options) < 0.5) & crossed
         swapped = swapped.repeat_interleave(genes_per_part, dim=1)
-        children[:, : swapped.shape[1]] = torch.where(
-            swapped, further[:, : swapped.shape[1]], children[:, : swapped.shape[1]]
-        )
+        width = swapped.shape[1]
+        children[:, :width] = torch.where(swapped, third[:, :width], children[:, :width])
     return children.clamp(-1.0, 1.0)
 
 
-def _targets_of(evaluation: Evaluation) -> NDArray[np.float32]:
-    """What is to be predicted of terrains, shape (N, 3 P + 4)."""
+def _make_targets(evaluation: Evaluation) -> NDArray[np.float32]:
+    """What the networks are to predict, shape (N, 3 P + 4)."""
     columns = (
         evaluation.ratios,
-        np.log(evaluation.penalty_mean + _LEAST_PENALTY),
-        np.log(evaluation.spread + _LEAST_PENALTY),
+        np.log(evaluation.penalty_mean + _MIN_PENALTY),
+        np.log(evaluation.spread + _MIN_PENALTY),
         np.arcsinh(evaluation.fitness)[:, None],
         evaluation.goal_rate[:, None],
         evaluation.collision_rate[:, None],
@@ -380,7 +364,7 @@ def _targets_of(evaluation: Evaluation) -> NDArray[np.float32]:
 
 
 def _best_of_each(cells: Tensor, gain: Tensor, num_cells: int) -> Tensor:
-    """Of each cell the row with the largest gain, if that is positive; by descending gain."""
+    """The row with the largest gain of each cell, if that is positive; by descending gain."""
     order = gain.argsort(descending=True, stable=True)
     order = order[(gain[order] > 0.0) & (cells[order] >= 0)]
     ranks = torch.arange(len(order), device=order.device)

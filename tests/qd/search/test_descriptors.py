@@ -70,10 +70,16 @@ def test_collision_bit_selects_the_upper_half():
     ratios = [[0.25, 0.25, 0.25, 0.15, 0.1]] * 2
     without, with_collision = cells.find_cells(ratios, [False, True])
     assert with_collision == without + 1750 and cells.num_cells == 3500
-    assert cells.describe(int(with_collision)).endswith("with collision")
     assert not cells.are_neighbours([without], [with_collision])[0]
     with pytest.raises(ValueError, match="collided must be given"):
         cells.find_cells(ratios)
+
+
+def test_a_described_cell_is_as_the_docstring_shows_it():
+    cells = Cells(3, collision_bit=True)
+    with_collision = cells.find_cells([[0.08, 0.35, 0.57]], [True])
+    assert f"``{cells.describe(int(with_collision[0]))}``" in Cells.describe.__doc__
+    assert Cells(2, 4).describe(0) == "0-0.25 0.75-1"
 
 
 def test_neighbours():

@@ -28,7 +28,7 @@ def holders(pool: Pool) -> dict[int, int]:
     return dict(zip(pool.terrains.cell[rows].tolist(), pool.number[rows].tolist(), strict=True))
 
 
-def cell_of(*ratios: float) -> int:
+def find_cell(*ratios: float) -> int:
     return int(CELLS.find_cells([ratios])[0])
 
 
@@ -69,7 +69,7 @@ def test_a_terrain_moves_to_the_cell_of_all_of_its_episodes_and_the_next_best_ho
     pool = Pool(2, CELLS, CFG)
     tell(pool, crossed((0.25, 0.35, 0.4)))
     tell(pool, crossed((0.22, 0.38, 0.4)), iteration=2)  # nearer to the edge
-    first, elsewhere = cell_of(0.25, 0.35, 0.4), cell_of(0.45, 0.15, 0.4)
+    first, elsewhere = find_cell(0.25, 0.35, 0.4), find_cell(0.45, 0.15, 0.4)
     assert holders(pool) == {first: 0}
     known = tell(pool, crossed((0.55, 0.05, 0.4), episodes=6), number=0, iteration=3)
     assert known.ratios[0] == pytest.approx([0.45, 0.15, 0.4])

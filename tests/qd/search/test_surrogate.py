@@ -10,7 +10,7 @@ from qd.search.descriptors import Cells
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, select_terrains
 from qd.search.presets import SchedulerCfg
 from qd.search.surrogate import surrogate as module
-from qd.search.surrogate.networks import MEMBERS, Networks, Training
+from qd.search.surrogate.networks import MEMBERS, Networks, Trainer
 from qd.search.surrogate.surrogate import Surrogate, vary_elites
 from sim.terrains.corridor import SHAPE, corridor_heights
 from sim.terrains.spaces.base import clipped
@@ -106,8 +106,8 @@ def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
         torch.nn.init.normal_(weights, std=0.1)
     targets = torch.rand(len(maps), 5)
     drawn = torch.arange(16 * MEMBERS).reshape(1, 16, MEMBERS) % len(maps)
-    training = Training(networks, lambda outputs, targets: ((outputs - targets) ** 2).sum(), "cpu")
-    training.run(maps, targets, drawn, torch.full_like(drawn, turned, dtype=torch.bool))
+    trainer = Trainer(networks, lambda outputs, targets: ((outputs - targets) ** 2).sum(), "cpu")
+    trainer.run(maps, targets, drawn, torch.full_like(drawn, turned, dtype=torch.bool))
     return list(networks.parameters())
 
 
@@ -212,11 +212,11 @@ def test_cells_are_the_archives(cells):
     search = Surrogate(CFG, cells, SUPER_GAUSSIAN, np.random.SeedSequence(0))
     rng = np.random.default_rng(1)
     ratios, collided = rng.dirichlet(np.full(cells.num_ratios, 0.5), 3000), rng.random(3000) < 0.5
-    numbers = search.cells_of(torch.from_numpy(ratios), torch.from_numpy(collided)).numpy()
+    numbers = search.find_cells(torch.from_numpy(ratios), torch.from_numpy(collided)).numpy()
     assert np.array_equal(numbers, cells.find_cells(ratios, collided))
     edge = torch.zeros(1, cells.num_ratios)
     edge[0, :2] = 0.5  # 5 + 5 intervals leave nothing for the others: a single point, in no cell
-    assert search.cells_of(edge, torch.tensor([False])).tolist() == [-1]
+    assert search.find_cells(edge, torch.tensor([False])).tolist() == [-1]
 
 
 def test_before_it_knows_enough_it_draws_and_varies():
@@ -230,7 +230,7 @@ def test_before_it_knows_enough_it_draws_and_varies():
     assert 0.0 < np.abs(later - first[0]).max() < 0.2  # one elite, varied by .02
 
 
-@pytest.mark.parametrize(("name", "value"), [("MOST", 70), ("MOST_BYTES", 70 * 41 * 121 * 2 + 1)])
+@pytest.mark.parametrize(("name", "value"), [("MAX_TERRAINS", 70), ("MAX_BYTES", 70 * 41 * 121 * 2 + 1)])
 def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name, value):
     monkeypatch.setattr(module, name, value)
     search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=1))
@@ -245,13 +245,13 @@ def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name,
 
 def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(monkeypatch):
     """By what training is given: 60 terrains at a time up to 300, and then in place of the oldest."""
-    monkeypatch.setattr(module, "MOST", 300)
+    monkeypatch.setattr(module, "MAX_TERRAINS", 300)
     given = []
 
     def run(self, maps, targets, drawn, turned):
         given.append((maps.clone(), targets, drawn))
 
-    monkeypatch.setattr(Training, "run", run)
+    monkeypatch.setattr(Trainer, "run", run)
     search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=60))
     genes = SUPER_GAUSSIAN.hard_random(420, 0)
     evaluation = crossed(genes, 0)
