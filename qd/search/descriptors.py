@@ -37,7 +37,8 @@ class Cells:
     A tuple of interval indices i_1 .. i_n (each in 0 .. intervals - 1) spans a box whose lower corner sums to
     sum(i) / intervals and whose upper corner to (sum(i) + n) / intervals. The plane sum(ratios) = 1 passes through
     the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple does not count if the plane only touches
-    a corner of its box. With a collision bit every tuple is two cells, the one with a collision in the upper half of the numbers.
+    a corner of its box. With a collision bit every tuple is two cells, the one with a collision in the upper half of
+    the numbers.
 
     Args:
         num_ratios: Number of ratio descriptors, at least 2.
