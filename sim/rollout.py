@@ -18,7 +18,7 @@ from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
-from sim.controllers.runner import PolicyRunner
+from sim.controllers.runner import Memory, PolicyRunner
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
@@ -314,7 +314,7 @@ class Rollout:
             self._queue.busy.zero_()
             self._began_at = self._taken_at = self._step
             self._taken_s = time.perf_counter()
-        if idle or self._policy.memory != "reset()":
+        if idle or self._policy.memory is not Memory.SHARED:
             self._release(begin=idle)
 
     def _write_terrains(self, terrains: Any, seeds: Any, slots: Sequence[slice], ground: GroundMaps | None) -> None:
@@ -333,7 +333,7 @@ class Rollout:
     def _release(self, *, begin: bool) -> None:
         """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
         count = self._num_unreleased
-        if self._policy.memory == "reset()":
+        if self._policy.memory is Memory.SHARED:
             count = min(count, self.num_envs)
             self._policy.reset()
         self._num_unreleased -= count

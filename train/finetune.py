@@ -13,8 +13,8 @@ from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elite
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.directory import RunDirectory, directory_of, find_run
+from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_actor
-from sim.controllers.onnx import export_onnx
 from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
 from sim.robots.robot import RobotCfg

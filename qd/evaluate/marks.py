@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.controllers.loaders import read_weights
+from sim.controllers.formats.rsl_rl import read_weights
 from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json
 

@@ -12,8 +12,8 @@ from qd.search.archive import Archive
 from qd.search.directory import RUNS, folder_for
 from qd.search.progress import Bar
 from qd.show.elites import OpenedRun
+from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_actor
-from sim.controllers.onnx import export_onnx
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import choose_elites
 from sim.files.provenance import provenance

@@ -2,7 +2,8 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from enum import Enum
+from typing import Any
 
 import torch
 import warp as wp
@@ -10,19 +11,19 @@ import warp as wp
 from sim.controllers.spec import in_one_line
 from sim.device import recording
 
-_LEAST_ROWS = 32
-"""Torch sums matrix products in another order for fewer than 4 or 16 rows, by processor (measured: batches of 16 to
-4,096 rows give each row the same bits, with AVX2 and AVX-512)."""
+_MIN_ROWS = 32
+"""Torch sums matrix products in another order for fewer than 4 or 16 rows, by processor. Batches of 16 to 4,096 rows
+give each row the same bits (measured with AVX2 and AVX-512)."""
 
 
 def with_rows_of_zeros(rows: torch.Tensor) -> torch.Tensor:
-    """Rows on the CPU with zeros after them where they are few: a module gives each the same bits in any batch."""
-    missing = 0 if rows.is_cuda else max(_LEAST_ROWS - len(rows), 0)
+    """Few rows on the CPU, followed by zeros, so that a module gives each row the same bits in any batch."""
+    missing = 0 if rows.is_cuda else max(_MIN_ROWS - len(rows), 0)
     return torch.nn.functional.pad(rows, (0, 0, 0, missing)) if missing else rows
 
 
 def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
-    """What a controller returned instead of floats of that shape, if anything; waits for no device."""
+    """What is wrong with an action, which must be floats of that shape; None if it fits. Waits for no device."""
     if not isinstance(action, torch.Tensor):
         return f"got {type(action).__name__}"
     if tuple(action.shape) != shape:
@@ -32,38 +33,41 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
     return None
 
 
-Memory = Literal["none", "reset(rows)", "reset()"]
-"""How a policy forgets: it has no memory, forgets single robots, or all.
-
-``reset(rows)`` is called before every step with a bool tensor of shape (num_envs,): True where a robot begins a new
-episode. ``reset()`` is called when all robots begin together, which leaves robots idle that have ended.
-"""
-
-
-def memory_of(policy: Any) -> Memory:
+class Memory(Enum):
     """What a policy remembers from one step to the next, by its ``reset``."""
+
+    NONE = "no reset"
+    """Nothing."""
+    PER_ROBOT = "reset(rows)"
+    """Each robot. Before every step ``rows``, bool, shape (num_envs,), is true where a robot begins an episode."""
+    SHARED = "reset()"
+    """All robots, which can only begin together; robots whose episode has ended stand idle until then."""
+
+
+def find_memory(policy: Any) -> Memory:
+    """Finds out what a policy remembers."""
     reset = getattr(policy, "reset", None)
     if not callable(reset):
-        return "none"
+        return Memory.NONE
     try:
         inspect.signature(reset).bind(None)
-    except (TypeError, ValueError):  # a ValueError of what has no signature
-        return "reset()"
-    return "reset(rows)"
+    except (TypeError, ValueError):  # ValueError: it has no signature
+        return Memory.SHARED
+    return Memory.PER_ROBOT
 
 
-def forget_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
-    """Let a policy that remembers forget all its robots; returns whether it is one."""
-    memory = memory_of(policy)
-    if memory == "reset(rows)":
+def reset_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
+    """Begins an episode of all robots; returns whether the policy remembers anything."""
+    memory = find_memory(policy)
+    if memory is Memory.PER_ROBOT:
         policy.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
-    elif memory == "reset()":
+    elif memory is Memory.SHARED:
         policy.reset()
-    return memory != "none"
+    return memory is not Memory.NONE
 
 
 class Recurrent(torch.nn.Module):
-    """A network that remembers a state of each robot, of any number of robots, at fixed places of the device."""
+    """A network with a state of each robot, for any number of robots, at fixed addresses of the device."""
 
     graph_safe = True
     """Whether steps, and a reset, may be captured as a CUDA graph."""
@@ -80,24 +84,24 @@ class Recurrent(torch.nn.Module):
         """Actions of the rows, shape (num_rows, size), and the state after them; it may change the state in place."""
         raise NotImplementedError
 
-    def _state_of(self, count: int) -> list[torch.Tensor]:
+    def _get_state(self, count: int) -> list[torch.Tensor]:
         if count not in self._states:
-            rows = count if self._initial[0].is_cuda else max(count, _LEAST_ROWS)
+            rows = count if self._initial[0].is_cuda else max(count, _MIN_ROWS)
             self._states[count] = [state.repeat_interleave(rows, dim=self._axis) for state in self._initial]
         return self._states[count]
 
     @torch.inference_mode()
     def reset(self, rows: torch.Tensor) -> None:
         """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
-        for initial, state in zip(self._initial, self._state_of(len(rows)), strict=True):
-            own = state.narrow(self._axis, 0, len(rows))
-            where = rows.reshape([-1 if axis == self._axis else 1 for axis in range(state.ndim)])
-            own.copy_(torch.where(where, initial, own))
+        for initial, state in zip(self._initial, self._get_state(len(rows)), strict=True):
+            robots = state.narrow(self._axis, 0, len(rows))
+            begins = rows.reshape([-1 if axis == self._axis else 1 for axis in range(state.ndim)])
+            robots.copy_(torch.where(begins, initial, robots))
 
     @torch.inference_mode()
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""
-        state = self._state_of(len(rows))
+        state = self._get_state(len(rows))
         # cuDNN's recurrent kernels are made for sequences: a step of many robots takes them far longer than products.
         with torch.backends.cudnn.flags(enabled=False):
             action, after = self.step(with_rows_of_zeros(rows), state)
@@ -107,46 +111,46 @@ class Recurrent(torch.nn.Module):
 
 
 def is_graph_safe(policy: Any) -> bool:
-    """Whether a policy may be captured as a CUDA graph: a module without memory, or what says that it is."""
-    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and memory_of(policy) == "none")
+    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory."""
+    return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and find_memory(policy) is Memory.NONE)
 
 
 class PolicyRunner:
     """Runs a policy between two Warp buffers.
 
-    A torch module without memory is captured as a CUDA graph, and so is what says that it is ``graph_safe``: of fixed
-    shapes, with a ``reset(rows)`` that writes in place.
+    A torch module without memory is captured as a CUDA graph. So is a policy that says that it is ``graph_safe``: it
+    has fixed shapes, and its ``reset(rows)`` writes in place.
     """
 
     def __init__(
         self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
     ) -> None:
-        """Bind it to Warp arrays of shapes (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
+        """Binds the policy to Warp arrays (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
 
         ``begins`` is not 0 where an episode begins with the coming step.
         """
         self._policy: Any = policy
-        self.memory = memory_of(policy)
+        self.memory = find_memory(policy)
         self._begins = wp.to_torch(begins)
         self._observation = wp.to_torch(observation)
         self._action = wp.to_torch(action)
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._plain = isinstance(policy, torch.nn.Module) and self.memory == "none"
+        self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
         if self._observation.is_cuda and is_graph_safe(policy):
-            self._graph = self._capture()  # of what remembers anyhow, it would repeat the first memory for ever
+            self._graph = self._capture()
 
     def reset(self) -> None:
-        """Let a policy forget all robots, of one that can forget no single one."""
+        """Begins an episode of all robots, of a policy whose memory is :attr:`Memory.SHARED`."""
         self._policy.reset()
 
     def _call(self) -> None:
         """Calls the controller with a copy of the rows, which it may keep or change, and checks its actions."""
         observation = self._observation.clone()
-        if self._plain:  # what remembers, or looks at its rows, gets one a robot
+        if self._plain:  # a function, or a module that remembers, gets one row a robot
             observation = with_rows_of_zeros(observation)
         sizes = tuple(observation.shape)
         try:
-            if self.memory == "reset(rows)":
+            if self.memory is Memory.PER_ROBOT:
                 self._policy.reset(self._begins != 0)
             action = self._policy(observation)
         except (Exception, SystemExit) as error:  # a controller can fail with anything

@@ -27,7 +27,7 @@ from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
-from sim.controllers.runner import forget_all
+from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
 from sim.crossing import resolved as with_contact_resolved
 from sim.mujoco_c.model import (
@@ -181,7 +181,7 @@ def cross(
     steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
-    remembers = forget_all(policy, count)  # it must be asked for the same robots every time
+    remembers = reset_all(policy, count)  # it must be asked for the same robots every time
     most = round(robot.max_duration_s / robot.physics_dt)
     for step in range(most):
         running = np.flatnonzero(outcome == Outcome.RUNNING)

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sim.controllers.adapters import read_row
+from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_policy
 from sim.controllers.mlp import MlpPolicy
-from sim.controllers.onnx import export_onnx
 from sim.controllers.spec import (
     ControllerSpec,
     controller_hash,

@@ -262,5 +262,5 @@ def test_what_is_not_understood_is_refused_by_its_name(tmp_path, write, change, 
 
 
 def test_a_folder_of_no_known_kind_is_told_which_there_are(tmp_path):
-    with pytest.raises(ValueError, match=r"config\.yaml.*params/env\.yaml"):
+    with pytest.raises(ValueError, match=r"params/env\.yaml.*config\.yaml"):
         imported(tmp_path, tmp_path)

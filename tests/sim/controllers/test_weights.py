@@ -6,7 +6,7 @@ from rsl_rl.models import RNNModel
 from tensordict import TensorDict
 
 from sim.controllers.loaders import load_policy
-from sim.controllers.runner import memory_of
+from sim.controllers.runner import Memory, find_memory
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 
 ACTOR = rsl_rl_actor(normalised=True).state_dict()
@@ -98,7 +98,7 @@ def test_what_remembers_one_robot_remembers_any_number_apart(tmp_path, anymal, r
         torch.onnx.export(model, model.get_dummy_inputs(), str(path), input_names=model.input_names,
                           output_names=model.output_names, opset_version=18, dynamo=False)  # fmt: skip
     policy = load_policy(path, anymal, "cpu")
-    assert memory_of(policy) == "reset(rows)"
+    assert find_memory(policy) is Memory.PER_ROBOT
     policy.reset(torch.ones(5, dtype=torch.bool))
     for step, actions in zip(steps, expected, strict=True):
         torch.testing.assert_close(policy(step), actions, rtol=1e-4, atol=1e-5)
@@ -152,8 +152,8 @@ def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
                 load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
         else:
             policies[kind] = load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
-    assert memory_of(policies["plain"]) == "none"
-    assert memory_of(policies["averages"]) == "reset(rows)"
+    assert find_memory(policies["plain"]) is Memory.NONE
+    assert find_memory(policies["averages"]) is Memory.PER_ROBOT
     rows = rows_of(4)
     torch.manual_seed(0)
     layer = Exported("plain").layer

@@ -1,0 +1,98 @@
+"""Checkpoints of rsl_rl 1 to 5: plain tensors, read as data alone."""
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sim.controllers.formats.yaml_file import read_yaml
+from sim.controllers.mlp import ACTIVATIONS, MlpPolicy, RnnPolicy
+from sim.controllers.spec import agent_file
+from sim.files.atomic import check_zip
+
+_FORMER_NAMES = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
+"""Prefixes of an actor's tensors in rsl_rl 1 to 4, and in rsl_rl 5."""
+_KNOWN_NAMES = (
+    r"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|obs_normalizer\.(_mean|_var|_std|count)|"
+    r"distribution\.(log_)?std_param|(log_)?std|critic.*|memory_c\.rnn\.\w+"
+)
+_ELU_KEYS = {"actor_state_dict", "iter", "trained_on"}
+"""A checkpoint of ours that has these alone has ELU between its layers."""
+
+
+def read_weights(path: Path) -> Any:
+    """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
+
+    It raises a ValueError if the file is damaged, and any error if it is foreign or holds code.
+    """
+    check_zip(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch warns of TorchScript files
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | RnnPolicy:
+    """The actor of a file, from what :func:`read_weights` returned; without ``activation`` the file must name it."""
+    state = _read_state(content, path)
+    kind = RnnPolicy if any(key.startswith("rnn.") for key in state) else MlpPolicy
+    activation = activation or _find_activation(content, path)
+    try:
+        return kind(state, activation)
+    except (KeyError, RuntimeError, AttributeError, TypeError, IndexError, ValueError, ZeroDivisionError) as error:
+        raise ValueError(f"policy '{path}' holds a damaged layer: {error}; save the checkpoint anew") from error
+
+
+def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
+    """The actor's tensors by rsl_rl 5's names."""
+    keys = ("actor_state_dict", "model_state_dict")
+    state = next((content[key] for key in keys if isinstance(content, dict) and key in content), None)
+    names = {key: _rename(key) for key in (map(str, state) if isinstance(state, dict) else ())}
+    if not isinstance(state, dict) or "mlp.0.weight" not in names.values():
+        got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
+        raise ValueError(
+            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', or "
+            f"'model_state_dict' with 'actor.0.weight', got {got}"
+        )
+    separate = content.get("obs_norm_state_dict") or {}
+    if not isinstance(separate, dict):
+        raise ValueError(f"policy '{path}': obs_norm_state_dict must be a table, got {type(separate).__name__}")
+    normaliser = {f"obs_normalizer.{key}": value for key, value in separate.items()}
+    names |= {key: key for key in normaliser}
+    if unknown := [key for key, name in names.items() if not re.fullmatch(_KNOWN_NAMES, name)]:
+        what = f"has more than a perceptron or a recurrent network: {', '.join(unknown)}"
+        raise ValueError(f"policy '{path}' {what}: export it as TorchScript or ONNX")
+    statistics = {name.partition(".")[2] for name in names.values() if name.startswith("obs_normalizer.")}
+    if statistics and not {"_mean", "_std"} <= statistics:
+        got = ", ".join(sorted(statistics))
+        raise ValueError(f"policy '{path}' must have _mean and _std of its normaliser, got {got}")
+    return {names[key]: value for key, value in state.items()} | normaliser
+
+
+def _rename(key: str) -> str:
+    prefix = next((prefix for prefix in _FORMER_NAMES if key.startswith(prefix)), "")
+    return _FORMER_NAMES.get(prefix, "") + key.removeprefix(prefix)
+
+
+def _find_activation(content: dict[str, Any], path: Path) -> str:
+    """The function between a checkpoint's layers, by its file or by the agent.yaml of its training."""
+    ours = str(content.get("format", "")).startswith("faultline") or ("iter" in content and content.keys() <= _ELU_KEYS)
+    activation = content.get("activation", "elu" if ours else None)
+    agent = agent_file(path)
+    if activation is None and agent is not None:
+        activation = read_activation(read_yaml(agent))
+    if activation is None:
+        raise ValueError(
+            f"policy '{path}' does not say what is between its layers: put the agent.yaml of its training "
+            'beside it, or describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
+        )
+    if not isinstance(activation, str) or activation not in ACTIVATIONS:
+        raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")
+    return activation
+
+
+def read_activation(agent: dict[str, Any]) -> Any:
+    """The function between the actor's layers in the content of an agent.yaml; None if it has none."""
+    tables = [agent.get(name) for name in ("actor", "policy")]
+    return next((table["activation"] for table in tables if isinstance(table, dict) and "activation" in table), None)
