@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 from qd.evaluate.dose import measure_dose
 from results.make.common import parse, published_controllers
-from sim.terrains.doses import DOSES, parse_doses
+from sim.terrains.doses import all_doses, parse_doses
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Lets the base and the published controllers cross every value of every obstacle."""
     script = parse(__doc__, argv, "dose.json")
     controllers = published_controllers(script)
-    doses = parse_doses(("step_up=0.1,0.4",) if script.small else tuple(DOSES), ())
+    doses = parse_doses(("step_up=0.1,0.4",) if script.small else tuple(all_doses()), ())
     size = 1 if script.small else None
     for resolved in (False,) if script.small else (False, True):
         out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.course import Kind, lay_out, rasterise
+from sim.terrains.elements.base import all_elements
+from sim.terrains.spaces.course import COURSE
 from tests.kernels import course_oracle as oracle
 
 
 def heights_of(genes):
     out = wp.zeros((len(genes), 161, 321), dtype=float)
-    rasterise(wp.array(np.float32(genes)), 0.05, out)
+    COURSE.rasterise(wp.array(np.float32(genes)), 0.05, out)
     return out.numpy()
 
 
@@ -19,8 +20,8 @@ def test_courses_equal_the_builders():
     genes[:4] = np.sign(genes[:4])
     for row, grid in zip(genes, heights_of(genes), strict=True):
         np.testing.assert_allclose(grid, oracle.heights(row), atol=5e-6)
-    kinds = lay_out(wp.array(genes)).numpy()["kind"]
-    assert len(np.unique(kinds)) == len(Kind)  # every kind is among them
+    kinds = COURSE.elements(genes)["kind"]
+    assert [all_elements()[kind].name for kind in np.unique(kinds)] == list(COURSE.kinds)  # every kind is among them
 
 
 @pytest.mark.parametrize(
@@ -34,4 +35,4 @@ def test_courses_equal_the_builders():
 def test_wrong_shapes_are_named(genes, spacing, heights, field):
     genes, out = (wp.zeros(shape, dtype=float) for shape in (genes, heights))
     with pytest.raises(ValueError, match=field):
-        rasterise(genes, spacing, out)
+        COURSE.rasterise(genes, spacing, out)

@@ -95,7 +95,7 @@ class OnGround(WiderSpace):
         return np.where(share > 0.0, tau, 0.0)
 
 
-def gene_of(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def ground_genes(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Genes of frictions, or of time constants [s] above the least, which is what its gene of -1 does not have."""
     if kind == "friction":
         return 1.0 - 2.0 * (1.0 - values) / (1.0 - LEAST_FRICTION)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim.terrains.bank import terrains_of
-from sim.terrains.doses import DOSES, FIRST_COL, LEVEL_SPACE, NUM_PLACES, parse_doses
+from sim.terrains.conditions.base import CONDITIONS
+from sim.terrains.doses import FIRST_COL, NUM_STARTS, all_doses, parse_doses
 from sim.terrains.spaces.registry import get_space
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element
@@ -58,10 +59,10 @@ def test_sizes_go_beyond_what_the_space_has():
 
 def test_places_are_spread_over_a_metre_and_the_same_for_all_values():
     dose = dose_of("ditch", 0.2, 0.4, 0.6)
-    grids = dose.terrains(NUM_PLACES, np.random.default_rng(0)).reshape(NUM_PLACES, 3, 161, 321)
+    grids = dose.terrains(NUM_STARTS, np.random.default_rng(0)).reshape(NUM_STARTS, 3, 161, 321)
     begins = (grids[:, :, 80] < 0).argmax(axis=2) - 1
     assert (begins == begins[:, :1]).all()
-    assert begins[:, 0].tolist() == list(range(FIRST_COL, FIRST_COL + NUM_PLACES))
+    assert begins[:, 0].tolist() == list(range(FIRST_COL, FIRST_COL + NUM_STARTS))
     assert ((grids[:, :, 80] < 0).sum(axis=2) == [3, 7, 11]).all()  # nodes between the edges
     few = dose.terrains(4, np.random.default_rng(0)).reshape(4, 3, 161, 321)
     assert ((few[:, 0, 80] < 0).argmax(axis=1) - 1).tolist() == [100, 105, 110, 115]
@@ -69,7 +70,8 @@ def test_places_are_spread_over_a_metre_and_the_same_for_all_values():
 
 @pytest.mark.parametrize(("name", "values"), [("friction", (1.0, 0.5, 0.15)), ("softness", (0.02, 0.06))])
 def test_ground_is_level_and_the_same_everywhere(name, values):
-    heights, ground = terrains_of(dose_of(name, *values).terrains(2, np.random.default_rng(0)), get_space(LEVEL_SPACE))
+    dose = dose_of(name, *values)
+    heights, ground = terrains_of(dose.terrains(2, np.random.default_rng(0)), get_space(dose.space))
     assert not heights.any()
     maps = {"friction": ground.friction, "softness": ground.time_constant_s}
     np.testing.assert_allclose(maps.pop(name), np.tile(values, 2)[:, None, None] * np.ones((4, 8)), atol=1e-6)
@@ -77,16 +79,16 @@ def test_ground_is_level_and_the_same_everywhere(name, values):
 
 
 def test_words():
-    assert DOSES["stairs_up"].describe() == "stairs up, tread 0.30 m, flight 5 steps"
+    assert all_doses()["stairs_up"].describe() == "stairs up, tread 0.30 m, flight 5 steps"
 
 
 def test_a_command_line_names_doses():
-    assert list(parse_doses([], [])) == list(DOSES)[:-6]  # those of conditions, which not every robot can have
+    assert list(parse_doses([], [])) == [name for name in all_doses() if name not in CONDITIONS]
     doses = parse_doses(["friction=0.2,0.9 stairs_up", "ditch"], ["tread=0.25"])
-    assert list(doses) == ["stairs_up", "ditch", "friction"]  # in the order of DOSES
+    assert list(doses) == ["stairs_up", "ditch", "friction"]  # in the order of all doses
     assert doses["friction"].values == (0.9, 0.2)  # the easier first
     assert doses["stairs_up"].others == {"tread": 0.25, "flight": 5.0}
-    assert doses["ditch"] == DOSES["ditch"]
+    assert doses["ditch"] == all_doses()["ditch"]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,7 @@ def test_what_cannot_be_made_is_refused(elements, at, field):
 
 @pytest.mark.parametrize("name", IN_RANGE)
 def test_every_value_of_an_obstacle_is_one(name):
-    grids = DOSES[name].terrains(1, np.random.default_rng(0))
-    assert len(grids) == len(DOSES[name].values) > 5
+    grids = all_doses()[name].terrains(1, np.random.default_rng(0))
+    assert len(grids) == len(all_doses()[name].values) > 5
     assert all(np.ptp(grid) > 0.0 for grid in grids)  # level ground stops nobody, and says nothing of a size
     assert all(not np.array_equal(*pair) for pair in itertools.pairwise(grids))
