@@ -153,24 +153,21 @@ class ExportCommand(ControllerFlags, EliteFlags):
     def execute(self) -> None:
         """Writes the files."""
         from qd.show.elites import open_run
-        from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
+        from qd.show.export import export_controller, export_elites, export_pack
 
         if sum([self.pack, self.from_pack is not None, self.onnx is not None]) > 1:
             raise ValueError("give one of --pack, --from-pack and --onnx")
+        options: Any = {"formats": split_values(self.formats), "out": self.out, "overwrite": self.overwrite}
         if self.onnx is not None:
             export_controller(self.policy, get_robot(self.robot or "anymal"), self.onnx, overwrite=self.overwrite)
-            return
-        if self.pack:
+        elif self.pack:
             self._make_pack()
-            return
-        if self.from_pack is not None:
-            if (self.run, self.space, self.minimal) != (None, None, None):
-                raise ValueError("a pack has its own terrains: leave --run, --space and --minimal out")
-            source = source_of_pack(self.from_pack, self.elite or "0", self.robot)
+        elif self.from_pack is None:
+            export_elites(open_run(self.robot, self.run, space=self.space), self.elite, self.minimal, **options)
+        elif (self.run, self.space, self.minimal) != (None, None, None):
+            raise ValueError("a pack has its own terrains: leave --run, --space and --minimal out")
         else:
-            opened_run = open_run(self.robot, self.run, space=self.space)
-            source = source_of_archive(opened_run, self.elite, self.minimal)
-        export_terrains(source, formats=split_values(self.formats), out=self.out, overwrite=self.overwrite)
+            export_pack(self.from_pack, self.elite or "0", self.robot, **options)
 
     def _make_pack(self) -> None:
         from qd.evaluate.make_pack import make_pack

@@ -1,7 +1,6 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,129 +16,119 @@ from sim.controllers.loaders import load_actor
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import choose_elites
 from sim.files.provenance import provenance
+from sim.files.templates import open_templates
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import terrains_of
 from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 
-INDEX_FILE, README_FILE = "index.json", "README.md"
-"""What was exported, and how other programs take it, in the folder of the files."""
+INDEX_FILE = "index.json"
+"""List of the exported terrains."""
+README_FILE = "README.md"
+"""How other programs take the files."""
 _FOLDER = "terrains"
+_TEMPLATES = open_templates(Path(__file__).parent / "templates")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """Terrains that may be exported."""
+def export_elites(
+    opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, out: Path | None = None, **options: Any
+) -> list[Path]:
+    """Writes elites of an archive or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
 
-    folder: Path
-    """Where their files go if no other folder is named."""
-    about: dict[str, dict[str, Any]]
-    """What is known of each, by the name of its files."""
-    terrains: Iterator[ExportedTerrain]
-    """The same ones in the same order."""
-    origin: dict[str, Any]
-
-
-def source_of_archive(opened_run: OpenedRun, elite: str = "", minimal: str | None = None) -> Source:
-    """Elites of an archive, or their minimal terrains; arguments as of :meth:`qd.show.elites.OpenedRun.terrains`."""
-    archive, space, robot = opened_run.archive, opened_run.space, opened_run.robot
-    terrains = opened_run.terrains(elite, minimal)
-    minima = read_minimal(opened_run.folder, archive)
-    ranking = rank(
-        archive, space, minima, half_width=robot.footprint[1], numbers=[terrain.number for terrain in terrains]
-    )
-
+    ``options`` are ``formats`` and ``overwrite``, as :func:`export_pack` has them.
+    """
+    archive = opened_run.archive
+    space = opened_run.space
     if space.conditions:
         raise ValueError(
             f"a terrain file holds heights and ground, got terrains of {archive.space}, which are crossed under "
             "conditions: replay or film them instead"
         )
+    terrains = {terrain.stem: terrain for terrain in opened_run.terrains(elite, minimal)}
+    minima = read_minimal(opened_run.folder, archive)
+    numbers = [terrain.number for terrain in terrains.values()]
+    ranking = rank(archive, space, minima, half_width=opened_run.robot.footprint[1], numbers=numbers)
 
-    def rasterised() -> Iterator[ExportedTerrain]:
-        for _, genes, name, *_ in terrains:
-            (heights,), ground = terrains_of(genes[None], space)
-            yield ExportedTerrain(heights=heights, name=name, genes=genes, timestep=robot.physics_dt, ground=ground)
+    def build(name: str) -> ExportedTerrain:
+        genes = terrains[name].genes
+        (heights,), ground = terrains_of(genes[None], space)
+        timestep = opened_run.robot.physics_dt
+        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=timestep, ground=ground)
 
-    return Source(
-        folder=folder_for(opened_run.path, robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}"),
-        about={
-            terrain.stem: about_elite(ranking, row, archive)
-            | ({"minimal": terrain.minimal} if terrain.minimal else {})
-            | {"terrain": space.describe(terrain.genes)}
-            for row, terrain in enumerate(terrains)
-        },
-        terrains=rasterised(),
-        origin={
-            "run": str(opened_run.path),
-            "space": archive.space,
-            "space_sha256": archive.space_sha256,
-            **archive.named(),
-        },
-    )
+    about = {
+        name: describe_elite(ranking, row, archive)
+        | ({"minimal": terrain.minimal} if terrain.minimal else {})
+        | {"terrain": space.describe(terrain.genes)}
+        for row, (name, terrain) in enumerate(terrains.items())
+    }
+    origin = {
+        "run": str(opened_run.path),
+        "space": archive.space,
+        "space_sha256": archive.space_sha256,
+        **archive.named(),
+    }
+    folder = folder_for(opened_run.path, opened_run.robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}")
+    return _export(about, build, origin, out or folder, **options)
 
 
-def source_of_pack(named: str, places: str = "all", robot: str | None = None) -> Source:
-    """Terrains of a pack."""
+def export_pack(
+    named: str,
+    elite: str = "all",
+    robot: str | None = None,
+    *,
+    formats: Sequence[str] = tuple(FORMATS),
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Writes terrains of a pack, by their index, as files that other programs read."""
     folder = find_pack(named)
     pack = read_pack(folder)
-    of_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
-    rows = choose_elites(places, range(len(pack.terrains)), f"{folder} has no place")
-    names = {pack.terrains[row]["name"]: row for row in rows}
-    return Source(
-        folder=RUNS / f"{of_robot.name}-pack-{_FOLDER}",
-        about={name: {"robot": of_robot.name, "place": row, **pack.terrains[row]} for name, row in names.items()},
-        terrains=(
-            ExportedTerrain(heights=pack.heights[row], name=name, genes=pack.genes[row], timestep=of_robot.physics_dt)
-            for name, row in names.items()
-        ),
-        origin={"pack": folder.name}
-        | {name: pack.content[name] for name in ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")},
-    )
+    pack_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
+    indices = choose_elites(elite, range(len(pack.terrains)), f"{folder} has no place")
+    rows = {pack.terrains[index]["name"]: index for index in indices}
+
+    def build(name: str) -> ExportedTerrain:
+        heights, genes = pack.heights[rows[name]], pack.genes[rows[name]]
+        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=pack_robot.physics_dt)
+
+    about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
+    keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")
+    origin = {"pack": folder.name} | {key: pack.content[key] for key in keys}
+    out = out or RUNS / f"{pack_robot.name}-pack-{_FOLDER}"
+    return _export(about, build, origin, out, formats=formats, overwrite=overwrite)
 
 
-def export_terrains(
-    source: Source, *, formats: Sequence[str] = tuple(FORMATS), out: Path | None = None, overwrite: bool = False
+def _export(
+    about: dict[str, dict[str, Any]],
+    build: Callable[[str], ExportedTerrain],
+    origin: dict[str, Any],
+    folder: Path,
+    *,
+    formats: Sequence[str] = tuple(FORMATS),
+    overwrite: bool = False,
 ) -> list[Path]:
-    """Writes terrains as files that other programs read."""
-    formats, folder, count = list(dict.fromkeys(formats)), out or source.folder, len(source.about)
+    """Writes terrains by the names of their files, an index and how to use them."""
+    formats = list(dict.fromkeys(formats))
     check_formats(formats)
-    common = (INDEX_FILE, README_FILE)
-    stored = sorted(file.name for file in folder.glob("*") if file.name in common or file.stem in source.about)
+    shared = (INDEX_FILE, README_FILE)
+    stored = sorted(file.name for file in folder.glob("*") if file.name in shared or file.stem in about)
     if stored and not overwrite:
         names = ", ".join(stored[:3]) + ", ..." * (len(stored) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
     prepare_output(folder / INDEX_FILE)
-    origin = {**source.origin, **provenance("cpu", 0)}
+    origin = {**origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     files = []
-    with Bar("exporting", count) as bar:
-        for done, terrain in enumerate(source.terrains, start=1):
-            files += write_terrain(folder, terrain, formats=formats, about={**source.about[terrain.name], **origin})
+    with Bar("exporting", len(about)) as bar:
+        for done, (name, facts) in enumerate(about.items(), start=1):
+            files += write_terrain(folder, build(name), formats=formats, about={**facts, **origin})
             bar.move_to(done)
-    files += [folder / README_FILE, folder / INDEX_FILE]
-    write_atomically(files[-2], _README.replace("STEM", next(iter(source.about))).encode())
-    index = [{**about, "files": name} for name, about in source.about.items()]
-    write_atomically(files[-1], to_json({"formats": formats, "elites": index, **origin}))
-    print(f"{count} terrain{'s' * (count != 1)} as {', '.join(formats)}: {folder}")
-    return files
-
-
-_README = """# Terrains of faultline
-
-x runs along the course (0 to 16 m), y across it (0 to 8 m), z up. Robots start at (2, 4) and walk to (14, 4).
-`STEM.json` says what the numbers in its files mean and what is known of the terrain; `index.json` lists all terrains.
-The line of MuJoCo is tested, the others follow the sources of these programs.
-
-- **MuJoCo**: `python -m mujoco.viewer --mjcf=STEM.xml`; with a robot: `scene = mujoco.MjSpec.from_file('STEM.xml')`,
-  `scene.attach(robot, prefix='robot/', frame=scene.worldbody.add_frame(pos=(2, 4, 0)))`
-- **mjlab**: `SceneCfg(spec_fn=add)` without a terrain, where `add(spec)` calls `spec.attach(
-  mujoco.MjSpec.from_file('STEM.xml'), prefix='terrain/', frame=spec.worldbody.add_frame())`
-- **Isaac Lab**: `import_mesh('STEM', trimesh.load_mesh('STEM.stl'))` of its `TerrainImporter`, or
-  `scripts/tools/convert_mesh.py` for a USD file
-- **Isaac Lab's and legged_gym's generators**: `convert_height_field_to_mesh(numpy.load('STEM.npy'), 0.05, 0.001)`
-  (x along the rows); it cuts cells along the other diagonal, so that between the nodes the mesh is truer
-- **Gazebo**: `gz sim STEM.sdf`, or `<include><uri>/path/to/STEM.sdf</uri></include>` in a world
-"""
+    readme = _TEMPLATES.get_template("export.md").render(stem=next(iter(about)))
+    write_atomically(folder / README_FILE, f"{readme}\n".encode())
+    index = [{**facts, "files": name} for name, facts in about.items()]
+    write_atomically(folder / INDEX_FILE, to_json({"formats": formats, "elites": index, **origin}))
+    print(f"{len(about)} terrain{'s' * (len(about) != 1)} as {', '.join(formats)}: {folder}")
+    return [*files, folder / README_FILE, folder / INDEX_FILE]
 
 
 def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwrite: bool = False) -> None:
@@ -150,12 +139,12 @@ def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwri
     print(f"Controller: {out}")
 
 
-def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
-    """An elite's verdict, cause, ending and numbers as JSON values: as found, and as 40 fresh episodes say, if any."""
+def describe_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
+    """An elite's verdict, cause, ending and numbers as JSON values: as found, and by 40 fresh episodes, if any."""
     elite = int(ranking.numbers[row])
     names = ("fitness", "collision_rate", "goal_rate", "fallen_rate", "episodes")
 
-    def numbers(values: Any) -> dict[str, Any]:
+    def list_numbers(values: Any) -> dict[str, Any]:
         ratios = dict(zip(archive.penalties, values.ratios[elite].tolist(), strict=True))
         return {**{name: getattr(values, name)[elite].item() for name in names}, "ratios": ratios}
 
@@ -167,6 +156,6 @@ def about_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
         "ending": ranking.ending(row)[0] if ranking.failing[row] else "crossed",
         "in_words": ranking.name(row),
         "iteration": int(archive.iteration[elite]),
-        **numbers(archive),
-        "fresh": None if archive.fresh is None else numbers(archive.fresh),
+        **list_numbers(archive),
+        "fresh": None if archive.fresh is None else list_numbers(archive.fresh),
     }

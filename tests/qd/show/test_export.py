@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from qd.show.elites import open_run
-from qd.show.export import export_controller, export_terrains, source_of_archive, source_of_pack
+from qd.show.export import export_controller, export_elites, export_pack
 from sim.terrains.bank import heights_of
 from sim.terrains.maps.heightmap import as_terrain, read_heightmap
 from tests.builders import fresh_values, small_archive, write_run
@@ -24,7 +24,7 @@ def run(tmp_path, monkeypatch):
 
 
 def export(elite, **options):
-    return export_terrains(source_of_archive(open_run("anymal"), elite), **options)
+    return export_elites(open_run("anymal"), elite, **options)
 
 
 def test_elites_are_exported_as_the_simulation_has_them(run):
@@ -65,8 +65,7 @@ def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
 
 
 def test_a_pack_is_exported_with_what_it_knows(tmp_path):
-    source = source_of_pack("anymal", "3")
-    (*_, about, _, _) = export_terrains(source, formats=("xml",), out=tmp_path)
+    (*_, about, _, _) = export_pack("anymal", "3", formats=("xml",), out=tmp_path)
     content = json.loads(about.read_text())
     assert content["verdict"] == "fault" and content["start"][:2] == [2, 4] and content["pack"] == "pack"
 
