@@ -12,7 +12,7 @@ from kernels.episode import Outcome
 from qd.show.crossed import find_failure_time, find_ghost_episode, find_typical_episode
 from qd.show.figures import relief
 from qd.show.film import clear_elevation
-from qd.show.report.page import picture_source
+from qd.show.report.page import encode_picture
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
@@ -21,29 +21,28 @@ from sim.terrains.spaces.base import TerrainSpace
 
 TILE = (96, 48)
 """Width and height of a small picture [pixels]."""
-_AT_ONCE = 50  # height maps that are made at once
-_EVERY = 2  # nodes, which are enough for a small picture
+_LOT = 50  # terrains that are drawn together
+_EVERY = 2  # every other node is enough for a small picture
 _SHEET_QUALITY = 70  # of WebP
 _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of that
 _DISTANCE = 3.0  # of the camera [m]
 
 
 def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
-    """The terrains of genes, shape (T, num_genes), at least one, from above: blue is low, brown high.
+    """Terrains of genes, shape (T, num_genes), at least one, from above in one image, so that large pages are light.
 
-    They are small pictures in one image, so that a page of a thousand is light: its ``source``, and the ``offsets`` of
-    each picture, pixels from the left and from the top.
+    ``source`` is the image; ``offsets`` are pixels from its left and top to each terrain. Blue is low, brown high.
     """
     columns = math.ceil(math.sqrt(len(genes) / 2))  # about a square, as a tile is twice as wide as high
     image = Image.new("RGB", (columns * TILE[0], -(-len(genes) // columns) * TILE[1]))
-    offsets = [(place % columns * TILE[0], place // columns * TILE[1]) for place in range(len(genes))]
-    for first in range(0, len(genes), _AT_ONCE):
-        lot = genes[first : first + _AT_ONCE]
+    offsets = [(k % columns * TILE[0], k // columns * TILE[1]) for k in range(len(genes))]
+    for first in range(0, len(genes), _LOT):
+        lot = genes[first : first + _LOT]
         grids, grounds = terrains_of(lot, space) if space.ground else (heights_of(lot, space, every=_EVERY), None)
-        for place, heights in enumerate(grids):
-            pixels = relief(heights, None if grounds is None else grounds[place : place + 1])[::-1]  # y up
-            image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + place])
-    return {"source": picture_source(image, _SHEET_QUALITY), "offsets": offsets}
+        for k, heights in enumerate(grids):
+            pixels = relief(heights, None if grounds is None else grounds[k : k + 1])[::-1]  # y up
+            image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + k])
+    return {"source": encode_picture(image, _SHEET_QUALITY), "offsets": offsets}
 
 
 class Moment(NamedTuple):
@@ -68,14 +67,14 @@ def find_failure(recording: Recording, scales: dict[str, float]) -> Moment | Non
     return Moment(recording, episode, round(find_failure_time(recording, episode) / recording.dt))
 
 
-def find_same_moment(moment: Moment, other: Recording, scales: dict[str, float]) -> Moment:
-    """Another controller on the same terrain at that time, from the same start if it reaches the goal from there."""
-    episode = find_ghost_episode(other, moment.episode, scales)
-    return Moment(other, episode, min(moment.frame, int(other.num_frames[0, episode]) - 1))
+def find_same_moment(moment: Moment, ghost: Recording, scales: dict[str, float]) -> Moment:
+    """Another controller on the same terrain at that time, from the same start if it reaches the goal from it."""
+    episode = find_ghost_episode(ghost, moment.episode, scales)
+    return Moment(ghost, episode, min(moment.frame, int(ghost.num_frames[0, episode]) - 1))
 
 
 def explain_missing_pictures() -> str:
-    """Why close pictures cannot be taken here, in a sentence; empty if they can."""
+    """Why this machine cannot take close pictures, in a sentence; empty if it can."""
     try:
         open_context(8, 8).free()
     except ValueError as error:
@@ -85,13 +84,14 @@ def explain_missing_pictures() -> str:
 
 def render_close_pictures(robot: RobotCfg, moments: Sequence[Moment]) -> list[str]:
     """Pictures of moments on one terrain, each from 3 m away; they need OpenGL."""
-    (width, height), recording = _SIZE, moments[0].recording
-    heights, sources = recording.heights[0], []
-    with Renderer(robot, heights, width=width, height=height, ground=recording.ground) as renderer:
+    sources = []
+    heights = moments[0].recording.heights[0]
+    ground = moments[0].recording.ground
+    with Renderer(robot, heights, width=_SIZE[0], height=_SIZE[1], ground=ground) as renderer:
         for recording, episode, frame in moments:
             pose = recording.qpos(0, episode)[frame]
             elevation = clear_elevation(heights, pose[None, :3], _DISTANCE)
             camera = Camera(target=tuple(pose[:3].tolist()), distance=_DISTANCE, elevation=elevation)
             pixels = renderer.render(pose, camera, touching=recording.touching[0, episode, frame])
-            sources.append(picture_source(Image.fromarray(pixels)))
+            sources.append(encode_picture(Image.fromarray(pixels)))
     return sources

@@ -15,7 +15,7 @@ from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Cross, Recordings, on_elite
 from qd.show.report.evaluation import compare_controllers, write_rounds
-from qd.show.report.page import Table, check_page, figure_source, publish_page
+from qd.show.report.page import Table, check_page, encode_figure, publish_page
 from qd.show.report.pictures import explain_missing_pictures, find_failure, find_same_moment, render_close_pictures
 from qd.show.report.search import collect_content
 from qd.workers.evaluator import check_policy, resolve_device
@@ -23,7 +23,7 @@ from sim.controllers.spec import resolve_policy
 from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
 
-_OTHER_CAUSES = 3  # beside those of the first pictures, of which one terrain each is shown
+_OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 
 
 def write_report(
@@ -48,47 +48,56 @@ def write_report(
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
     opened_run = open_run(robot, run, space=space)
-    archive, minima = opened_run.archive, read_minimal(opened_run.folder, opened_run.archive)
-    half_width = opened_run.robot.footprint[1]
-    ranking = rank(archive, opened_run.space, minima, half_width=half_width, judged=True)
-    missing = list[str]()
+    archive = opened_run.archive
+    minima = read_minimal(opened_run.folder, archive)
+    ranking = rank(archive, opened_run.space, minima, half_width=opened_run.robot.footprint[1], judged=True)
     if not len(ranking):
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
-    crosser = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
-    suffix = "" if policy is None else opened_run.suffix(crosser)
+    controller = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
+    suffix = "" if policy is None else opened_run.suffix(controller)
     out = out or folder_for(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)
     compared = None
     if tables is not None:
-        about = {"file": without_machine(str(tables)), "searched": archive.policy_sha256}
-        compared = compare_controllers(read_tables(tables, opened_run.robot), **about)
-    content = collect_content(opened_run, ranking, minima, crosser, is_searched=not suffix)
-    heads = [n for n in ranking.worst(num_elites) if ranking.failing[ranking.find_row(n)]]
-    heads = heads or ranking.worst(num_elites)
-    causes = {ranking.causes[ranking.find_row(number)] for number in heads}
-    firsts = [int(ranking.numbers[rows[0]]) for cause, rows in ranking.by_cause().items() if cause not in causes]
-    others, cases = firsts[:_OTHER_CAUSES], {}
-    if reason := _why_not_crossed(opened_run, policy, device):
-        missing.append(reason)
-    else:
-        no_pictures = explain_missing_pictures()
+        file = without_machine(str(tables))
+        compared = compare_controllers(
+            read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256
+        )
+    content = collect_content(opened_run, ranking, minima, controller, is_searched=not suffix)
+    heads, others = _choose_elites(ranking, num_elites)
+    cases: dict[int, dict[str, Any]] = {}
+    missing = [_explain_no_crossings(opened_run, policy, device)]
+    if not missing[0]:
+        missing = [explain_missing_pictures()]
         recordings = Recordings(opened_run.robot, device=resolve_device(device), cross=cross)
         cases = cross_cases(
-            opened_run, ranking, crosser, heads, others, recordings, episodes=episodes, pictured=not no_pictures
+            opened_run, ranking, controller, heads, others, recordings, episodes=episodes, pictured=not missing[0]
         )
-        missing += [no_pictures] if no_pictures else []
-        for number, case in cases.items():
-            case["film"] = opened_run.command("film", elite=number, policy=policy)
-        missing += [f"All crossings of elite {n} were invalid this time." for n in (*heads, *others) if n not in cases]
+        for number in (*heads, *others):
+            if number in cases:
+                cases[number]["film"] = opened_run.command("film", elite=number, policy=policy)
+            else:
+                missing.append(f"All crossings of elite {number} were invalid this time.")
     return publish_page(
-        out, "search.html", **content, missing=missing, compared=compared,
+        out, "search.html", **content, missing=[*filter(None, missing)], compared=compared,
         heads=[cases[number] for number in heads if number in cases],
         others=[cases[number] for number in others if number in cases],
     )  # fmt: skip
 
 
-def _why_not_crossed(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
-    """Why the search's controller can cross nothing, empty if it can; one that was asked for must be able to."""
+def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[int]]:
+    """The worst elites, failing ones if there are any, and the worst of some other causes."""
+    rows = ranking.order()[:num_elites]
+    failing = rows[ranking.failing[rows]]
+    rows = failing if len(failing) else rows
+    causes = {ranking.causes[row] for row in rows}
+    others = [members[0] for cause, members in ranking.by_cause().items() if cause not in causes][:_OTHER_CAUSES]
+    numbers = ranking.numbers
+    return numbers[rows].tolist(), [int(numbers[row]) for row in others]
+
+
+def _explain_no_crossings(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
+    """Why the search's controller cannot cross terrains, empty if it can; a controller of the user must be able to."""
     try:
         check_policy(opened_run.policy(policy), opened_run.robot, resolve_device(device))
     except ValueError as error:
@@ -111,48 +120,52 @@ def cross_cases(
 ) -> dict[int, dict[str, Any]]:
     """Lets a controller cross elites and takes their pictures, by number; one without a valid episode is left out.
 
-    ``heads`` are crossed by another controller too, if they have a certificate; ``others`` are shown in short. What the
-    template takes of each: its number, name and verdict, the ``source`` of the picture at the moment of failure
-    ``time_s`` [s], empty without pictures, the ``conditions`` in words, who crosses ``beside`` it, if anybody, the
-    source of the ``figure`` with paths and profile, empty in short, and the table of its ``rates``.
+    ``heads`` are crossed by their best certifier too, if they have one; ``others`` are shown in short.
     """
-    files, cases = opened_run.certifiers(), dict[int, dict[str, Any]]()
-    names = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
+    files = opened_run.certifiers()
+    certifiers = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
-    crossings += [(number, files[name]) for number, name in names.items()]
+    crossings += [(number, files[name]) for number, name in certifiers.items()]
     wanted = [on_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
     recorded = dict(zip(crossings, recordings.all_of(wanted), strict=True))
+    cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):
-            name = names.get(number)
-            other = None if name is None else (name, recorded[number, files[name]])
-            case = _case(opened_run, ranking, number, recorded[number, policy], other, number in heads, pictured)
-            cases |= {number: case} if case else {}
+            name = certifiers.get(number)
+            ghost = None if name is None else (name, recorded[number, files[name]])
+            case = _make_case(opened_run, ranking, number, recorded[number, policy], ghost, pictured)
+            if case is not None:
+                cases[number] = case
+                if number in heads:
+                    title = f"{opened_run.archive.robot}, elite {number} of {len(opened_run.archive):,}"
+                    figure = draw_crossing(recorded[number, policy], f"{title}: {case['rate'].count} crossings")
+                    case["figure"] = encode_figure(figure)
             bar.move_to(done)
     return cases
 
 
-def _case(
+def _make_case(
     opened_run: OpenedRun,
     ranking: Ranking,
     number: int,
     recording: Recording,
-    other: tuple[str, Recording] | None,
-    whole: bool,
+    ghost: tuple[str, Recording] | None,
     pictured: bool,
 ) -> dict[str, Any] | None:
+    """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
     archive = opened_run.archive
     scales = dict(zip(archive.penalties, archive.scales, strict=True))
-    if (failure := find_failure(recording, scales)) is None:
+    failure = find_failure(recording, scales)
+    if failure is None:
         return None
-    moments = [failure] if other is None else [failure, find_same_moment(failure, other[1], scales)]
+    moments = [failure] if ghost is None else [failure, find_same_moment(failure, ghost[1], scales)]
     sources = render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
-    if other is not None:
-        rate = count_rates(other[1])[ARRIVED]
-        beside = {"name": other[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
-    arrived, row = count_rates(recording)[ARRIVED], ranking.find_row(number)
-    title = f"{archive.robot}, elite {number} of {len(archive):,}: {arrived.count} crossings"
+    if ghost is not None:
+        rate = count_rates(ghost[1])[ARRIVED]
+        beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
+    row = ranking.find_row(number)
+    rate = count_rates(recording)[ARRIVED]
     return {
         "number": number,
         "name": ranking.name(row),
@@ -161,16 +174,16 @@ def _case(
         "time_s": failure.time_s,
         "conditions": opened_run.space.condition_text(archive.genes[number]),
         "beside": beside,
-        "figure": figure_source(draw_crossing(recording, title)) if whole else "",
-        "rates": _rates(ranking, archive, row, arrived),
+        "figure": "",
+        "rate": rate,
+        "rates": _list_rates(ranking, archive, row, rate),
     }
 
 
-def _rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
-    """Who reaches the goal how often: here, when the elite was found or judged, and under other conditions."""
-    number = int(ranking.numbers[row])
+def _list_rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
+    """How often controllers reach the goal: now, when the elite was found or judged, and under other conditions."""
     tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
     rates = {"for this page": arrived, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
-    rates |= {who: Rate(*rate) for who, rate in further_rates(archive, number).items()}
-    rows = [[name, f"{rate.hits} of {rate.count}", rate.limits] for name, rate in rates.items()]
+    rates |= {label: Rate(*rate) for label, rate in further_rates(archive, int(ranking.numbers[row])).items()}
+    rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
     return Table(head=["goal reached", "", "95 % interval"], rows=rows)

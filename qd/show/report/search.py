@@ -14,7 +14,7 @@ from qd.search.directory import METRICS_FILE, Metrics, RunDirectory
 from qd.show.crossed import Rate
 from qd.show.elites import OpenedRun
 from qd.show.figures import draw_archive, draw_curves
-from qd.show.report.page import figure_source, origin_rows, percent
+from qd.show.report.page import encode_figure, origin_rows, percent
 from qd.show.report.pictures import draw_sheet
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.intervals import RATES, bootstrap_interval
@@ -56,8 +56,8 @@ def collect_content(
         "elites": _listed_elites(ranking),
         "minimal_tiles": None if minima is None else draw_sheet(np.array([*minima.genes.values()]), space),
         "minimal": None if minima is None else _listed_minima(minima),
-        "curves": figure_source(draw_curves(archive, metrics)) if metrics else "",
-        "parallel": figure_source(draw_archive(archive)),
+        "curves": encode_figure(draw_curves(archive, metrics)) if metrics else "",
+        "parallel": encode_figure(draw_archive(archive)),
         "origin": origin_rows({} if search is None else run.read_config()),
     }
 
