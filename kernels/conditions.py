@@ -37,7 +37,7 @@ class VariedRobots:
     physics_dt: float
     body_mass: wp.array2d[float]
     """As simulated [kg], shape (num_envs, num_bodies), as all up to ``body_inertia``."""
-    subtree_mass: wp.array2d[float]
+    body_subtreemass: wp.array2d[float]
     body_ipos: wp.array2d[wp.vec3]
     body_iquat: wp.array2d[wp.quat]
     body_inertia: wp.array2d[wp.vec3]

@@ -1,8 +1,7 @@
-"""What a physics step tells mujoco_warp of the robots, their drives and contacts, and what it reads back.
+"""Conversion between our state, targets and contacts and the data of mujoco_warp, in a physics step.
 
-The coordinates are those of :mod:`kernels.state` here. mujoco_warp has the base's quaternion as wxyz, its velocity at
-the base's origin, and its rotation rate in the base's frame. All other joints have one axis, and the same numbers in
-both.
+Our coordinates are those of :mod:`kernels.state`. mujoco_warp has the base's quaternion as wxyz, its velocity at the
+base's origin, and its rotation rate in the base's frame. All other joints have one axis and the same numbers in both.
 """
 
 from typing import Any
@@ -15,14 +14,14 @@ from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 @wp.struct
 class SolverState:
-    """Arrays of mujoco_warp's data, and where joints, bodies and targets stand in them."""
+    """Arrays of mujoco_warp's data, and the columns of joints, bodies and targets in them."""
 
     qpos: wp.array2d[float]
     """Coordinates, shape (num_envs, 7 + num_joints)."""
     qvel: wp.array2d[float]
     """Velocities, shape (num_envs, 6 + num_joints)."""
     ctrl: wp.array2d[float]
-    """What actuators are told, shape (num_envs, num_actuators)."""
+    """Controls of the actuators, shape (num_envs, num_actuators)."""
     xpos: wp.array2d[wp.vec3]
     """Positions of bodies, world-local frame [m], shape (num_envs, num_solver_bodies)."""
     xquat: wp.array2d[wp.quat]
@@ -30,7 +29,7 @@ class SolverState:
     column_of_joint: wp.array[int]
     """Column of each joint in ``qpos``, shape (num_joints,); in ``qvel`` it is one less."""
     target_of_actuator: wp.array[int]
-    """Column of the targets that an actuator follows, shape (num_actuators,); -1 of one that follows none."""
+    """Column in the targets of each actuator, shape (num_actuators,); -1 for none."""
     column_of_body: wp.array[int]
     """Column of each body of a robot in ``xpos``, shape (bodies_per_env,); the base comes first."""
     base_com: wp.vec3
@@ -38,37 +37,41 @@ class SolverState:
 
 @wp.struct
 class Delay:
-    """Targets that have yet to count; empty where all count at once."""
+    """Targets that take effect later; empty where all take effect at once."""
 
     steps: wp.array[int]
-    """Physics steps after which a target counts, shape (num_envs,)."""
+    """Physics steps until a target takes effect, shape (num_envs,)."""
     age: wp.array2d[int]
-    """Physics steps since the episode began, shape (num_envs, num_actuators): each counts for itself."""
+    """Physics steps since the episode began, shape (num_envs, num_actuators)."""
     former: wp.array3d[float]
-    """Targets of the last steps [rad], shape (num_envs, 1 + most steps, num_actuators)."""
+    """Targets of the last steps [rad], shape (num_envs, 1 + max steps, num_actuators)."""
     at_first: wp.array[float]
-    """Joint targets that count until there are some [rad], shape (num_joints,)."""
+    """Joint targets in effect before the first one is [rad], shape (num_joints,)."""
 
 
 @wp.func
 def _due_target(target: float, at_first: float, env: int, actuator: int, delay_out: Delay) -> float:
-    """Keep the target of a physics step, and find the one that counts in it: this one if none is late."""
+    """Keep the target of a physics step, and return the one in effect."""
     if delay_out.steps[env] == 0:
         return target
     age = delay_out.age[env, actuator]
-    size, before = delay_out.former.shape[1], age - delay_out.steps[env]
+    size = delay_out.former.shape[1]
+    due = age - delay_out.steps[env]
     delay_out.former[env, age % size, actuator] = target
     delay_out.age[env, actuator] = age + 1
-    if before < 0:
+    if due < 0:
         return at_first
-    return delay_out.former[env, before % size, actuator]
+    return delay_out.former[env, due % size, actuator]
 
 
 @wp.kernel
-def _tell_solver_kernel(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], targets: wp.array2d[float], delay_out: Delay,
+def _to_solver_kernel(
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    targets: wp.array2d[float],
+    delay_out: Delay,
     solver_out: SolverState,
-):  # fmt: skip
+):
     """Grid (num_envs, 1 + the larger of num_joints and num_actuators): the base, then a joint and an actuator each."""
     env, thread = wp.tid()
     k = thread - 1
@@ -85,9 +88,9 @@ def _tell_solver_kernel(
                     target = _due_target(target, delay_out.at_first[column - 7], env, k, delay_out)
                 solver_out.ctrl[env, k] = target
         return
-    of_com = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
+    com_velocity = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
     rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
-    velocity = velocity_beside(of_com, rate, base_rotation(joint_q, env), -solver_out.base_com)
+    velocity = velocity_beside(com_velocity, rate, base_rotation(joint_q, env), -solver_out.base_com)
     rate_b = base_ang_vel_b(joint_q, joint_qd, env)
     for axis in range(3):
         solver_out.qpos[env, axis] = joint_q[env, axis]
@@ -97,11 +100,12 @@ def _tell_solver_kernel(
     solver_out.qpos[env, 3] = joint_q[env, 6]
 
 
-def tell_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState) -> None:
-    """Write coordinates, velocities and the targets that count into mujoco_warp's data."""
+def to_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState) -> None:
+    """Write coordinates, velocities and the targets in effect to mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
-    inputs, outputs = [joint_q, joint_qd, targets], [delay_out, solver_out]
-    wp.launch(_tell_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=outputs, device=joint_q.device)
+    inputs = [joint_q, joint_qd, targets]
+    outputs = [delay_out, solver_out]
+    wp.launch(_to_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=outputs, device=joint_q.device)
 
 
 @wp.kernel
@@ -110,14 +114,16 @@ def _limit_torques_kernel(
 ):
     """Grid (num_envs, num_actuators)."""
     env, k = wp.tid()
-    effort, saturation, limit = motors[k][0], motors[k][1], motors[k][2]
-    lost = saturation * joint_qd[env, solver.target_of_actuator[k] - 1] / limit
-    least, most = wp.clamp(-saturation - lost, -effort, effort), wp.clamp(saturation - lost, -effort, effort)
-    ranges_out[env, k] = wp.vec2(least, most)
+    effort = motors[k][0]
+    saturation = motors[k][1]
+    lost = saturation * joint_qd[env, solver.target_of_actuator[k] - 1] / motors[k][2]
+    lower = wp.clamp(-saturation - lost, -effort, effort)
+    upper = wp.clamp(saturation - lost, -effort, effort)
+    ranges_out[env, k] = wp.vec2(lower, upper)
 
 
 def limit_torques(joint_qd: Any, solver: SolverState, motors: Any, ranges_out: Any) -> None:
-    """Find the least and most torque [N m] of DC motors at the present velocities, shape (num_envs, num_actuators).
+    """Write the torque limits [N m] of DC motors at the present velocities, shape (num_envs, num_actuators).
 
     ``motors`` are effort limit [N m], stall torque [N m] and speed limit [rad/s] of each, shape (num_actuators,).
     """
@@ -126,7 +132,7 @@ def limit_torques(joint_qd: Any, solver: SolverState, motors: Any, ranges_out: A
 
 
 @wp.kernel
-def _ask_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float]):
+def _from_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float]):
     """Grid (num_envs, 1 + num_joints): the base, then a joint each."""
     env, thread = wp.tid()
     k = thread - 1
@@ -141,21 +147,22 @@ def _ask_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], join
     joint_q_out[env, 6] = solver.qpos[env, 3]
     rotation = base_rotation(joint_q_out, env)
     rate = wp.quat_rotate(rotation, wp.vec3(solver.qvel[env, 3], solver.qvel[env, 4], solver.qvel[env, 5]))
-    of_origin = wp.vec3(solver.qvel[env, 0], solver.qvel[env, 1], solver.qvel[env, 2])
-    velocity = velocity_beside(of_origin, rate, rotation, solver.base_com)
+    origin_velocity = wp.vec3(solver.qvel[env, 0], solver.qvel[env, 1], solver.qvel[env, 2])
+    velocity = velocity_beside(origin_velocity, rate, rotation, solver.base_com)
     for axis in range(3):
         joint_qd_out[env, axis] = velocity[axis]
         joint_qd_out[env, 3 + axis] = rate[axis]
 
 
-def ask_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
+def from_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
     """Read coordinates and velocities from mujoco_warp's data."""
-    size, outputs = (joint_q_out.shape[0], 1 + len(solver.column_of_joint)), [joint_q_out, joint_qd_out]
-    wp.launch(_ask_solver_kernel, size, [solver], outputs=outputs, device=joint_q_out.device)
+    size = (joint_q_out.shape[0], 1 + len(solver.column_of_joint))
+    outputs = [joint_q_out, joint_qd_out]
+    wp.launch(_from_solver_kernel, size, [solver], outputs=outputs, device=joint_q_out.device)
 
 
 @wp.kernel
-def _ask_poses_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
+def _poses_from_solver_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
     """Grid (num_envs, bodies_per_env)."""
     env, body = wp.tid()
     column = solver.column_of_body[body]
@@ -163,9 +170,9 @@ def _ask_poses_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform])
     body_q_out[env, body] = wp.transform(solver.xpos[env, column], wp.quat(turned[1], turned[2], turned[3], turned[0]))
 
 
-def ask_poses(solver: SolverState, body_q_out: Any) -> None:
+def poses_from_solver(solver: SolverState, body_q_out: Any) -> None:
     """Read the poses of bodies, world-local frame, shape (num_envs, bodies_per_env), from mujoco_warp's data."""
-    wp.launch(_ask_poses_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
+    wp.launch(_poses_from_solver_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
 
 
 @wp.struct
@@ -188,15 +195,15 @@ class SolverContacts:
     efc_force: wp.array2d[float]
     overflow: wp.array[int]
     too_many: int
-    """Its bit for more contacts than there is room for."""
+    """Overflow bit for too many contacts."""
     ground: int
-    """Its number of the ground's geom."""
+    """Geom of the ground."""
     slot: wp.array2d[int]
-    """Where each contact of a robot lies in the others, shape (num_envs, capacity)."""
+    """Index of each contact of a robot in the arrays above, shape (num_envs, capacity)."""
 
 
 @wp.kernel
-def _tell_contacts_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts):
+def _contacts_to_solver_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts):
     """Grid (num_envs, capacity)."""
     env, c = wp.tid()
     if c == 0:
@@ -235,15 +242,16 @@ def _tell_contacts_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: So
         solver_out.efc_address[slot, row] = -1
 
 
-def tell_contacts(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts) -> None:
+def contacts_to_solver(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts) -> None:
     """Write terrain contacts into mujoco_warp's data."""
     solver_out.count.zero_()
-    size, device = contacts.shape.shape, contacts.count.device
-    wp.launch(_tell_contacts_kernel, size, [contacts, surfaces], outputs=[solver_out], device=device)
+    inputs = [contacts, surfaces]
+    size = contacts.shape.shape
+    wp.launch(_contacts_to_solver_kernel, size, inputs, outputs=[solver_out], device=contacts.count.device)
 
 
 @wp.kernel
-def _ask_forces_kernel(solver: SolverContacts, contacts_out: Contacts):
+def _forces_from_solver_kernel(solver: SolverContacts, contacts_out: Contacts):
     """Grid (num_envs, capacity)."""
     env, c = wp.tid()
     if c >= contacts_out.count[env]:
@@ -258,7 +266,7 @@ def _ask_forces_kernel(solver: SolverContacts, contacts_out: Contacts):
     contacts_out.force[env, c] = force
 
 
-def ask_forces(solver: SolverContacts, contacts_out: Contacts) -> None:
+def forces_from_solver(solver: SolverContacts, contacts_out: Contacts) -> None:
     """Read the forces of terrain contacts from mujoco_warp's data."""
-    size, device = contacts_out.shape.shape, contacts_out.count.device
-    wp.launch(_ask_forces_kernel, size, [solver], outputs=[contacts_out], device=device)
+    size = contacts_out.shape.shape
+    wp.launch(_forces_from_solver_kernel, size, [solver], outputs=[contacts_out], device=contacts_out.count.device)

@@ -1,4 +1,4 @@
-// Quantities of a body or joint stand one after the other, body (or dof) by body. Spatial vectors have the rotation first, and are
+// Quantities are stored body by body or dof by dof. Spatial vectors have the rotation first, and are
 // taken at the mass centre of the body's tree, in the world's axes. The world is body 0.
 struct Quat { float w, x, y, z; };
 struct Six { float v[6]; };
@@ -16,18 +16,18 @@ float* motion = com + NB * 3;       // NV x 6: of each dof; before, at its first
 const float* qpos = &wp::index(robots.qpos, world, 0);
 const float* qvel = &wp::index(robots.qvel, world, 0);
 
-auto get = [](const float* at, int k) { return Vec(at[3 * k], at[3 * k + 1], at[3 * k + 2]); };
-auto put = [](float* at, int k, const Vec& v) { at[3 * k] = v[0]; at[3 * k + 1] = v[1]; at[3 * k + 2] = v[2]; };
-auto get_six = [](const float* at, int k) {
+auto get = [](const float* array, int k) { return Vec(array[3 * k], array[3 * k + 1], array[3 * k + 2]); };
+auto put = [](float* array, int k, const Vec& v) { array[3 * k] = v[0]; array[3 * k + 1] = v[1]; array[3 * k + 2] = v[2]; };
+auto get_six = [](const float* array, int k) {
     Six s;
-    for (int i = 0; i < 6; ++i) s.v[i] = at[6 * k + i];
+    for (int i = 0; i < 6; ++i) s.v[i] = array[6 * k + i];
     return s;
 };
-auto put_six = [](float* at, int k, const Six& s) {
-    for (int i = 0; i < 6; ++i) at[6 * k + i] = s.v[i];
+auto put_six = [](float* array, int k, const Six& s) {
+    for (int i = 0; i < 6; ++i) array[6 * k + i] = s.v[i];
 };
 auto get_quat = [&](int k) { return Quat{rotation[4 * k], rotation[4 * k + 1], rotation[4 * k + 2], rotation[4 * k + 3]}; };
-auto quat_of = [](const wp::quat_t<float>& q) { return Quat{q.x, q.y, q.z, q.w}; };  // the solver's arrays have wxyz
+auto to_quat = [](const wp::quat_t<float>& q) { return Quat{q.x, q.y, q.z, q.w}; };  // the solver's arrays have wxyz
 auto times = [](const Quat& a, const Quat& b) {
     return Quat{
         a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z, a.w * b.x + a.x * b.w + a.y * b.z - a.z * b.y,
@@ -69,8 +69,8 @@ auto momentum = [](const float* i, const Six& s) {
          i[4] * v[0] + i[5] * v[1] + i[2] * v[2] - i[7] * v[3] + i[6] * v[4], i[8] * v[1] - i[7] * v[2] + i[9] * v[3],
          i[6] * v[2] - i[8] * v[0] + i[9] * v[4], i[7] * v[0] - i[6] * v[1] + i[9] * v[5]}};
 };
-auto first_joint = [&](int body) { return tree.joint.data[body]; };
-auto num_joints = [&](int body) { return tree.num_joints.data[body]; };
+auto first_joint = [&](int body) { return tree.body_jntadr.data[body]; };
+auto num_joints = [&](int body) { return tree.body_jntnum.data[body]; };
 
 // Poses, from the root of each tree outward.
 if (lane == 0) {
@@ -85,32 +85,32 @@ sync();
 #pragma unroll 1
 for (int level = 0; level < LEVELS; ++level) {
     #pragma unroll 1
-    for (int n = tree.level.data[level] + lane; n < tree.level.data[level + 1]; n += LANES) {
-        const int body = tree.order.data[n], parent = tree.parent.data[body], first = first_joint(body);
+    for (int n = tree.level_start.data[level] + lane; n < tree.level_start.data[level + 1]; n += LANES) {
+        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body], first = first_joint(body);
         Vec x;
         Quat q;
-        if (num_joints(body) > 0 && tree.joint_type.data[first] == FREE) {
-            const float* at = qpos + tree.joint_qpos.data[first];
-            x = Vec(at[0], at[1], at[2]);
-            q = Quat{at[3], at[4], at[5], at[6]};
+        if (num_joints(body) > 0 && tree.jnt_type.data[first] == FREE) {
+            const float* base = qpos + tree.jnt_qposadr.data[first];
+            x = Vec(base[0], base[1], base[2]);
+            q = Quat{base[3], base[4], base[5], base[6]};
         } else {
             const Quat q_parent = get_quat(parent);
-            x = turn(q_parent, of_model(tree.body_pos, body)) + get(position, parent);
-            q = times(q_parent, quat_of(of_model(tree.body_quat, body)));
+            x = turn(q_parent, model_value(tree.body_pos, body)) + get(position, parent);
+            q = times(q_parent, to_quat(model_value(tree.body_quat, body)));
             #pragma unroll 1
             for (int j = first; j < first + num_joints(body); ++j) {
-                const Vec axis = of_model(tree.joint_axis, j), offset = of_model(tree.joint_pos, j);
+                const Vec axis = model_value(tree.jnt_axis, j), offset = model_value(tree.jnt_pos, j);
                 const Vec anchor = turn(q, offset) + x, turned = turn(q, axis);
-                const int column = tree.joint_qpos.data[j];
-                const float moved = qpos[column] - of_model(tree.qpos0, column);
-                if (tree.joint_type.data[j] == SLIDE) {
+                const int column = tree.jnt_qposadr.data[j];
+                const float moved = qpos[column] - model_value(tree.qpos0, column);
+                if (tree.jnt_type.data[j] == SLIDE) {
                     x += turned * moved;
                 } else {
                     const float s = wp::sin(0.5f * moved), c = wp::cos(0.5f * moved);
                     q = times(q, Quat{c, axis[0] * s, axis[1] * s, axis[2] * s});
                     x = anchor - turn(q, offset);
                 }
-                put_six(motion, tree.joint_dof.data[j], six(turned, anchor));
+                put_six(motion, tree.jnt_dofadr.data[j], six(turned, anchor));
             }
         }
         q = normal(q);
@@ -119,7 +119,7 @@ for (int level = 0; level < LEVELS; ++level) {
         rotation[4 * body + 1] = q.x;
         rotation[4 * body + 2] = q.y;
         rotation[4 * body + 3] = q.z;
-        put(centre, body, x + turn(q, of_model(tree.body_ipos, body)));
+        put(centre, body, x + turn(q, model_value(tree.body_ipos, body)));
         wp::index(robots.xpos, world, body) = x;
         wp::index(robots.xquat, world, body) = wp::quat_t<float>(q.w, q.x, q.y, q.z);
     }
@@ -130,10 +130,10 @@ for (int n = 0; n < tree.roots.shape[0]; ++n) {
     const int root = tree.roots.data[n];
     Vec sum;
     for (int body = 1 + lane; body < NB; body += LANES) {
-        if (tree.root.data[body] == root) sum += get(centre, body) * of_model(tree.body_mass, body);
+        if (tree.body_rootid.data[body] == root) sum += get(centre, body) * model_value(tree.body_mass, body);
     }
     for (int i = 0; i < 3; ++i) sum[i] = total(sum[i]);
-    const float mass = of_model(tree.subtree_mass, root);
+    const float mass = model_value(tree.body_subtreemass, root);
     if (mass != 0.0f) sum = sum / mass;
     if (lane == 0) {
         put(com, root, sum);
@@ -145,28 +145,28 @@ sync();
 // Inertias and motions at the mass centre.
 #pragma unroll 1
 for (int body = 1 + lane; body < NB; body += LANES) {
-    const Quat q = times(get_quat(body), quat_of(of_model(tree.body_iquat, body)));
+    const Quat q = times(get_quat(body), to_quat(model_value(tree.body_iquat, body)));
     const Vec x = turn(q, Vec(1.0f, 0.0f, 0.0f)), y = turn(q, Vec(0.0f, 1.0f, 0.0f)), z = turn(q, Vec(0.0f, 0.0f, 1.0f));
-    const Vec d = get(centre, body) - get(com, tree.root.data[body]), moment = of_model(tree.body_inertia, body);
-    const float mass = of_model(tree.body_mass, body);
+    const Vec d = get(centre, body) - get(com, tree.body_rootid.data[body]), moment = model_value(tree.body_inertia, body);
+    const float mass = model_value(tree.body_mass, body);
     auto entry = [&](int i, int j) {
         const float product = i == j ? d[i] * d[j] - wp::dot(d, d) : d[i] * d[j];
         return moment[0] * x[i] * x[j] + moment[1] * y[i] * y[j] + moment[2] * z[i] * z[j] - mass * product;
     };
-    float* at = inertia + 10 * body;
-    at[0] = entry(0, 0);
-    at[1] = entry(1, 1);
-    at[2] = entry(2, 2);
-    at[3] = entry(0, 1);
-    at[4] = entry(0, 2);
-    at[5] = entry(1, 2);
-    for (int i = 0; i < 3; ++i) at[6 + i] = mass * d[i];
-    at[9] = mass;
+    float* entries = inertia + 10 * body;
+    entries[0] = entry(0, 0);
+    entries[1] = entry(1, 1);
+    entries[2] = entry(2, 2);
+    entries[3] = entry(0, 1);
+    entries[4] = entry(0, 2);
+    entries[5] = entry(1, 2);
+    for (int i = 0; i < 3; ++i) entries[6 + i] = mass * d[i];
+    entries[9] = mass;
 }
 #pragma unroll 1
 for (int j = lane; j < NJ; j += LANES) {
-    const int body = tree.joint_body.data[j], dof = tree.joint_dof.data[j], type = tree.joint_type.data[j];
-    const Vec middle = get(com, tree.root.data[body]);
+    const int body = tree.jnt_bodyid.data[j], dof = tree.jnt_dofadr.data[j], type = tree.jnt_type.data[j];
+    const Vec middle = get(com, tree.body_rootid.data[body]);
     if (type == FREE) {
         const Quat q = get_quat(body);
         const Vec offset = middle - get(position, body);
@@ -176,8 +176,8 @@ for (int j = lane; j < NJ; j += LANES) {
             put_six(motion, dof + 3 + i, six(turned, wp::cross(turned, offset)));
         }
     } else {
-        const Six found = get_six(motion, dof);
-        const Vec axis = rotation_part(found), offset = middle - linear_part(found);
+        const Six joint_line = get_six(motion, dof);
+        const Vec axis = rotation_part(joint_line), offset = middle - linear_part(joint_line);
         put_six(motion, dof, type == SLIDE ? six(Vec(), axis) : six(axis, wp::cross(axis, offset)));
     }
 }
@@ -189,17 +189,17 @@ for (int n = lane; n < NV; n += LANES) {
     for (int i = 0; i < 6; ++i) out[i] = s.v[i];
 }
 
-// Velocities and accelerations without those of the joints, outward; then the forces that these take, inward.
+// Velocities and accelerations at zero joint acceleration, outward; then the forces that they need, inward.
 #pragma unroll 1
 for (int level = 0; level < LEVELS; ++level) {
     #pragma unroll 1
-    for (int n = tree.level.data[level] + lane; n < tree.level.data[level + 1]; n += LANES) {
-        const int body = tree.order.data[n], parent = tree.parent.data[body];
+    for (int n = tree.level_start.data[level] + lane; n < tree.level_start.data[level + 1]; n += LANES) {
+        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body];
         Six v = get_six(velocity, parent), a = get_six(force, parent);
         #pragma unroll 1
         for (int j = first_joint(body); j < first_joint(body) + num_joints(body); ++j) {
-            int dof = tree.joint_dof.data[j];
-            if (tree.joint_type.data[j] == FREE) {
+            int dof = tree.jnt_dofadr.data[j];
+            if (tree.jnt_type.data[j] == FREE) {
                 for (int i = 0; i < 3; ++i) add(v, get_six(motion, dof + i), qvel[dof + i]);
                 const Six linear = v;
                 for (int i = 3; i < 6; ++i) {
@@ -227,13 +227,13 @@ for (int body = 1 + lane; body < NB; body += LANES) {
 }
 sync();
 #pragma unroll 1
-for (int k = lane; k < 16; k += LANES) {  // each thread one number of all bodies
-    float* of = k < 6 ? force + k : inertia + k - 6;
-    const int apart = k < 6 ? 6 : 10;
+for (int k = lane; k < 16; k += LANES) {  // each thread sums one number over all bodies
+    float* numbers = k < 6 ? force + k : inertia + k - 6;
+    const int stride = k < 6 ? 6 : 10;
     #pragma unroll 1
     for (int n = NB - 2; n >= 0; --n) {
-        const int body = tree.order.data[n], parent = tree.parent.data[body];
-        if (parent > 0) of[apart * parent] += of[apart * body];
+        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body];
+        if (parent > 0) numbers[stride * parent] += numbers[stride * body];
     }
 }
 sync();
@@ -241,46 +241,46 @@ sync();
 // Inertia of the joints, and the forces on them.
 #pragma unroll 1
 for (int n = lane; n < NV; n += LANES) {
-    const int body = tree.dof_body.data[n], joint = tree.dof_joint.data[n];
+    const int body = tree.dof_bodyid.data[n], joint = tree.dof_jntid.data[n];
     const Six s = get_six(motion, n), carried = momentum(inertia + 10 * body, s);
-    const int start = tree.inertia_start.data[n];  // of a row that may lack ancestors, where their entries are always 0
-    int at = start + tree.inertia_count.data[n] - 1;
-    wp::index(robots.inertia, world, at) = of_model(tree.armature, n) + dot(s, carried);
+    const int start = tree.M_rowadr.data[n];  // a row leaves out ancestors whose entries are always 0
+    int column = start + tree.M_rownnz.data[n] - 1;
+    wp::index(robots.M, world, column) = model_value(tree.dof_armature, n) + dot(s, carried);
     #pragma unroll 1
-    for (int m = tree.dof_parent.data[n]; at > start; m = tree.dof_parent.data[m]) {
-        wp::index(robots.inertia, world, --at) = dot(get_six(motion, m), carried);
+    for (int m = tree.dof_parentid.data[n]; column > start; m = tree.dof_parentid.data[m]) {
+        wp::index(robots.M, world, --column) = dot(get_six(motion, m), carried);
     }
-    const float damping = of_model(tree.damping, n);
+    const float damping = model_value(tree.dof_damping, n);
     const float strength = robots.strength.shape[0] > 0 ? wp::index(robots.strength, world) : 1.0f;
     float passive = -damping * qvel[n], driven = 0.0f, slope = damping;
-    if (tree.joint_type.data[joint] != FREE) {
-        const int column = tree.joint_qpos.data[joint];
-        passive -= of_model(tree.stiffness, joint) * (qpos[column] - of_model(tree.rest, column));
-        const int a = tree.actuator.data[n];
+    if (tree.jnt_type.data[joint] != FREE) {
+        const int coordinate = tree.jnt_qposadr.data[joint];
+        passive -= model_value(tree.jnt_stiffness, joint) * (qpos[coordinate] - model_value(tree.qpos_spring, coordinate));
+        const int a = tree.dof_actuator.data[n];
         if (a >= 0) {
-            const auto& gain = wp::index(tree.gain, world % tree.gain.shape[0], a, 0);
-            const float* bias = &wp::index(tree.bias, world % tree.bias.shape[0], a, 0);
-            const float gear = of_model(tree.gear, a)[0];
-            float control = wp::index(robots.control, world, a);
-            if (tree.control_limited.data[a]) {
-                const auto range = of_model(tree.control_range, a);
+            const auto& gain = wp::index(tree.actuator_gainprm, world % tree.actuator_gainprm.shape[0], a, 0);
+            const float* bias = &wp::index(tree.actuator_biasprm, world % tree.actuator_biasprm.shape[0], a, 0);
+            const float gear = model_value(tree.actuator_gear, a)[0];
+            float control = wp::index(robots.ctrl, world, a);
+            if (tree.actuator_ctrllimited.data[a]) {
+                const auto range = model_value(tree.actuator_ctrlrange, a);
                 control = wp::clamp(control, range[0], range[1]);
             }
-            float f = gain * control, steep = 0.0f;
-            if (tree.biased.data[a]) {
-                f += bias[0] + bias[1] * (gear * qpos[column]) + bias[2] * (gear * qvel[n]);
-                steep = bias[2];
+            float f = gain * control, velocity_gain = 0.0f;
+            if (tree.actuator_biastype.data[a] != 0) {
+                f += bias[0] + bias[1] * (gear * qpos[coordinate]) + bias[2] * (gear * qvel[n]);
+                velocity_gain = bias[2];
             }
-            if (tree.force_limited.data[a]) {
-                const auto range = of_model(tree.force_range, a);
-                if (f <= range[0] || f >= range[1]) steep = 0.0f;
+            if (tree.actuator_forcelimited.data[a]) {
+                const auto range = model_value(tree.actuator_forcerange, a);
+                if (f <= range[0] || f >= range[1]) velocity_gain = 0.0f;
                 f = wp::clamp(f, range[0], range[1]);
             }
             driven = gear * f;
-            slope -= gear * gear * steep * strength;
+            slope -= gear * gear * velocity_gain * strength;
         }
-        if (tree.joint_force_limited.data[joint]) {
-            const auto range = of_model(tree.joint_force_range, joint);
+        if (tree.jnt_actfrclimited.data[joint]) {
+            const auto range = model_value(tree.jnt_actfrcrange, joint);
             driven = wp::clamp(driven, range[0], range[1]);
         }
         driven *= strength;

@@ -1,15 +1,14 @@
-"""A robot's step: its contact problem is put together, solved and acted on by 32 threads of a GPU, or one of a CPU.
+"""A robot's step: its constraints are set up, solved and applied by 32 threads of a GPU, or one of a CPU.
 
-mujoco_warp takes some ninety kernels a step for it, each over all robots, and hands rows of constraints, gradient,
-Hessian and search direction from one to the next through global memory. A walking robot has two contacts and mostly is
-done after one or two iterations. Here a warp takes one robot: it makes the rows of its contacts, joint limits and joint
-friction in shared memory, iterates until that robot is done, and moves it on. Matrices are factorised in registers.
+mujoco_warp takes some ninety kernels a step for it, each over all robots, and passes rows of constraints, gradient,
+Hessian and search direction through global memory. A walking robot has two contacts and mostly needs one or two
+iterations. Here a warp works on one robot: it makes the rows of its contacts, joint limits and joint friction in shared
+memory, iterates until that robot has converged, and moves it on. Matrices are factorised in registers.
 
 Constraints, algorithm, tests of convergence and line search are those of MuJoCo and mujoco_warp (Todorov, "Convex and
 analytically-invertible dynamics with contacts and constraints", ICRA 2014; primal form, elliptic cones), so that steps
-agree to rounding. Only the Hessian of a contact on the side of its cone is put together in another way: its C is
-positive semidefinite, so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu,
-``add_contacts``).
+agree to rounding. Only the Hessian of a contact on the side of its cone is computed in another way: its C is positive
+semidefinite, so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``add_contacts``).
 """
 
 from dataclasses import asdict, dataclass
@@ -24,109 +23,107 @@ from kernels.contact import Contacts, Surfaces, vec5
 from kernels.dynamics import Robots
 
 LANES = 32
-_REGISTERS = 96  # a thread, so that 20 robots find room on a multiprocessor
-_CHUNK = 4
-"""Contacts whose part of the Hessian is summed at once."""
-_SHARED_WORDS = 1792  # of a robot, so that 32 find room; contacts beyond these are in global memory
-_LEAST_KEPT = 8  # contacts in shared memory, also of a large robot
-
-
+_REGISTERS = 96  # a thread, so that 20 robots fit on a multiprocessor
+_CHUNK = 4  # contacts whose terms of the Hessian are summed at once
+_SHARED_FLOATS = 1792  # a robot, so that 32 robots fit; further contacts are in global memory
+_MIN_SHARED_CONTACTS = 8
 _BODY = Path(__file__).with_suffix(".cu")
 
 
 @wp.struct
 class Problem:
-    """Model and contacts of every robot. Arrays of a model of shape (1, ...) hold for all, else for one each."""
+    """Model and contacts of every robot: mujoco_warp's arrays under its names where there is no line.
 
-    most_iterations: int
-    most_line_iterations: int
+    Arrays of two or more dimensions have a row for each world, or one for all.
+    """
+
+    iterations: int
+    ls_iterations: int
     tolerance: wp.array[float]
     ls_tolerance: wp.array[float]
     impratio_invsqrt: wp.array[float]
     timestep: wp.array[float]
-    joint_type: wp.array[int]
-    joint_qpos: wp.array[int]
-    joint_dof: wp.array[int]
-    joint_limited: wp.array[bool]
-    joint_range: wp.array2d[wp.vec2]
-    joint_margin: wp.array2d[float]
-    joint_solref: wp.array2d[wp.vec2]
-    joint_solimp: wp.array2d[vec5]
-    dof_joint: wp.array[int]
-    dof_weight: wp.array2d[float]
-    """MuJoCo's ``invweight0``, of dofs and below of bodies."""
+    jnt_type: wp.array[int]
+    jnt_qposadr: wp.array[int]
+    jnt_dofadr: wp.array[int]
+    jnt_limited: wp.array[int]
+    jnt_range: wp.array2d[wp.vec2]
+    jnt_margin: wp.array2d[float]
+    jnt_solref: wp.array2d[wp.vec2]
+    jnt_solimp: wp.array2d[vec5]
+    dof_jntid: wp.array[int]
+    dof_invweight0: wp.array2d[float]
     dof_solref: wp.array2d[wp.vec2]
-    """Of friction in the joints."""
     dof_solimp: wp.array2d[vec5]
-    frictionloss: wp.array2d[float]
-    body_root: wp.array[int]
-    body_weight: wp.array2d[wp.vec2]
-    is_ancestor: wp.array2d[int]
-    """Whether a body, in rows, moves with a dof."""
+    dof_frictionloss: wp.array2d[float]
+    body_rootid: wp.array[int]
+    body_invweight0: wp.array2d[wp.vec2]
+    body_isdofancestor: wp.array2d[int]
+    M_hinit_i: wp.array[int]
+    M_colind: wp.array[int]
     surfaces: Surfaces
-    inertia_row: wp.array[int]
-    """Rows, then columns, of the numbers kept of the inertia."""
-    inertia_col: wp.array[int]
     contacts: Contacts
-    others: wp.array2d[float]
-    """Room for the contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.other_words`)."""
+    spilled_contacts: wp.array2d[float]
+    """Contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.global_floats`)."""
     qacc_warmstart: wp.array2d[float]
-    iterations: wp.array[int]
+    solver_niter: wp.array[int]
     overflow: wp.array[int]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sizes:
-    """What a model's kernel is made for."""
+    """Sizes of a model, which its kernel is compiled for."""
 
     dofs: int
     contacts: int
-    """Most contacts of a robot."""
+    """Capacity for contacts of a robot."""
     dimensions: int
-    """Most rows of a contact."""
+    """Rows of the largest contact."""
     inertia: int
-    """Numbers kept of an inertia."""
+    """Stored entries of the inertia."""
     losses: bool
     """Whether there is friction in any joint."""
 
     @property
     def stride(self) -> int:
-        """Words from row to row of a matrix: whole vectors of four, an odd number, so that 8 rows meet in no bank."""
+        """Floats from row to row of a matrix: an odd number of vectors of four, so that 8 rows share no memory bank."""
         return 4 * (-(-self.dofs // 4) | 1)
 
     @property
-    def _contact_words(self) -> int:
-        return _fours(self.dimensions * (self.stride + 5) + 1)
+    def _floats_per_contact(self) -> int:
+        return _round_up_to_4(self.dimensions * (self.stride + 5) + 1)
 
     @property
-    def _other_words(self) -> int:
-        matrices = (self.dofs + 1 + _CHUNK * self.dimensions) * self.stride
-        return matrices + _fours(_CHUNK * self.dimensions**2)
+    def _matrix_floats(self) -> int:
+        rows = self.dofs + 1 + _CHUNK * self.dimensions
+        return rows * self.stride + _round_up_to_4(_CHUNK * self.dimensions**2)
 
     @property
-    def kept(self) -> int:
+    def shared_contacts(self) -> int:
         """Contacts in shared memory."""
-        return min(self.contacts, max(_LEAST_KEPT, (_SHARED_WORDS - self._other_words) // self._contact_words))
+        room = (_SHARED_FLOATS - self._matrix_floats) // self._floats_per_contact
+        return min(self.contacts, max(_MIN_SHARED_CONTACTS, room))
 
     @property
-    def words(self) -> int:
-        """Words of shared memory that a robot needs."""
-        return self._other_words + self.kept * self._contact_words
+    def shared_floats(self) -> int:
+        """Floats of shared memory that a robot needs."""
+        return self._matrix_floats + self.shared_contacts * self._floats_per_contact
 
     @property
-    def other_words(self) -> int:
-        """Words of global memory that a robot needs."""
-        return (self.contacts - self.kept) * self._contact_words
+    def global_floats(self) -> int:
+        """Floats of global memory that a robot needs."""
+        return (self.contacts - self.shared_contacts) * self._floats_per_contact
 
 
-def _fours(words: int) -> int:
-    return -(-words // 4) * 4
+def _round_up_to_4(count: int) -> int:
+    return -(-count // 4) * 4
 
 
 @cache
 def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
-    values = {"chunk": _CHUNK, "kept": sizes.kept, "stride": sizes.stride} | asdict(sizes) | dict(codes)
-    snippet = lanes.snippet(_BODY, words=sizes.words, lanes=LANES, **values | {"losses": str(sizes.losses).lower()})
+    values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower()}
+    values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride}
+    snippet = lanes.snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
 
     @wp.func_native(snippet=snippet)
     def step_one(robots: Robots, problem: Problem, thread: int): ...
@@ -142,12 +139,13 @@ def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
 
 
 def step_robots(robots: Robots, problem: Problem, sizes: Sizes, codes: dict[str, Any]) -> None:
-    """Moves every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
+    """Move every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
-    It writes ``qpos``, ``qvel`` and the warm start of the next step, the contacts' forces, the number of iterations,
-    and the bits of what overflowed. The words of the sizes must :func:`kernels.lanes.fits` with ``LANES``. ``codes``
-    are MuJoCo's numbers, by their names in solver.cu: of a free joint, of the bits, of the limits of impedances, and
-    the least divisor.
+    It writes ``qpos``, ``qvel``, the warm start of the next step, the contacts' forces, the number of iterations and
+    the overflow bits. The shared memory of ``sizes`` must pass :func:`kernels.lanes.fits_block` with ``LANES``.
+    ``codes`` are MuJoCo's numbers, by their names in solver.cu: the type of a free joint, overflow bits, limits of
+    impedances, the smallest divisor.
     """
-    kernel, num_worlds = _kernel(sizes, tuple(codes.items())), robots.qvel.shape[0]
+    kernel = _kernel(sizes, tuple(codes.items()))
+    num_worlds = robots.qvel.shape[0]
     lanes.launch(kernel, num_worlds, [robots, problem], lanes=LANES, device=robots.qvel.device)

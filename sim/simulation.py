@@ -12,7 +12,7 @@ import warp as wp
 
 from kernels.conditions import Disturbed, DisturbedStep, begin_conditions, disturb
 from kernels.contact import collide_strips, make_contacts, sum_forces
-from kernels.coordinates import Delay, SolverState, ask_poses, ask_solver, limit_torques, tell_solver
+from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes
 from kernels.ground import Ground
 from kernels.observation import Sensors
@@ -26,7 +26,7 @@ from sim.robots.model import builder_of
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
-from sim.solver import TheirDynamics, dynamics_of
+from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.base import begin_effects, disturb_effects
 from sim.terrains.conditions.delay import MAX_DELAY_S
@@ -169,7 +169,7 @@ class Simulation:
         roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
         self.geom_role = wp.array(roles, dtype=int)
         model, data = self.solver.mjw_model, self.solver.mjw_data
-        self._dynamics = dynamics_of(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
+        self._dynamics = make_dynamics(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
@@ -213,7 +213,7 @@ class Simulation:
         self.disturbed = None
         if self.bank.conditions is None:
             return
-        if isinstance(self._dynamics, TheirDynamics):
+        if isinstance(self._dynamics, StockDynamics):
             raise ValueError(
                 f"robot '{self.robot.name}' cannot have conditions, since its model takes mujoco_warp's own step "
                 "(sim/solver.py says why): leave conditions out"
@@ -287,14 +287,14 @@ class Simulation:
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
-            tell_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
+            to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self._dynamics.find()
-            ask_poses(coordinates, self.body_q)
+            poses_from_solver(coordinates, self.body_q)
             self.collide()
             self._dynamics.step()
-            ask_solver(coordinates, self.joint_q, self.joint_qd)
+            from_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:
         """Sum the last step's contact forces into ``geom_force``."""
@@ -307,7 +307,7 @@ class Simulation:
         clear_rows(mask, self.parked.reshape((-1, 1)).view(float))  # whose 0 has the same bits
         if self._delay.age is not None:
             clear_rows(mask, self._delay.age.view(float))
-        if isinstance(self._dynamics, TheirDynamics):
+        if isinstance(self._dynamics, StockDynamics):
             # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not
             # finite would stay so, whatever state it is reset to.
             clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))

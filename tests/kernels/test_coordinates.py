@@ -9,11 +9,11 @@ from kernels.coordinates import (
     Delay,
     SolverContacts,
     SolverState,
-    ask_forces,
-    ask_poses,
-    ask_solver,
-    tell_contacts,
-    tell_solver,
+    forces_from_solver,
+    poses_from_solver,
+    from_solver,
+    contacts_to_solver,
+    to_solver,
 )
 from kernels.ground import FIRM
 from sim.mujoco_c.model import to_mujoco
@@ -44,7 +44,7 @@ def solver():
 def told(solver):
     q, qd = random_states(ENVS, 3)
     targets = q + np.float32(1.0)
-    tell_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), Delay(), solver)
+    to_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), Delay(), solver)
     return q, qd, targets
 
 
@@ -67,7 +67,7 @@ def test_actuators_are_told_their_targets_and_others_nothing(solver, told):
 def test_what_was_told_is_read_back(solver, told):
     q, qd, _ = told
     now = wp.zeros(q.shape, dtype=float), wp.zeros(qd.shape, dtype=float)
-    ask_solver(solver, *now)
+    from_solver(solver, *now)
     np.testing.assert_array_equal(now[0].numpy(), q)
     np.testing.assert_allclose(now[1].numpy(), qd, atol=3e-6)
 
@@ -78,7 +78,7 @@ def test_poses_are_those_of_the_bodies_with_quaternions_turned_round(solver):
     solver.xpos.assign(np.float32(positions))
     solver.xquat.assign(np.float32(rotations))
     poses = wp.zeros((ENVS, 2), dtype=wp.transform)
-    ask_poses(solver, poses)
+    poses_from_solver(solver, poses)
     expected = np.concatenate([positions, rotations[..., [1, 2, 3, 0]]], axis=-1)[:, list(BODIES)]
     np.testing.assert_array_equal(poses.numpy(), np.float32(expected))
 
@@ -111,7 +111,7 @@ def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
         Surfaces, geom=[4, 7], body=[1, 2], condim=[3, 4], friction=[[[0.8, 0.8, 0.1, 0.2, 0.2]] * 2],
         solref=[[[-500, -30], [0.02, 1.5]]], solimp=[[[0.7, 0.9, 0.1, 0.5, 2.0]] * 2],
     )  # fmt: skip
-    tell_contacts(contacts, surfaces, theirs)
+    contacts_to_solver(contacts, surfaces, theirs)
     found = {name: getattr(theirs, name).numpy() for name in SolverContacts.vars if name not in ("too_many", "ground")}
     slots = found["slot"][[0, 1, 1], [0, 0, 1]]
     assert found["count"][0] == 3 and sorted(slots) == [0, 1, 2]
@@ -139,6 +139,6 @@ def test_forces_of_contacts_are_put_together_from_their_rows(contacts, theirs):
     theirs.frame.assign(np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4))
     theirs.dim.assign(np.int32([1, 3, 4, 0]))
     theirs.efc_address.assign(np.int32([[1, -1, -1, -1], [-1] * 4, [2, 3, 4, 5], [0] * 4]))
-    ask_forces(theirs, contacts)
+    forces_from_solver(theirs, contacts)
     np.testing.assert_array_equal(contacts.force.numpy()[0], [[5, 3, 4], [7, 7, 7]])
     np.testing.assert_array_equal(contacts.force.numpy()[1], [[0, 12, 0], [0, 0, 0]])

@@ -10,7 +10,7 @@ import warp as wp
 
 from kernels.contact import make_contacts
 from kernels.ground import FIRM, make_ground
-from sim.solver import Dynamics, TheirDynamics, dynamics_of
+from sim.solver import Dynamics, StockDynamics, make_dynamics
 from tests.sim.scenes import put, standing
 
 Mujoco: Any = mujoco  # it names its types at run time
@@ -94,7 +94,7 @@ def build(xml, device, **parts):
 def ours_of(m, d, contacts):
     """Our dynamics of it, or theirs by our road, and whether it is the former."""
     m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
-    found = dynamics_of(
+    found = make_dynamics(
         m, d, contacts, wp.zeros(WORLDS, dtype=int, device=d.qpos.device), 1 + np.arange(m.ngeom - 1), 0
     )
     m.opt.run_collision_detection = True
@@ -219,7 +219,7 @@ def test_robots_that_fall(eight, monkeypatch):
     m, d = eight.solver.mjw_model, eight.solver.mjw_data
     ours = eight._dynamics
     assert isinstance(ours, Dynamics)
-    theirs = TheirDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
+    theirs = StockDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
     states, iterations = set(), []
     q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
     put(eight, q, rng.normal(0.0, 0.7, eight.joint_qd.shape))
@@ -370,4 +370,4 @@ def test_too_many_contacts_are_noted(device, solver):
 )
 def test_other_models_take_their_step(device, parts):
     assert isinstance(ours_of(*build(MODEL, device)), Dynamics)
-    assert isinstance(ours_of(*build(MODEL, device, **parts)), TheirDynamics)
+    assert isinstance(ours_of(*build(MODEL, device, **parts)), StockDynamics)

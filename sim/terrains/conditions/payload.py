@@ -34,7 +34,7 @@ def _begin_payload(robots: VariedRobots, row: wp.array[float], first: int, terra
         frame = wp.quat(turned[3], turned[0], turned[1], turned[2])
         moments = principal
     robots.body_mass[env, BASE] = mass + added
-    robots.subtree_mass[env, BASE] = robots.total_mass[env] + added
+    robots.body_subtreemass[env, BASE] = robots.total_mass[env] + added
     robots.body_ipos[env, BASE] = robots.base_centre[env] + moved
     robots.body_iquat[env, BASE] = frame
     robots.body_inertia[env, BASE] = moments
