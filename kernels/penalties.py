@@ -1,13 +1,16 @@
 """The raw penalties of one physics step (the paper's section III-B), on the device.
 
-A penalty is one ``@_penalty`` function here, under whose name robots choose it. Its NumPy counterpart, by which MuJoCo
-C is compared, stands in :func:`sim.mujoco_c.model.step_penalties`; its label and colour in :mod:`qd.show.figures`.
+A penalty is one Warp function with its record, ``@penalty``. Robots choose it by its name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from kernels.state import base_ang_vel_b, base_lin_vel_b
 
@@ -53,7 +56,7 @@ def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], en
 
 @wp.struct
 class PenaltyStep:
-    """What a physics step ended in; one row an environment. Shapes are those of :func:`add_penalties`."""
+    """The end of a physics step; one row an environment. :mod:`kernels` has the arrays."""
 
     joint_q: wp.array2d[float]
     joint_qd: wp.array2d[float]
@@ -62,15 +65,75 @@ class PenaltyStep:
     geom_force: wp.array2d[wp.vec3]
     geom_role: wp.array[int]
     force_limit: float
+    """Foot contact force beyond which it is penalised [N]."""
 
 
-_FUNCTIONS: dict[str, Any] = {}
+@dataclass(frozen=True, kw_only=True)
+class PlainStep:
+    """The same for N robots in float64 NumPy, in the terms of the penalties."""
+
+    velocity: NDArray[np.float64]
+    """Of the base link's origin, base frame [m/s], shape (N, 3)."""
+    ang_vel: NDArray[np.float64]
+    """Of the base, base frame [rad/s], shape (N, 3)."""
+    command: NDArray[np.float64]
+    """Shape (N, 3)."""
+    forces: NDArray[np.float64]
+    """Contact force on each geom, world frame [N], shape (N, num_geoms, 3)."""
+    feet: NDArray[np.bool_]
+    """Which geoms are feet, shape (num_geoms,); the others are base and limbs."""
+    force_limit: float
 
 
-def _penalty(function: Callable[..., Any]) -> Any:
-    """Make a Warp function of a penalty, and its name a column of the sums."""
-    _FUNCTIONS[function.__name__] = wp.func(function)
-    return _FUNCTIONS[function.__name__]
+@dataclass(frozen=True, kw_only=True)
+class Penalty:
+    """What a robot may be penalised for in each physics step."""
+
+    name: str
+    """In robots' settings, archives and tables."""
+    function: Any
+    """Warp function of a :class:`PenaltyStep` and an environment: the penalty before it is multiplied by the step."""
+    plain: Callable[[PlainStep], NDArray[Any]]
+    """The same in NumPy, shape (N,), by which crossings in MuJoCo C are penalised and the Warp function is tested."""
+    label: str
+    """On one line."""
+    unit: str
+    """Of the sum over a crossing."""
+    color: str
+    """In figures; one of Okabe and Ito's."""
+    needs_limbs: bool = False
+    """Only for robots with limb geoms."""
+    default: bool = True
+    """Whether a user's robot has it if its settings name no penalties."""
+
+
+PENALTIES: dict[str, Penalty] = {}
+"""Columns of the penalty sums, by name."""
+
+
+def penalty(name: str, **details: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Register a Warp function as a :class:`Penalty`, before robots are simulated; ``details`` are its fields."""
+
+    def register(function: Callable[..., Any]) -> Any:
+        PENALTIES[name] = Penalty(name=name, function=wp.func(function), **details)
+        return PENALTIES[name].function
+
+    return register
+
+
+def penalty_columns(names: Iterable[str]) -> list[int]:
+    """Columns of the penalties in the penalty sums."""
+    columns = list(PENALTIES)
+    return [columns.index(name) for name in names]
+
+
+def _norms(vectors: NDArray[Any]) -> NDArray[Any]:
+    return np.linalg.norm(vectors, axis=-1)
+
+
+def _plain_stumble(step: PlainStep) -> NDArray[Any]:
+    feet = step.forces[:, step.feet]
+    return (_norms(feet[..., :2]) > 5.0 * np.abs(feet[..., 2])).any(axis=1)
 
 
 @wp.func
@@ -80,39 +143,70 @@ def _squared_velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
     return error * error
 
 
-@_penalty
-def yaw_rate(step: PenaltyStep, env: int) -> float:
+@penalty(
+    "yaw_rate",
+    plain=lambda step: (step.ang_vel[:, 2] - step.command[:, 2]) ** 2,
+    label="yaw-rate error",
+    unit="(rad/s)^2 s",
+    color="#cc79a7",
+)
+def _yaw_rate(step: PenaltyStep, env: int) -> float:
     """Squared error of the yaw rate [(rad/s)^2], base frame."""
     error = base_ang_vel_b(step.joint_q, step.joint_qd, env)[2] - step.command[env, 2]
     return error * error
 
 
-@_penalty
-def vel_x(step: PenaltyStep, env: int) -> float:
+@penalty(
+    "vel_x",
+    plain=lambda step: (step.velocity[:, 0] - step.command[:, 0]) ** 2,
+    label="forward-velocity error",
+    unit="(m/s)^2 s",
+    color="#0072b2",
+)
+def _vel_x(step: PenaltyStep, env: int) -> float:
     """Squared error of the forward velocity of the base link [(m/s)^2], base frame."""
     return _squared_velocity_error(step, env, 0)
 
 
-@_penalty
-def vel_y(step: PenaltyStep, env: int) -> float:
+@penalty(
+    "vel_y",
+    plain=lambda step: (step.velocity[:, 1] - step.command[:, 1]) ** 2,
+    label="sideways-velocity error",
+    unit="(m/s)^2 s",
+    color="#56b4e9",
+)
+def _vel_y(step: PenaltyStep, env: int) -> float:
     """Squared error of the sideways velocity of the base link [(m/s)^2], base frame."""
     return _squared_velocity_error(step, env, 1)
 
 
-@_penalty
-def contact_force(step: PenaltyStep, env: int) -> float:
-    """Sum over the feet of the contact force beyond what costs nothing [N]."""
+@penalty(
+    "contact_force",
+    plain=lambda step: np.maximum(0.0, _norms(step.forces[:, step.feet]) - step.force_limit).sum(axis=1),
+    label="high contact force",
+    unit="N s",
+    color="#000000",
+)
+def _contact_force(step: PenaltyStep, env: int) -> float:
+    """Sum over the feet of the contact force beyond the limit [N]."""
     return excess_contact_force(step.geom_force, step.geom_role, step.force_limit, env)
 
 
-@_penalty
-def stumble(step: PenaltyStep, env: int) -> float:
+@penalty("stumble", plain=_plain_stumble, label="stumble", unit="s", color="#e69f00")
+def _stumble(step: PenaltyStep, env: int) -> float:
     """1 if any foot hits a vertical surface, else 0."""
     return is_stumbling(step.geom_force, step.geom_role, env)
 
 
-@_penalty
-def collision(step: PenaltyStep, env: int) -> float:
+@penalty(
+    "collision",
+    plain=lambda step: (_norms(step.forces[:, ~step.feet]) > 0.1).sum(axis=1),
+    label="collisions of base and legs",
+    unit="s",
+    color="#d55e00",
+    needs_limbs=True,
+)
+def _collision(step: PenaltyStep, env: int) -> float:
     """Number of base and limb geoms touched with more than 0.1 N."""
     count = float(0.0)
     for g in range(step.geom_role.shape[0]):
@@ -122,37 +216,32 @@ def collision(step: PenaltyStep, env: int) -> float:
     return count
 
 
-PENALTIES = tuple(_FUNCTIONS)
-"""Columns of the penalty sums."""
-_IN_ORDER = tuple(_FUNCTIONS.values())
-_NUM_PENALTIES = wp.constant(len(PENALTIES))
-wp.set_module_options({"max_unroll": max(16, len(PENALTIES))})  # the loop calls another function each time
+@cache
+def _kernel(functions: tuple[Any, ...]) -> Any:
+    count = len(functions)
+    options = {"max_unroll": max(16, count)}  # the loop calls another function each time
+
+    @wp.kernel(module="unique", module_options=options)
+    def add_penalties_kernel(step: PenaltyStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
+        """Grid (num_envs,)."""
+        env = wp.tid()
+        if counted[env] != 0:
+            for k in range(wp.static(count)):
+                sums_out[env, k] += dt * wp.static(functions[k])(step, env)
+
+    return add_penalties_kernel
 
 
-@wp.kernel
-def _add_penalties_kernel(step: PenaltyStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
-    """Grid (num_envs,)."""
-    env = wp.tid()
-    if counted[env] != 0:
-        for k in range(_NUM_PENALTIES):
-            sums_out[env, k] += dt * wp.static(_IN_ORDER[k])(step, env)
+def add_penalties(step: PenaltyStep, dt: float, counted: Any, sums_out: Any) -> None:
+    """Add one physics step's raw penalties times ``dt`` [s] to the sums, columns :data:`PENALTIES`.
 
-
-def add_penalties(
-    joint_q: Any, joint_qd: Any, base_com: wp.vec3, command: Any, geom_force: Any, geom_role: Any,
-    force_limit: float, dt: float, counted: Any, sums_out: Any,
-) -> None:  # fmt: skip
-    """Add one physics step's raw penalties times ``dt`` to the sums, columns :data:`PENALTIES`.
-
-    Where the int ``counted`` (num_envs,) is 0, nothing is added. Foot forces up to ``force_limit`` [N] cost nothing.
+    Where the int ``counted`` (num_envs,) is 0, nothing is added.
     """
-    if tuple(sums_out.shape) != (counted.shape[0], len(PENALTIES)):
+    expected = (counted.shape[0], len(PENALTIES))
+    if tuple(sums_out.shape) != expected:
         raise ValueError(
-            f"sums_out must have shape ({counted.shape[0]}, {len(PENALTIES)}), got {tuple(sums_out.shape)}: "
-            f"one column for each of {', '.join(PENALTIES)}"
+            f"sums_out must have shape {expected}, one column for each of {', '.join(PENALTIES)}, "
+            f"got {tuple(sums_out.shape)}"
         )
-    step = PenaltyStep()
-    step.joint_q, step.joint_qd, step.base_com, step.command = joint_q, joint_qd, base_com, command
-    step.geom_force, step.geom_role, step.force_limit = geom_force, geom_role, force_limit
-    inputs = [step, dt, counted]
-    wp.launch(_add_penalties_kernel, counted.shape[0], inputs, outputs=[sums_out], device=sums_out.device)
+    kernel = _kernel(tuple(entry.function for entry in PENALTIES.values()))
+    wp.launch(kernel, counted.shape[0], inputs=[step, dt, counted], outputs=[sums_out], device=sums_out.device)

@@ -29,23 +29,24 @@ class Reward:
         ``command``, of shape (num_envs, 3), is what the step's clipped ``action``, (num_envs, num_joints), answers.
         """
         robot = sim.robot
-        motion = self.motion = Motion()
-        for name in ("joint_q", "joint_qd", "joint_torque", "geom_force", "geom_role"):
-            setattr(motion, name, getattr(sim, name))
-        motion.command, motion.action = command, action
-        motion.base_com = sim.sensors.base_com
-        motion.default_joint_pos = sim.sensors.default_joint_pos
-        motion.force_limit = robot.contact_force_limit
-        motion.dt = robot.control_dt
-        motion.min_air_time_s = cfg.min_air_time_s
         limits = (sim.model.joint_limit_lower, sim.model.joint_limit_upper)
         lower, upper = (np.asarray(limit.numpy(), dtype=np.float64)[6 : 6 + robot.num_joints] for limit in limits)
-        # Soft limits span a share of each joint's range about its middle; where there is none, they are far away.
-        middle, half = 0.5 * (lower + upper), 0.5 * cfg.soft_joint_limit * (upper - lower)
-        motion.joint_lower = wp.array(middle - half, dtype=float, device=sim.device)
-        motion.joint_upper = wp.array(middle + half, dtype=float, device=sim.device)
+        # Soft limits span a share of each joint's range about its middle; a joint without limits has them far away.
+        middle = 0.5 * (lower + upper)
+        half = 0.5 * cfg.soft_joint_limit * (upper - lower)
         steady = [int(name in cfg.steady_joints) for name in robot.joint_names]
-        motion.joint_is_steady = wp.array(steady, dtype=int, device=sim.device)
+        self.motion = sim.fill(
+            Motion,
+            command=command,
+            action=action,
+            default_joint_pos=sim.sensors.default_joint_pos,
+            force_limit=robot.contact_force_limit,
+            dt=robot.control_dt,
+            min_air_time_s=cfg.min_air_time_s,
+            joint_lower=wp.array(middle - half, dtype=float, device=sim.device),
+            joint_upper=wp.array(middle + half, dtype=float, device=sim.device),
+            joint_is_steady=wp.array(steady, dtype=int, device=sim.device),
+        )
         self._weights = make_weights(asdict(cfg.rewards), only_positive=cfg.only_positive, falls=falls)
         self.state = make_rewards(sim.num_envs, robot.num_joints, len(robot.geom_names), sim.device)
 

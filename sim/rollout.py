@@ -13,7 +13,7 @@ import warp as wp
 
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
-from kernels.penalties import PENALTIES, add_penalties
+from kernels.penalties import PENALTIES, PenaltyStep, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
@@ -113,7 +113,7 @@ class Rollout:
 
     Attributes:
         sim: The robots' simulation.
-        penalty_sums: Columns :data:`kernels.penalties.PENALTIES`, times the physics step, shape (num_envs, 6).
+        penalty_sums: Columns :data:`kernels.penalties.PENALTIES`, times the physics step, (num_envs, num_penalties).
         command: Command of the coming control step, zero once an episode has ended, shape (num_envs, 3).
         episode: The episode that a robot runs: replica ``episode % num_replicas`` of terrain slot
             ``episode // num_replicas``, -1 for none; shape (num_envs,).
@@ -194,6 +194,7 @@ class Rollout:
         self._last_action = wp.zeros_like(self._action)
         self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
         self._counter = wp.zeros(1, dtype=int)
+        self._penalty_step = sim.fill(PenaltyStep, command=self.command, force_limit=robot.contact_force_limit)
         self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._queue = make_queue(
             num_envs, self.num_terrains, self.num_replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
@@ -228,10 +229,7 @@ class Rollout:
                     sim.joint_q, sim.joint_qd, self._last_action, sim.geom_force, sim.geom_role, sim.overflow,
                     task, episode,
                 )  # fmt: skip
-            add_penalties(
-                sim.joint_q, sim.joint_qd, sim.sensors.base_com, self.command, sim.geom_force, sim.geom_role,
-                robot.contact_force_limit, robot.physics_dt, self._episode.counted, self.penalty_sums,
-            )  # fmt: skip
+            add_penalties(self._penalty_step, robot.physics_dt, self._episode.counted, self.penalty_sums)
         if self._reward is not None:
             self._reward.pay(self._stepped.outcome)
 
@@ -399,7 +397,7 @@ class Rollout:
             return values.reshape(-1, self.num_replicas, *values.shape[1:])
 
         outcome, steps, pose = of(queue.outcome).astype(np.uint8), of(queue.steps), of(queue.final_pose)
-        penalties = of(queue.penalty_sums).astype(np.float64)[..., [PENALTIES.index(name) for name in robot.penalties]]
+        penalties = of(queue.penalty_sums).astype(np.float64)[..., penalty_columns(robot.penalties)]
         penalties[outcome == Outcome.INVALID] = np.nan
         reward = None
         if self._reward is not None:

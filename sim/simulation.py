@@ -51,6 +51,7 @@ class Simulation:
             transforms of shape (num_envs, bodies_per_env).
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
         geom_of_shape: The solver's number of each.
+        base_com: Mass centre of the base in its frame [m].
         disturbed: What the conditions of running episodes need; None of a bank without conditions.
         motors: Effort limit [N m], stall torque [N m] and speed limit [rad/s] of each actuator, vectors of shape
             (num_actuators,); None without DC motors.
@@ -186,7 +187,7 @@ class Simulation:
         scan_x, scan_y = self.robot.scan_points()
         self.sensors.scan_x = wp.array(scan_x, dtype=float)
         self.sensors.scan_y = wp.array(scan_y, dtype=float)
-        self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
+        self.base_com = self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
         self._coordinates = self._build_coordinates()
         self._build_drives()
 
@@ -245,8 +246,16 @@ class Simulation:
         coordinates.target_of_actuator = wp.array(followed, dtype=int)
         bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
         coordinates.column_of_body = wp.array(bodies[-self.body_q.shape[1] :], dtype=int)
-        coordinates.base_com = self.sensors.base_com
+        coordinates.base_com = self.base_com
         return coordinates
+
+    def fill(self, struct: Any, **values: Any) -> Any:
+        """A kernel argument with this simulation's arrays under its names, and ``values``."""
+        filled = struct()
+        for name in struct.vars:
+            if name in values or hasattr(self, name):
+                setattr(filled, name, values.get(name, getattr(self, name, None)))
+        return filled
 
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""

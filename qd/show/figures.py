@@ -1,9 +1,10 @@
 """What a search leaves to look at: its curves, its archive, and minimal terrains."""
 
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -11,6 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from kernels.penalties import PENALTIES
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.archive import Archive
 from sim.crossing import CrossingCfg
@@ -27,37 +29,6 @@ _SUN = (-0.45, 0.35)  # where the light of a relief comes from: how much slopes 
 _MARK_M = 0.3  # half side of the marks of start and goal
 _START, _GOAL = (240, 200, 60), (0, 158, 115)
 _SHOWN, _COLUMNS = 12, 3  # minimal terrains that are shown, and how many side by side
-
-
-class PenaltyLook(NamedTuple):
-    """How a penalty is written and drawn."""
-
-    label: str
-    """Of an axis, broken into lines."""
-    unit: str = ""
-    """Of its raw sum."""
-    color: str = "#999999"
-    """One of Okabe and Ito's."""
-
-
-_PENALTY_LOOKS = {
-    "yaw_rate": PenaltyLook("yaw-rate error", "(rad/s)^2 s", "#cc79a7"),
-    "vel_x": PenaltyLook("forward-\nvelocity error", "(m/s)^2 s", "#0072b2"),
-    "vel_y": PenaltyLook("sideways-\nvelocity error", "(m/s)^2 s", "#56b4e9"),
-    "contact_force": PenaltyLook("high contact\nforce", "N s", "#000000"),
-    "stumble": PenaltyLook("stumble", "s", "#e69f00"),
-    "collision": PenaltyLook("collisions of\nbase and legs", "s", "#d55e00"),
-}
-
-
-def get_penalty_look(penalty: str) -> PenaltyLook:
-    """How a penalty is shown; one that the figures do not know by its name, in grey."""
-    return _PENALTY_LOOKS.get(penalty, PenaltyLook(penalty))
-
-
-def get_penalty_label(penalty: str) -> str:
-    """A penalty in words, on one line; a word broken at a hyphen stays one."""
-    return get_penalty_look(penalty).label.replace("-\n", "-").replace("\n", " ")
 
 
 def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
@@ -138,7 +109,7 @@ def draw_archive(archive: Archive) -> Figure:
     axes.add_collection(lines)
     for place in places:
         axes.axvline(float(place), color="0.25", linewidth=1.0)
-    axes.set_xticks(places, [get_penalty_look(name).label for name in archive.penalties])
+    axes.set_xticks(places, [textwrap.fill(PENALTIES[name].label, 14) for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
     axes.set_xlim(-0.15, count - 0.85)
     axes.set_ylim(-0.02, 1.02)

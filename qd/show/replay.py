@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from kernels.episode import Outcome
+from kernels.penalties import PENALTIES
 from qd.faults.numbers import describe_elite
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, folder_for
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
-from qd.show.figures import get_penalty_label, get_penalty_look
 from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
 from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
 from sim.controllers.spec import ControllerSpec, crosser_name
@@ -199,7 +199,7 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
         "outcomes": outcomes,
         "duration_s": float(recording.duration_s[0, valid].mean()),
         "penalties": {
-            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": get_penalty_look(name).unit}
+            name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTIES[name].unit}
             for name, column in zip(recording.penalty_names, sums.T, strict=True)
         },
     }
@@ -217,7 +217,7 @@ def describe(source: ReplaySource, k: int, recording: Recording) -> str:
         number = source.terrains[k].number
         columns[:0] = [(f"{whole}{label}", values, number) for label, values in stored.items() if values is not None]
     reasons = invalid_reasons(recording.result())
-    units = [f"{get_penalty_label(name)} [{get_penalty_look(name).unit}]" for name in source.fitness.penalties]
+    units = [f"{PENALTIES[name].label} [{PENALTIES[name].unit}]" for name in source.fitness.penalties]
     lines = _TEMPLATES.get_template("replay.txt").render(
         units=", ".join(units),
         invalid=sum(reasons.values()),
@@ -242,7 +242,7 @@ def _format_numbers(columns: Sequence[tuple[str, Evaluation, int]], fitness: Fit
             texts.append(format_rate(hits, count, short=True).replace("% to ", "-").replace(" to ", "-"))
         rows[label] = texts
     for p, (name, scale) in enumerate(zip(fitness.penalties, fitness.scales, strict=True)):
-        rows[get_penalty_label(name)] = [
+        rows[PENALTIES[name].label] = [
             f"{_format_spread(scale * values.penalty_mean[n, p], scale * values.penalty_std[n, p])}, "
             f"{values.ratios[n, p]:.0%}"
             for _, values, n in columns

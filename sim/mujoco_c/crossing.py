@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
-from kernels.penalties import PENALTIES
+from kernels.penalties import PENALTIES, penalty_columns
 from kernels.queue import make_queue, make_ready, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards
@@ -213,7 +213,7 @@ def cross(
     sums[outcome == Outcome.INVALID] = np.nan
     upright = 1.0 - 2.0 * (episodes.qpos[:, 4] ** 2 + episodes.qpos[:, 5] ** 2)
     return RolloutResult(
-        penalties=sums[None][..., [PENALTIES.index(name) for name in robot.penalties]],
+        penalties=sums[None][..., penalty_columns(robot.penalties)],
         penalty_names=robot.penalties,
         outcome=outcome[None].astype(np.uint8),
         invalidity=np.where(outcome[None] == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),

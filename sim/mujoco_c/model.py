@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.ground import FIRM
-from kernels.penalties import PENALTIES
+from kernels.penalties import PENALTIES, PlainStep
 from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, rotation_matrix
@@ -288,22 +288,17 @@ def observations(
 def step_penalties(
     qpos: Array, qvel: Array, command: Array, forces: Array, *, feet: NDArray[np.bool_], force_limit: float
 ) -> Array:
-    """Raw penalties of one physics step, before times dt, in the order of :data:`PENALTIES`; shape (num, 6).
+    """Raw penalties of one physics step, before times dt, shape (num, num_penalties), columns :data:`PENALTIES`.
 
-    An added penalty that has no formula here is NaN: how episodes end can be compared without it. States and commands
-    are those of :func:`observations`; contact forces on each geom with a role, world frame [N], have shape (num,
-    num_geoms, 3); ``feet``, shape (num_geoms,), are those whose force up to the limit [N] costs nothing.
+    States and commands are those of :func:`observations`; contact forces on each geom with a role, world frame [N],
+    have shape (num, num_geoms, 3). ``feet``, shape (num_geoms,), may be touched; up to the limit [N] it costs nothing.
     """
-    velocity = _base_velocity(qpos, qvel)
-    size = np.linalg.norm(forces, axis=2)
-    sideways = np.linalg.norm(forces[:, :, :2], axis=2)
-    by_name = {
-        "yaw_rate": (qvel[:, 5] - command[:, 2]) ** 2,
-        "vel_x": (velocity[:, 0] - command[:, 0]) ** 2,
-        "vel_y": (velocity[:, 1] - command[:, 1]) ** 2,
-        "contact_force": np.maximum(0.0, size[:, feet] - force_limit).sum(axis=1),
-        "stumble": (sideways[:, feet] > 5.0 * np.abs(forces[:, feet, 2])).any(axis=1).astype(float),
-        "collision": (size[:, ~feet] > 0.1).sum(axis=1).astype(float),
-    }
-    unknown = np.full(len(qpos), np.nan)
-    return np.stack([by_name.get(name, unknown) for name in PENALTIES], axis=1)
+    step = PlainStep(
+        velocity=_base_velocity(qpos, qvel),
+        ang_vel=qvel[:, 3:6],
+        command=command,
+        forces=forces,
+        feet=feet,
+        force_limit=force_limit,
+    )
+    return np.stack([penalty.plain(step).astype(float) for penalty in PENALTIES.values()], axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from kernels.penalties import COLLISION_FORCE, PENALTIES
+from kernels.penalties import COLLISION_FORCE, penalty_columns
 from sim.controllers.spec import controller_identity
 from sim.files.provenance import provenance
 from sim.rollout import Rollout, RolloutResult
@@ -132,7 +132,7 @@ class _Frames:
         self._shape = (num_terrains, rollout.num_replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
         self._num_base = len(robot.base_geoms)  # the first ones
-        self._columns = [PENALTIES.index(name) for name in robot.penalties]
+        self._columns = penalty_columns(robot.penalties)
         self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
         self._ended = np.zeros(len(self._num_frames), dtype=bool)
         self._frames: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []

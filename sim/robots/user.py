@@ -138,7 +138,8 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     found.setdefault("foot_geoms", [name for name in free if body[name] in last and bottoms[name] <= low])
     limbs = [name for name in free if name not in {*found["base_geoms"], *found["foot_geoms"]}]
     found.setdefault("limb_geoms", limbs)
-    found.setdefault("penalties", [name for name in PENALTIES if name != "collision" or found["limb_geoms"]])
+    usual = [penalty for penalty in PENALTIES.values() if penalty.default]
+    found.setdefault("penalties", [p.name for p in usual if found["limb_geoms"] or not p.needs_limbs])
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
     found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))

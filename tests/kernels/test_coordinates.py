@@ -9,10 +9,10 @@ from kernels.coordinates import (
     Delay,
     SolverContacts,
     SolverState,
-    forces_from_solver,
-    poses_from_solver,
-    from_solver,
     contacts_to_solver,
+    forces_from_solver,
+    from_solver,
+    poses_from_solver,
     to_solver,
 )
 from kernels.ground import FIRM

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.penalties import BASE, FOOT, LIMB, add_penalties
+from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, PenaltyStep, add_penalties, penalty_columns
 from sim.mujoco_c.model import step_penalties, to_mujoco
-from tests.kernels.states import random_states, upright
+from tests.kernels.states import filled, random_states, upright
 
 ROLES = [BASE, LIMB, LIMB, FOOT, FOOT]
 BASE_COM = (0.05, -0.02, 0.1)
@@ -17,11 +17,13 @@ DT = 0.005
 def sums_after(states, command, forces, *, counted=None, sums=None):
     """Penalty sums after adding a physics step."""
     num_envs = len(command)
-    out = wp.array(np.zeros((num_envs, 6), np.float32) if sums is None else sums)
-    arrays = [wp.array(np.float32(array)) for array in (*states, command)]
-    on_geoms, roles = wp.array(np.float32(forces), dtype=wp.vec3), wp.array(ROLES, dtype=int)
+    step = filled(
+        PenaltyStep, joint_q=states[0], joint_qd=states[1], base_com=BASE_COM, command=np.float32(command),
+        geom_force=np.float32(forces), geom_role=ROLES, force_limit=LIMIT,
+    )  # fmt: skip
+    out = wp.array(np.zeros((num_envs, len(PENALTIES)), np.float32) if sums is None else sums)
     counted = wp.array(np.ones(num_envs, int) if counted is None else counted, dtype=int)
-    add_penalties(*arrays[:2], wp.vec3(*BASE_COM), arrays[2], on_geoms, roles, LIMIT, DT, counted, out)
+    add_penalties(step, DT, counted, out)
     return out.numpy()
 
 
@@ -62,15 +64,17 @@ def test_contact_penalties_by_hand(forces, contact_force, stumble, collision):
     for geom, force in forces.items():
         on_geoms[0, geom] = force
     sums = sums_after(upright(1, 3), [[0, 0, 0]], on_geoms)
-    np.testing.assert_allclose(sums[0, 3:], [contact_force, stumble, collision], atol=1e-6)
+    columns = penalty_columns(["contact_force", "stumble", "collision"])
+    np.testing.assert_allclose(sums[0, columns], [contact_force, stumble, collision], atol=1e-6)
 
 
 def test_steps_that_do_not_count_add_nothing():
     states, forces = random_states(4, 3), random_forces(4, 5)
-    before = np.random.default_rng(0).random((4, 6)).astype(np.float32)
+    before = np.random.default_rng(0).random((4, len(PENALTIES))).astype(np.float32)
     after = sums_after(states, np.zeros((4, 3)), forces, counted=[0, 1, 0, 1], sums=before)
     np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
-    assert (after[[1, 3], :3] > before[[1, 3], :3]).all()
+    velocities = penalty_columns(["yaw_rate", "vel_x", "vel_y"])
+    assert (after[[1, 3]] > before[[1, 3]])[:, velocities].all()
 
 
 def test_wrong_number_of_columns_is_named():

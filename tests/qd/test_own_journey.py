@@ -41,14 +41,14 @@ SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "2", "--replicas"
 def project(tmp_path):
     """The project with the penalty of docs/robots.md in its kernels, and a folder of the user's; its name."""
     page = (ROOT / "docs" / "robots.md").read_text()
-    function, name = re.findall(r"```python\n(@_penalty\ndef (\w+)\(.*?)```", page, re.DOTALL)[0]
+    function, name = re.findall(r"```python\n(@penalty\(\s+\"(\w+)\".*?)```", page, re.DOTALL)[0]
     (tmp_path / "kernels").mkdir()
     for source in (ROOT / "kernels").glob("*.*"):
         (tmp_path / "kernels" / source.name).write_text(source.read_text())
     for source in ("sim", "qd", "train", "faultline.py"):
         (tmp_path / source).symlink_to(ROOT / source)
     penalties = tmp_path / "kernels" / "penalties.py"
-    penalties.write_text(penalties.read_text().replace("\nPENALTIES = ", f"\n{function}\n\nPENALTIES = "))
+    penalties.write_text(penalties.read_text().replace("\n@cache\n", f"\n{function}\n\n@cache\n"))
     dog = write_dog(tmp_path / "mine")
     dog.write_text(dog.read_text().replace('"vel_y", "collision"', f'"vel_y", "{name}"'))
     write_ridges(tmp_path / "mine")

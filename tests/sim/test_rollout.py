@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from kernels.episode import Invalidity, Outcome
-from kernels.penalties import PENALTIES
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -29,7 +28,7 @@ def test_a_robot_that_stands_times_out(anymal, device):
     np.testing.assert_allclose(result.final_position[..., :2], [[[2, 4]] * 4], atol=0.25)
     # Standing still against a command of 0.75 m/s for 0.6 s costs 0.75^2 x 0.6 = 0.34 (m/s)^2 s in vel_x, a bit more or
     # less since it starts with up to 0.2 m/s.
-    np.testing.assert_allclose(result.penalties[0, :, PENALTIES.index("vel_x")], 0.34, atol=0.1)
+    np.testing.assert_allclose(result.penalties[0, :, result.penalty_names.index("vel_x")], 0.34, atol=0.1)
 
 
 def test_the_shipped_controller_walks_to_the_edge_of_the_goal(robot, device):

@@ -15,9 +15,9 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from viser import uplot
 
+from kernels.penalties import PENALTIES
 from qd.faults.families import ORDERS, summarise
 from qd.show.crossed import ENDINGS
-from qd.show.figures import get_penalty_label, get_penalty_look
 from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
@@ -150,7 +150,7 @@ class CrossingPanel:
         self.rates = gui.add_html("")
         names = tab.shared.show.opened_run.archive.penalties
         series = [
-            uplot.Series(label=get_penalty_label(name), stroke=get_penalty_look(name).color, width=2.0)
+            uplot.Series(label=PENALTIES[name].label, stroke=PENALTIES[name].color, width=2.0)
             for name in names
         ]
         with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):

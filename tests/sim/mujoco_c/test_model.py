@@ -8,11 +8,11 @@ import pytest
 import warp as wp
 
 from kernels.episode import Invalidity, Outcome
-from kernels.penalties import PENALTIES
+from kernels.penalties import penalty_columns
 from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
-from sim.mujoco_c.model import GROUND, crossing_model, step_penalties, to_mujoco
+from sim.mujoco_c.model import GROUND, crossing_model, to_mujoco
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
@@ -103,7 +103,7 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     assert (np.abs(plain.forces[:, :, 2]).sum(axis=1) > 50.0).all()  # and the ground has a part in it
     np.testing.assert_allclose(joint_q[:, :3], plain.qpos[:, :3], atol=metres)
     np.testing.assert_allclose(joint_q[:, 7:], plain.qpos[:, 7:], atol=radians)
-    sums = rollout.penalty_sums.numpy()[:, [PENALTIES.index(name) for name in robot.penalties]]
+    sums = rollout.penalty_sums.numpy()[:, penalty_columns(robot.penalties)]
     np.testing.assert_allclose(sums, result.penalties[0], rtol=share, atol=1e-6)
     if changes is DRIVES:
         ideal, _ = cross_and_keep(shipped, policy, FLAT, starts, seconds)
@@ -200,11 +200,3 @@ def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
     expected = cross(robot, stand, FLAT, starts)
     np.testing.assert_array_equal(result.outcome, expected.outcome)
     np.testing.assert_array_equal(result.penalties, expected.penalties)
-
-
-def test_an_added_penalty_without_a_formula_is_nan(monkeypatch):
-    monkeypatch.setattr("sim.mujoco_c.model.PENALTIES", ("vel_y", "roll_rate"))
-    state = (np.zeros((2, 7)), np.zeros((2, 6)), np.array([[0.0, 0.5, 0.0]] * 2), np.zeros((2, 1, 3)))
-    state[0][:, 3] = 1.0
-    penalties = step_penalties(*state, feet=np.array([True]), force_limit=1.0)
-    np.testing.assert_array_equal(penalties, [[0.25, np.nan]] * 2)

@@ -11,7 +11,6 @@ import pytest
 from matplotlib.image import imsave
 
 from kernels.episode import Outcome
-from kernels.penalties import PENALTIES
 from sim.controllers.adapters import read_row
 from sim.crossing import resolved
 from sim.mujoco_c.crossing import cross, draw_starts
@@ -72,7 +71,7 @@ def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
         expected = str(file) if name == "spec" else getattr(written, name)
         assert getattr(dog, name) == expected, name
     assert {*dog.limb_geoms} == {*written.limb_geoms}
-    assert dog.penalties == PENALTIES and (dog.scan_x, dog.scan_y) == ((), ())
+    assert dog.penalties == get_robot("anymal").penalties and (dog.scan_x, dog.scan_y) == ((), ())
     assert dog.contact_force_limit == pytest.approx(MASS * 9.81, rel=5e-3)
     # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
     assert dog.default_base_height == pytest.approx(0.2911, abs=3e-3)
