@@ -188,7 +188,7 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
 
 
 def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):
-    monkeypatch.setattr("sim.solver.fits", lambda *_: False)
+    monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
     nobody = Robots(result_of, stop_after=0)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
         judged(path, nobody, stages=("fresh", "resolved", "others", "varied"))

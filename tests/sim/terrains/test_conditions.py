@@ -254,7 +254,7 @@ def test_times_are_rounded_alike_in_both():
 
 
 def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
-    monkeypatch.setattr("sim.solver.fits", lambda *_: False)
+    monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
         Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=1, device="cpu", space=SPACE)
 
