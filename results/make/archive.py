@@ -38,7 +38,7 @@ def make_archive(script: Script, name: str) -> Path:
     """Searches and judges; returns the run."""
     changes, seed = ({}, 0) if script.small else SEARCHES[name]
     run, cfg = script.runs / name, script.search_cfg(seed=script.seed + seed, **changes)
-    points = script.iterations_of(cfg, *(CURVE if name.startswith("archive") else CURVE[:3]))
+    points = script.count_iterations(cfg, *(CURVE if name.startswith("archive") else CURVE[:3]))
     follow_search(script, run, cfg, points, COUNTS)
     if not script.small and name.startswith("archive"):  # on a CPU a training takes hours
         judge_with_specialist(script, run)

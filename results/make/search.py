@@ -36,7 +36,7 @@ def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
     run, counts = script.runs / "search" / file_name(f"{method}, seed {seed}"), ("episodes", *COUNTS, *JUDGED)
     *rows, last = follow_search(
-        script, run, cfg, script.iterations_of(cfg, *STEPS), counts, ("fresh", "resolved", "others")
+        script, run, cfg, script.count_iterations(cfg, *STEPS), counts, ("fresh", "resolved", "others")
     )  # fmt: skip
     origin = script.read_so_far(run / CURVE_FILE)
     named = {"method": method, "search_seed": seed, **{key: origin[key] for key in ("commit", "device", "date")}}

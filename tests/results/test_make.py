@@ -3,22 +3,18 @@
 import importlib
 import json
 import re
-import subprocess
-import sys
-import threading
 import weakref
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.workers.evaluator import Compute
-from results.make import archive, bare, common, docs, rounds, search, search_noise, speed, tables, train_speed
+from results.make import bare, common, docs, search, speed, tables, train_speed
 from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
@@ -92,19 +88,6 @@ def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path,
     assert common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites")) == again
 
 
-def test_what_todays_sources_have_judged_in_all_stages_is_read(tmp_path, monkeypatch):
-    words = ["--small", "--device", "cpu", "--out", str(tmp_path / "anymal/rounds.json")]
-    script, judged = common.parse(None, words, "rounds.json"), []
-    monkeypatch.setattr(archive, "judge", lambda run, **_: judged.append(run) or SimpleNamespace(failing=np.zeros(1)))
-    stages = {name: {"sources_sha256": sources_sha256()} for name in ("fresh", "resolved", "others", "varied")}
-    of_others = {**stages, "fresh": {"sources_sha256": "of others"}}
-    without = {name: origin for name, origin in stages.items() if name != "varied"}
-    for by, passes in ((stages, 0), (of_others, 2), (without, 2), ({}, 2)):
-        judged.clear()
-        (tmp_path / "archive.json").write_text(json.dumps({"faults": 3, "judged_by": by}))
-        assert archive.judge_with_specialist(script, tmp_path)["faults"] == 3 and judged == [tmp_path] * passes
-
-
 def test_doses_are_the_bases_by_todays_sources(tmp_path):
     script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/spaces.json")], "spaces.json")
     file, origin = tmp_path / "anymal/dose.json", {**script.origin, "sources_sha256": sources_sha256()}
@@ -114,26 +97,6 @@ def test_doses_are_the_bases_by_todays_sources(tmp_path):
     file.write_text(json.dumps({**origin, "seed": 1, "dose": rows}))
     with pytest.raises(ValueError, match="must be of today's sources"):
         script.read_dose(conditions=True)
-
-
-def test_rounds_say_when_their_hardenings_were_made_and_when_the_file(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "results/anymal").mkdir(parents=True)
-    made = {"command": "harden", "commit": "first", "date": "then", "device": "a GPU", "rounds": [{"faults": 3}]}
-    monkeypatch.setattr(rounds, "harden_here", lambda script, name: made | {"seed": 5})
-    monkeypatch.setattr(rounds, "train_at_once", lambda script: Path("at_once.pt"))
-    monkeypatch.setattr(rounds, "last_policy", lambda script, name="hardening": Path("hardened.pt"))
-    monkeypatch.setattr(rounds, "search_again", lambda script, name, policy, seed: {"of": name, "seed": seed})
-    monkeypatch.setattr(rounds, "publish_controller", lambda script, policy, name: None)
-    crossed = {}
-    monkeypatch.setattr(rounds, "write_tables", lambda script, of: crossed.update({script.out.name: of}))
-    monkeypatch.setenv("FAULTLINE_COMMIT", "second")
-    report = rounds.main(["--device", "cpu"])
-    of_hardening = {"command": "harden", "commit": "first", "device": "a GPU", "date": "then"}
-    assert (report["commit"], report["seed"], report["rounds"]) == ("second", 0, [{"faults": 3}])
-    assert report["hardenings"] == {"hardening": of_hardening, "again": of_hardening}
-    assert [one["of"] for one in report["again_searches"]] == ["again"] * 3
-    assert crossed == {"tables_at_once.json": {"at_once": "at_once.pt", "hardened": "hardened.pt"}}
 
 
 def test_what_is_published_goes_with_its_archive(tmp_path):
@@ -158,29 +121,6 @@ def test_every_script_loads_and_is_listed():
     assert [name for name in scripts if f" {name} " not in text and f"make.{name}" not in text] == []
 
 
-def test_parts_run_side_by_side_on_all_gpus_each_once(tmp_path, monkeypatch):
-    ran, both = [], threading.Barrier(4, timeout=10)
-
-    def run(command, *, env, stdout, stderr, check):
-        both.wait()  # four at once, two on each GPU
-        ran.append((command[-1], env["CUDA_VISIBLE_DEVICES"]))
-        assert command[:3] == [sys.executable, "-m", "results.make.some"] and command[3:-1] == ["--seed=3", "--parts"]
-        stdout.write(b"done")
-        return SimpleNamespace(returncode=int(command[-1] == "c 3"))
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(common.wp, "get_cuda_devices", lambda: ["cuda:0", "cuda:1"])
-    monkeypatch.setattr(sys.modules["__main__"], "__spec__", SimpleNamespace(name="results.make.some"))
-    monkeypatch.setattr(subprocess, "run", run)
-    parts = [f"{letter} {number}" for letter in "abcd" for number in (1, 2)]
-    common.run_parts(["--seed=3"], parts, 2)
-    assert sorted(part for part, _ in ran) == sorted(parts)
-    assert [gpu for _, gpu in ran].count("0") == [gpu for _, gpu in ran].count("1") == 4
-    assert len(list((tmp_path / "runs/make/logs").glob("*.log"))) == 8
-    with pytest.raises(RuntimeError, match=r"^c 3 failed"):
-        common.run_parts(["--seed=3"], ["a 1", "c 3", "a 2", "b 1"], 2)
-
-
 def test_a_file_of_other_sources_or_of_a_trial_is_not_current(tmp_path):
     file, ours = tmp_path / "base.json", {"sources_sha256": sources_sha256()}
     assert not common.is_current(file)
@@ -189,102 +129,49 @@ def test_a_file_of_other_sources_or_of_a_trial_is_not_current(tmp_path):
         assert common.is_current(file) == (content == ours)
 
 
-class Speed:
-    """The script of speed.json with parts that count, on devices that need not be there."""
+def test_speeds_of_gpu_and_cpu_stand_beside_each_other_and_a_gpu_replaces_its_own(tmp_path, monkeypatch):
+    measured = []
+    for name in speed.ON_GPU:
+        monkeypatch.setitem(
+            speed.ON_GPU, name, lambda script, name=name: measured.append(name) or {name: len(measured)}
+        )
+    monkeypatch.setattr(speed, "time_cpu", lambda script: {"cpu": script.origin})
+    monkeypatch.setattr(common, "resolve_device", lambda name: name)
+    out = tmp_path / "speed.json"
 
-    def __init__(self, folder, monkeypatch):
-        self.out, self.calls, self.patch = folder / "new" / "speed.json", [], monkeypatch
-        for part in speed.PARTS:
-            monkeypatch.setitem(speed.PARTS, part, lambda script, part=part: self.measure(part, script))
+    def run(device, *flags):
+        assert speed.main(["--device", device, "--out", str(out), *flags]) == json.loads(out.read_text())
+        return json.loads(out.read_text())
 
-    def measure(self, part, script):
-        self.calls.append(part)
-        return {part: script.origin if part == "cpu" else len(self.calls)}
-
-    def run(self, device, *words):
-        """What it writes; device names are as a machine without them has them."""
-        self.patch.setattr(common, "resolve_device", lambda name: name)
-        report = speed.main(["--device", device, "--out", str(self.out), *words])
-        assert report == json.loads(self.out.read_text())
-        return report
-
-
-@pytest.fixture
-def speeds(tmp_path, monkeypatch):
-    return Speed(tmp_path, monkeypatch)
+    assert (run("cpu").get("curve"), list(run("cpu")["measured"])) == (None, ["cpu"])
+    report = run("cuda:0")
+    assert (report["device"], report["curve"], report["cpu"]["device"][:3]) == ("cuda:0", 1, "CPU")
+    assert [*report["measured"]] == ["cpu", *speed.ON_GPU] == ["cpu", *measured]
+    assert run("cpu")["device"] == "cuda:0" and run("cuda:1")["curve"] == 1 + len(speed.ON_GPU)
+    assert run("cuda:1", "--seed", "3")["cpu"] is None  # of another seed
 
 
-def test_a_part_of_speed_is_measured_once(speeds):
-    for words in (["cuda:0", "--parts", "curve"], ["cpu"], ["cuda:0", "--parts", "flat", "curve"], ["cpu"]):
-        report = speeds.run(*words)
-    assert speeds.calls == ["curve", "cpu", "flat"] == list(report["measured"])
-    assert report | {"curve": 1, "flat": 3, "wide": None, "device": "cuda:0"} == report
-    assert report["cpu"]["device"].startswith("CPU")
-
-
-def test_speeds_of_two_gpus_or_seeds_or_of_a_trial_are_not_mixed(speeds):
-    speeds.run("cpu")
-    assert list(speeds.run("cuda:0", "--parts", "curve", "flat")["measured"]) == ["cpu", "curve", "flat"]
-    report = speeds.run("cuda:1", "--parts", "flat")
-    assert list(report["measured"]) == ["cpu", "flat"] and "curve" not in report and report["device"] == "cuda:1"
-    assert list(speeds.run("cuda:1", "--parts", "curve", "--seed", "3")["measured"]) == ["curve"]
-    assert list(speeds.run("cuda:1", "--parts", "wide", "--seed", "3", "--small")["measured"]) == ["wide"]
-    assert list(speeds.run("cuda:1", "--parts", "flat", "--seed", "3")["measured"]) == ["flat"]
-
-
-def test_a_part_that_fails_leaves_the_others(speeds, monkeypatch):
-    before = speeds.run("cuda:0", "--parts", "curve")
-
-    def fail(script):
-        raise KeyboardInterrupt
-
-    monkeypatch.setitem(speed.PARTS, "flat", fail)
-    with pytest.raises(KeyboardInterrupt):
-        speeds.run("cuda:0", "--parts", "flat", "curve")
-    assert json.loads(speeds.out.read_text()) == before
-    speeds.out.write_text("{")  # a broken file is made again
-    assert list(speeds.run("cuda:0", "--parts", "curve")["measured"]) == ["curve"]
-
-
-@pytest.mark.parametrize("words", [["cuda:0", "--parts", "cpu"], ["cpu", "--parts", "curve"]])
-def test_a_part_is_measured_on_its_own_kind_of_device(speeds, words):
-    with pytest.raises(ValueError, match="parts"):
-        speeds.run(*words)
-
-
-def test_sources_that_change_meanwhile_are_refused(speeds, monkeypatch):
-    def edit(script):
-        monkeypatch.setattr(common, "sources_sha256", lambda: "0" * 64)
-        return {}
-
-    monkeypatch.setitem(speed.PARTS, "curve", edit)
-    with pytest.raises(RuntimeError, match="sources"):
-        speeds.run("cuda:0", "--parts", "curve")
-    assert not speeds.out.exists()
-
-
-def test_a_file_that_cannot_be_written_is_found_out_first(speeds):
-    speeds.out.mkdir(parents=True)
-    with pytest.raises(ValueError, match="directory"):
-        speeds.run("cuda:0")
-    assert not speeds.calls
-
-
-def test_rates_of_training_are_of_the_same_device(speeds):
-    speeds.run("cuda:0", "--parts", "curve")
-    origin = json.loads(speeds.out.read_text())
+def test_training_rates_are_of_the_same_device(tmp_path):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "speed.json")], "speed.json")
     row = {"gpus": 1, "num_envs": 4096, "train_env_steps_per_s": 7.0, "device": "cuda:0"}
-    rows = [
-        row,
-        {**row, "num_envs": 8192, "device": "cuda:1"},
-        {**row, "peer": "mjlab 1", "train_env_steps_per_s": 2.0},
-    ]
-    file = speeds.out.with_name("train_speed.json")
-    file.write_text(json.dumps({**origin, "rows": rows}))
-    report = speeds.run("cuda:0", "--parts", "curve")
-    assert [report[f"train_env_steps_per_s{key}"] for key in ("", "_8192", "_mjlab")] == [7.0, None, 2.0]
-    file.write_text(json.dumps({**origin, "rows": rows, "sources_sha256": "0" * 64}))
-    assert speeds.run("cuda:0", "--parts", "curve")["train_env_steps_per_s"] is None
+    peer = {**row, "peer": "mjlab 1", "train_env_steps_per_s": 2.0}
+    rows = [row, {**row, "num_envs": 8192, "device": "cuda:1"}, peer]
+    file = tmp_path / "train_speed.json"
+    file.write_text(json.dumps({**script.origin, "rows": rows}))
+    rates = speed.training_rates(script, "cuda:0")
+    assert [rates[f"train_env_steps_per_s{key}"] for key in ("", "_8192", "_mjlab")] == [7.0, None, 2.0]
+    file.write_text(json.dumps({**script.origin, "rows": rows, "sources_sha256": "0" * 64}))
+    assert speed.training_rates(script, "cuda:0")["train_env_steps_per_s"] is None
+
+
+def test_a_file_is_not_written_if_the_sources_changed_or_it_cannot_be(tmp_path, monkeypatch):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "base.json")], "base.json")
+    monkeypatch.setattr(common, "sources_sha256", lambda: "0" * 64)
+    with pytest.raises(RuntimeError, match="sources"):
+        script.write({})
+    with pytest.raises(ValueError, match="directory"):
+        common.parse(None, ["--device", "cpu", "--out", str(tmp_path)], "base.json")
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
@@ -305,21 +192,6 @@ def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
     assert rows[2]["command"].startswith("torchrun --nproc-per-node 2 -m ")
 
 
-def test_rows_that_are_there_keep_their_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(search_noise, "row_of", lambda script, name: {"search": name})
-    words = ["--small", "--device", "cpu", "--out", str(tmp_path / "search_noise.json"), "--parts"]
-
-    def run(commit, *parts):
-        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
-        report = search_noise.main([*words, *parts])
-        assert report == json.loads((tmp_path / "search_noise.json").read_text())
-        return report["commit"], [(row["search"], row["commit"]) for row in report["rows"]]
-
-    one, other = "once, seed 0", "once, seed 1"
-    assert run("first", one) == run("second", one) == ("first", [(one, "first")])
-    assert run("third", one, other) == ("third", [(one, "first"), (other, "third")])
-
-
 def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
     monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
     monkeypatch.chdir(tmp_path)
@@ -334,12 +206,12 @@ def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
         assert row["elites"] == report["methods"]["surrogate"]["elites"]
 
 
-def test_what_a_search_asks_for_is_remembered(tmp_path, monkeypatch):
+def test_lots_that_a_search_asks_for_are_recorded(tmp_path, monkeypatch):
     without_figures(monkeypatch)
-    with speed.remembering() as asked:
+    with speed.record_lots() as lots:
         run(tmp_path / "run", iterations=4)
     # Lots of 12 terrains: one is put in first, one behind each iteration, and the last is not crossed.
-    assert [len(lot) for lot in asked] == [12] * 5
+    assert [len(lot) for lot in lots] == [12] * 5
     assert sum(row["terrains"] for row in rows_of(tmp_path / "run")) == 4 * 12
 
 

@@ -203,7 +203,7 @@ def test_what_no_task_can_do_is_refused(shared_task):
         shared_task.step(torch.zeros(6, 11, device=shared_task.device))
     for changes in ({"friction": (-0.1, 1.0)}, {"lin_vel_x": (1.0, -1.0)}, {"episode_s": 0.01}):
         (problem,) = task_problems(TaskCfg(**changes), 0.02)
-        assert problem.startswith(f"task.{next(iter(changes))} must")
+        assert problem.startswith(f"task.{next(iter(changes))} ")
 
 
 def test_a_robot_whose_file_has_it_in_the_ground_overflows_nothing_while_the_step_is_captured(tmp_path, capfd):
