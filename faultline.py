@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from qd.faults.judge import judge as judge
     from qd.search.loop import search as search
     from qd.search.settings import preset as preset
-    from qd.workers.cross import cross as cross
-    from qd.workers.evaluator import Compute as Compute
+    from qd.workers.compute import Compute as Compute
+    from qd.workers.crosser import cross as cross
     from sim.robots.find import get_robot as get_robot
     from train.cfg import FinetuneCfg as FinetuneCfg
     from train.finetune import finetune as finetune
@@ -60,14 +60,15 @@ if TYPE_CHECKING:
 API = {
     "search": "qd.search.loop",
     "judge": "qd.faults.judge",
-    "cross": "qd.workers.cross",
+    "cross": "qd.workers.crosser",
     "evaluate": "qd.evaluate.evaluate",
     "make_sets": "qd.evaluate.sets",
     "finetune": "train.finetune",
     "preset": "qd.search.settings",
     "FinetuneCfg": "train.cfg",
-    "Compute": "qd.workers.evaluator",
+    "Compute": "qd.workers.compute",
     "get_robot": "sim.robots.find",
+    "Terrains": "sim.terrains.terrains",
 }
 """Functions and settings for Python by their modules, loaded when they are used; type checkers see them above."""
 

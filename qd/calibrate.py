@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.search.directory import RUNS
-from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
+from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
 from qd.workers.shards import join_results
 from sim.controllers.spec import controller_identity
@@ -24,6 +24,7 @@ from sim.rollout import RolloutResult
 from sim.terrains.spaces.base import MOST_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 _ENOUGH = 200  # failing episodes that scales are means over; with fewer, even of the most terrains, all episodes are
 _MOST = 5  # times as many terrains as to begin with
@@ -34,7 +35,7 @@ _CROSSED = 0.8  # share of episodes that should reach the goal
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
 
 
-def fitting_height(crossings: Crossings, policy: str) -> tuple[float, float]:
+def fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and how many it does there.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
@@ -45,9 +46,9 @@ def fitting_height(crossings: Crossings, policy: str) -> tuple[float, float]:
     low, high, shares = 0, len(_HEIGHTS), dict[float, float]()
     while low < high:  # those before low are crossed, those from high on are not; the highest first
         middle = high - 1 if high == len(_HEIGHTS) else (low + high) // 2
-        name, height = at_height(SUPER_GAUSSIAN, _HEIGHTS[middle]).name, _HEIGHTS[middle]
-        label = f"hard-random terrains of height {height:g} m"
-        result = crossings.cross(policy, genes, seeds, replicas=1, space=name, label=label)
+        height = _HEIGHTS[middle]
+        terrains = Terrains(genes=genes, seeds=seeds, space=at_height(SUPER_GAUSSIAN, height))
+        result = crosser.cross(policy, terrains, replicas=1, label=f"hard-random terrains of height {height:g} m")
         refuse_all_invalid(result)
         shares[height] = reached = float(result.reached_goal[~result.invalid].mean())
         print(f"Height {height:g} m: {reached:.0%} of episodes reach the goal.", flush=True)
@@ -70,14 +71,14 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     genes = space.hard_random(most, 0)
     seeds = np.random.SeedSequence(0).generate_state(most, np.uint32)
     results: list[RolloutResult] = []
-    with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
+    with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
         if robot.settings_file is not None:
-            space = at_height(space, fitting_height(crossings, policy)[0])
+            space = at_height(space, fitting_height(crosser, policy)[0])
         for first in range(0, most, terrains):
-            rows, label = slice(first, first + terrains), f"hard-random terrains from {first + 1:,}"
-            results.append(
-                crossings.cross(policy, genes[rows], seeds[rows], replicas=replicas, space=space.name, label=label)
-            )
+            rows = slice(first, first + terrains)
+            drawn = Terrains(genes=genes[rows], seeds=seeds[rows], space=space)
+            label = f"hard-random terrains from {first + 1:,}"
+            results.append(crosser.cross(policy, drawn, replicas=replicas, label=label))
             result = join_results(results, join=1)
             if (count := _failing(result).sum()) >= _ENOUGH:
                 break

@@ -11,13 +11,13 @@ from qd.calibrate import calibrate, fitting_height
 from qd.evaluate.dose import measure_dose
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
 from sim.controllers.spec import crosser_name
 from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.templates import open_templates
-from sim.mujoco_c.crossing import cross_terrains
 from sim.robots.describe import describe_model, describe_standing
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
@@ -26,7 +26,7 @@ from sim.robots.user import describe_inferred
 from sim.rollout import RolloutResult
 from sim.terrains.doses import parse_doses
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
-from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 _WALKS = 8  # episodes on flat ground in each simulator
 _APART = 0.05  # share by which speeds may differ
@@ -51,14 +51,14 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
         expected = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
         print(f"Without a controller, expected at {expected} or named by --policy, this is all.")
         return not [*standing_mistakes(robot, standing)]
-    with Crossings(robot, compute, cache=RUNS / "crossings") as crossings:
-        if not _report_walk(robot, walk(crossings, policy)):
+    with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
+        if not _report_walk(robot, walk(crosser, policy)):
             return False
-        height, share = fitting_height(crossings, policy)
+        height, share = fitting_height(crosser, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
-    crosser = crosser_name(robot, policy)
-    out = RUNS / f"{crosser}-check" / "dose.json"
-    dose = measure_dose(robot, {crosser: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
+    name = crosser_name(robot, policy)
+    out = RUNS / f"{name}-check" / "dose.json"
+    dose = measure_dose(robot, {name: policy}, doses, compute=compute, terrains=4, episodes=2, seed=0, out=out)
     stairs, kerb = (_half_label(dose, name) for name in ("stairs_up", "step_up"))
     print(f"Half get over a kerb {kerb}, stairs {stairs}", end="; ")
     print(f"{share:.0%} cross hard-random terrains at --height {height:g}.")
@@ -109,18 +109,18 @@ def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, 
     return larger, standing
 
 
-def walk(crossings: Crossings, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
+def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
     """How a controller walks over flat ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
 
     Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` from the start to the end
     [m/s], and ``height`` of the base at the end [m].
     """
-    flat, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.array([seed], np.uint32)
-    here = crossings.cross(policy, flat, seeds, replicas=_WALKS, label="flat ground", invalid_ok=True)
-    (there,) = cross_terrains(
-        crossings.robot, policy, flat, seeds, space=SUPER_GAUSSIAN, num_episodes=_WALKS, processes=1, resolved=False
-    )
-    return {"searched": _walked(here), "mujoco_c": _walked(there)}
+    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
+    engines: dict[str, Engine] = {"searched": "search", "mujoco_c": "mujoco_c_search"}
+    return {
+        name: _walked(crosser.cross(policy, flat, replicas=_WALKS, engine=engine, label="flat ground", invalid_ok=True))
+        for name, engine in engines.items()
+    }
 
 
 def _walked(result: RolloutResult) -> dict[str, float]:

@@ -24,8 +24,8 @@ _SETTINGS = ("preset", "iterations", "seed", "replicas", "intervals", "scheduler
 
 
 def _compute(flags: WorkerFlags) -> Any:
-    """Where the flags of a command let terrains be crossed, a :class:`qd.workers.evaluator.Compute`."""
-    from qd.workers.evaluator import Compute
+    """Where the flags of a command let terrains be crossed, a :class:`qd.workers.compute.Compute`."""
+    from qd.workers.compute import Compute
 
     return Compute.resolve(flags.device, flags.workers, flags.num_envs)
 
@@ -367,7 +367,7 @@ def default_preset(argv: Sequence[str]) -> str:
     """The preset that suits the device of a command line: wide on a GPU, small on the CPU."""
     device = peek(argv, "--device")
     if device is None and not {"-h", "--help"} & {*argv}:
-        from qd.workers.evaluator import resolve_device
+        from qd.workers.compute import choose_device
 
-        device = resolve_device(None, peek(argv, "--workers"))
+        device = choose_device(None, peek(argv, "--workers"))
     return "wide" if device is not None and device.startswith("cuda") else "small"

@@ -1,6 +1,5 @@
 """The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
 
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 import warp as wp
 
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
@@ -20,16 +20,17 @@ from kernels.rewards import Rewards, remember_steps
 from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.controllers.runner import Memory, PolicyRunner
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
+from sim.recording.frames import Frames
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
-from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutResult:
-    """What came of every episode; arrays lead with (num_terrains, num_replicas)."""
+    """What came of every episode; arrays lead with (num_terrains, replicas)."""
 
     penalties: np.ndarray
     """Raw penalty sums times the physics step, unscaled; (T, R, P) float64, NaN where invalid."""
@@ -54,6 +55,8 @@ class RolloutResult:
     """Time that took [s]."""
     reward: np.ndarray | None = None
     """Training reward summed to the end of the time, (T, R) float64, NaN where invalid; None unless asked for."""
+    frames: Frames | None = None
+    """What the robots did at every control step; None unless asked for."""
 
     @property
     def base_collision(self) -> np.ndarray:
@@ -95,7 +98,7 @@ class _Lot:
     slots: tuple[slice, ...]
     """Where they lie in the ring, in order."""
     num_episodes: int
-    most_steps: int
+    max_steps: int
     """Control steps by which they have ended if nothing else is under way."""
     put_at: int
     """Control steps made before."""
@@ -115,8 +118,8 @@ class Rollout:
         sim: The robots' simulation.
         penalty_sums: Columns :data:`kernels.penalties.PENALTIES`, times the physics step, (num_envs, num_penalties).
         command: Command of the coming control step, zero once an episode has ended, shape (num_envs, 3).
-        episode: The episode that a robot runs: replica ``episode % num_replicas`` of terrain slot
-            ``episode // num_replicas``, -1 for none; shape (num_envs,).
+        episode: The episode that a robot runs: replica ``episode % replicas`` of terrain slot
+            ``episode // replicas``, -1 for none; shape (num_envs,).
         outcome: :class:`kernels.episode.Outcome` of it, shape (num_envs,).
     """
 
@@ -126,7 +129,7 @@ class Rollout:
         policy: PolicySpec,
         *,
         num_terrains: int,
-        num_replicas: int,
+        replicas: int,
         device: str,
         num_envs: int | None = None,
         cfg: CrossingCfg | None = None,
@@ -138,32 +141,33 @@ class Rollout:
         """Load the policy, build the simulation and capture the control step.
 
         The policy is a file, ``module:callable`` or a callable on device tensors. ``num_terrains`` may be under way at
-        once, with ``num_replicas`` episodes on each, run by ``num_envs`` robots: one an episode if None, and never
+        once, with ``replicas`` episodes on each, run by ``num_envs`` robots: one an episode if None, and never
         more. Heights may come with maps of the ground if ``with_ground``, and with conditions if ``with_conditions``;
         with genes the space decides.
         """
-        if num_terrains < 1 or num_replicas < 1 or (num_envs is not None and num_envs < 1):
+        if num_terrains < 1 or replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
-                "num_terrains, num_replicas and num_envs must be positive, "
-                f"got {num_terrains}, {num_replicas} and {num_envs}"
+                "num_terrains, replicas and num_envs must be positive, "
+                f"got {num_terrains}, {replicas} and {num_envs}"
             )
-        self.robot, self.cfg = robot, cfg or CrossingCfg()
-        self.num_terrains, self.num_replicas = num_terrains, num_replicas
-        self.num_envs = min(num_envs or num_terrains * num_replicas, num_terrains * num_replicas)
-        self.space, self._with_ground = space, with_ground or bool(space.ground)
+        self.robot = robot
+        self.cfg = cfg or CrossingCfg()
+        self.num_terrains = num_terrains
+        self.replicas = replicas
+        self.num_envs = min(num_envs or num_terrains * replicas, num_terrains * replicas)
+        self.space = space
+        self._with_ground = with_ground or bool(space.ground)
         self._with_conditions = with_conditions or bool(space.conditions)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
             self._build(loaded, solver, device)
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, RuntimeError) and not re.search(
-                "out of memory|failed to allocate", str(error).lower()
-            ):
+            if not _is_out_of_memory(error):
                 raise
             raise ValueError(
-                f"{self.num_envs:,} robots and {num_terrains:,} terrains at once need more memory than {device} has "
-                "free: give fewer robots (--num-envs), or fewer terrains"
+                f"num_envs and num_terrains must fit the memory that {device} has free, got {self.num_envs:,} robots "
+                f"and {num_terrains:,} terrains at once: give fewer"
             ) from error
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
@@ -176,10 +180,11 @@ class Rollout:
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes
         self._num_unreleased = 0  # episodes that were put in and no robot may take yet
-        self._steps_an_episode = round(self.robot.max_duration_s / self.robot.control_dt)  # at most
+        self._max_episode_steps = round(self.robot.max_duration_s / self.robot.control_dt)
         self._step = 0  # control steps made so far
         self._began_at = 0  # the step at which all robots last began together
-        self._taken_at, self._taken_s = 0, time.perf_counter()  # step and time of the last result
+        self._taken_at = 0  # step and time of the last result
+        self._taken_s = time.perf_counter()
         with wp.ScopedDevice(device):
             self._allocate()
             self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
@@ -187,7 +192,9 @@ class Rollout:
             self._turn_graph = self.sim.capture(self._launch_turn_over)
 
     def _allocate(self) -> None:
-        num_envs, robot, sim = self.num_envs, self.robot, self.sim
+        num_envs = self.num_envs
+        robot = self.robot
+        sim = self.sim
         self._ranges = make_start_ranges(self.cfg, robot)
         self.command = wp.zeros((num_envs, 3), dtype=float)
         self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
@@ -197,11 +204,12 @@ class Rollout:
         self._penalty_step = sim.fill(PenaltyStep, command=self.command, force_limit=robot.contact_force_limit)
         self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._queue = make_queue(
-            num_envs, self.num_terrains, self.num_replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
+            num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
         )
         self._task = make_task(self.cfg, robot)
         self._episode = self._stepped = make_episodes(num_envs)
-        self.episode, self.outcome = self._queue.episode_of_env, self._episode.outcome
+        self.episode = self._queue.episode_of_env
+        self.outcome = self._episode.outcome
         self._latches = [(self._task, self._episode)]
         self._reward = None
         if self.cfg.reward:
@@ -216,7 +224,8 @@ class Rollout:
         self._rewards = Rewards() if self._reward is None else self._reward.state
 
     def _launch_control_step(self) -> None:
-        sim, robot = self.sim, self.robot
+        sim = self.sim
+        robot = self.robot
         apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
         park_ended(
             self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
@@ -234,7 +243,8 @@ class Rollout:
             self._reward.pay(self._stepped.outcome)
 
     def _launch_turn_over(self) -> None:
-        sim, begins = self.sim, self._queue.begins
+        sim = self.sim
+        begins = self._queue.begins
         turn_over(
             self._stepped.outcome, self._rewards, self._episode, self.penalty_sums, sim.terrain_of_env, self._queue
         )
@@ -257,33 +267,29 @@ class Rollout:
     @property
     def num_free(self) -> int:
         """Terrains that may be put in now."""
-        return self.num_terrains - sum(lot.num_episodes for lot in self._lots) // self.num_replicas
+        return self.num_terrains - sum(lot.num_episodes for lot in self._lots) // self.replicas
 
     def evaluate(
         self,
-        terrains: np.ndarray,
-        seeds: np.ndarray,
+        terrains: Terrains,
         *,
-        ground: GroundMaps | None = None,
         watcher: Watcher | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> RolloutResult:
-        """Run one crossing of every replica on every terrain; nothing else may be under way.
+        """Run one crossing of every replica on every terrain, of at most ``num_terrains``; drops all pending lots.
 
-        Terrains, at most ``num_terrains`` of them, are genes, shape (count, num_genes), or heights [m], shape (count,
-        nrow, ncol), with ``ground`` where they have friction or softness. Each has a seed, uint32 of shape (count,).
         ``progress`` is called now and then with the share that is done.
         """
         self.clear()
         try:
-            self.put(terrains, seeds, ground)
+            self.put(terrains)
             return self.take(progress, watcher=watcher)
         except BaseException:
             self.clear()
             raise
 
     def clear(self) -> None:
-        """Forget all that is under way."""
+        """Drop all pending lots."""
         if not self._lots:
             return
         self._lots.clear()
@@ -292,19 +298,20 @@ class Rollout:
             episode.outcome.fill_(int(Outcome.TIME_OUT))
         self._queue.episode_of_env.fill_(-1)
 
-    def put(self, terrains: np.ndarray, seeds: np.ndarray, ground: GroundMaps | None = None) -> None:
-        """Queue crossings of at most :attr:`num_free` terrains, arguments as of :meth:`evaluate`; waits for nothing."""
-        count, idle = len(terrains), not self._lots
-        if seeds.shape != (count,):
-            raise ValueError(f"seeds must have shape ({count},), one a terrain, got {seeds.shape}")
+    def put(self, terrains: Terrains) -> None:
+        """Queue crossings of at most :attr:`num_free` terrains; waits for nothing."""
+        count = len(terrains)
+        idle = not self._lots
         if not 1 <= count <= self.num_free:
             raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
+        if terrains.genes is not None and terrains.space.name != self.space.name:
+            raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
         first = 0 if idle else self._next_slot
         slots = ring_slices(first, count, self.num_terrains)
-        self._write_terrains(terrains, seeds, slots, ground)
-        num_episodes = count * self.num_replicas
-        most_steps = self._steps_an_episode * -(-num_episodes // self.num_envs)
-        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, most_steps=most_steps, put_at=self._step))
+        self._write_terrains(terrains, slots)
+        num_episodes = count * self.replicas
+        max_steps = self._max_episode_steps * -(-num_episodes // self.num_envs)
+        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, max_steps=max_steps, put_at=self._step))
         self._next_slot = (first + count) % self.num_terrains
         self._num_unreleased += num_episodes
         if idle:
@@ -315,18 +322,15 @@ class Rollout:
         if idle or self._policy.memory is not Memory.SHARED:
             self._release(begin=idle)
 
-    def _write_terrains(self, terrains: Any, seeds: Any, slots: Sequence[slice], ground: GroundMaps | None) -> None:
-        done = 0
+    def _write_terrains(self, terrains: Terrains, slots: Sequence[slice]) -> None:
+        first = 0
         with wp.ScopedDevice(self.sim.device):
             for run in slots:
-                part = slice(done, done + run.stop - run.start)
-                if terrains.ndim == 3:
-                    self.sim.bank.set_heights(terrains[part], run, ground=None if ground is None else ground[part])
-                else:
-                    self.sim.bank.set_genes(terrains[part], self.space, run)
-                self._queue.seed[run].assign(seeds[part].astype(np.uint32))
+                part = terrains[first : first + run.stop - run.start]
+                self.sim.bank.set(part, run)
+                self._queue.seed[run].assign(part.seeds.astype(np.uint32))
                 self._queue.num_ended[run].zero_()
-                done = part.stop
+                first += len(part)
 
     def _release(self, *, begin: bool) -> None:
         """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
@@ -353,8 +357,9 @@ class Rollout:
 
     def _advance(self, watcher: Watcher | None = None) -> None:
         """Make the control steps up to the next look at what has ended."""
-        poll, since = max(1, round(self.cfg.poll_every_s / self.robot.control_dt)), self._step - self._began_at
-        stop = min((since // every + 1) * every for every in (poll, self._steps_an_episode))
+        poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
+        since = self._step - self._began_at
+        stop = min((since // every + 1) * every for every in (poll, self._max_episode_steps))
         for _ in range(stop - since):
             self.control_step(watcher)
 
@@ -366,10 +371,11 @@ class Rollout:
         """
         if not self._lots:
             raise RuntimeError("take() must follow put(), got nothing under way")
-        lot, share = self._lots[0], 0.0
+        lot = self._lots[0]
+        share = 0.0
         while True:
             ended = self._num_ended(lot)
-            share = max(share, ended / lot.num_episodes, (self._step - lot.put_at) / lot.most_steps)
+            share = max(share, ended / lot.num_episodes, (self._step - lot.put_at) / lot.max_steps)
             if progress is not None and self._step > lot.put_at:
                 progress(min(1.0, share))
             if ended == lot.num_episodes:
@@ -389,19 +395,21 @@ class Rollout:
         return sum(int(self._queue.num_ended[slots].numpy().sum()) for slots in lot.slots)
 
     def _collect(self, lot: _Lot) -> RolloutResult:
-        queue, robot = self._queue, self.robot
-        rows = [slice(slots.start * self.num_replicas, slots.stop * self.num_replicas) for slots in lot.slots]
+        queue = self._queue
+        robot = self.robot
+        rows = [slice(slots.start * self.replicas, slots.stop * self.replicas) for slots in lot.slots]
 
-        def of(array: Any) -> np.ndarray:
+        def read(array: Any) -> np.ndarray:
             values = np.concatenate([array[part].numpy() for part in rows])  # a copy: on the CPU numpy() is a view
-            return values.reshape(-1, self.num_replicas, *values.shape[1:])
+            return values.reshape(-1, self.replicas, *values.shape[1:])
 
-        outcome, steps, pose = of(queue.outcome).astype(np.uint8), of(queue.steps), of(queue.final_pose)
-        penalties = of(queue.penalty_sums).astype(np.float64)[..., penalty_columns(robot.penalties)]
+        outcome = read(queue.outcome).astype(np.uint8)
+        pose = read(queue.final_pose)
+        penalties = read(queue.penalty_sums).astype(np.float64)[..., penalty_columns(robot.penalties)]
         penalties[outcome == Outcome.INVALID] = np.nan
         reward = None
         if self._reward is not None:
-            reward = of(queue.reward).astype(np.float64)
+            reward = read(queue.reward).astype(np.float64)
             reward[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
@@ -409,14 +417,15 @@ class Rollout:
         busy_steps = int(queue.busy.numpy().sum(dtype=np.int64)) * robot.decimation
         queue.busy.zero_()
         wall_s = time.perf_counter() - self._taken_s
-        self._taken_at, self._taken_s = self._step, self._taken_s + wall_s
+        self._taken_at = self._step
+        self._taken_s += wall_s
         return RolloutResult(
             penalties=penalties,
             penalty_names=robot.penalties,
             outcome=outcome,
-            invalidity=of(queue.invalidity).astype(np.uint8),
+            invalidity=read(queue.invalidity).astype(np.uint8),
             fallen=upright < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
-            duration_s=(steps * robot.physics_dt).astype(np.float32),
+            duration_s=(read(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
             physics_steps=physics_steps,
             robot_steps=physics_steps * self.num_envs,
@@ -424,3 +433,8 @@ class Rollout:
             wall_s=wall_s,
             reward=reward,
         )
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether an allocation failed: on the host, by torch, or by Warp, whose errors have no type of their own."""
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or str(error).startswith("Failed to allocate")

@@ -17,6 +17,8 @@ import pytest
 import torch
 import warp as wp
 
+from qd.search import loop
+from qd.workers import crosser
 from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.provenance import provenance
@@ -66,6 +68,21 @@ def pytest_runtest_call() -> Iterator[None]:
 def one_thread():
     """One core for torch, as the search's workers have it: its threads spin for each other on a busy machine."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def stand_ins():
+    """Pipelines of a compute that has an opener of its own (tests.qd.stand_in.compute_by) are opened by it."""
+    real = crosser.open_pipeline
+
+    def open_pipeline(cfg, **kwargs):
+        opener = getattr(cfg.compute, "opener", None)
+        return opener(cfg) if opener else real(cfg, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (crosser, loop):
+            patch.setattr(module, "open_pipeline", open_pipeline)
+        yield
 
 
 @pytest.fixture(scope="session")

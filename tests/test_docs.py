@@ -13,7 +13,8 @@ import torch
 import tyro
 
 import faultline
-from qd.workers.evaluator import Compute
+from qd.search import loop
+from qd.workers import crosser
 from sim.controllers.described import TERMS, Described, read_controller
 from sim.controllers.loaders import load_policy
 from sim.robots.compiled import robot_spec
@@ -115,7 +116,8 @@ def test_the_script_of_a_page_searches_judges_crosses_and_trains(tmp_path, monke
     (tmp_path / "search.py").write_text("from qd.search.presets import SchedulerCfg\n" + small)
     (tmp_path / "results").symlink_to(ROOT / "results")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_stand_in(cfg))
+    monkeypatch.setattr(crosser, "open_pipeline", open_stand_in)
+    monkeypatch.setattr(loop, "open_pipeline", open_stand_in)
     runpy.run_path("search.py", run_name="__main__")
     assert Path("runs/mine-tuned/policy.pt").exists() and "elites" in capsys.readouterr().out
 

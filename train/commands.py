@@ -114,7 +114,7 @@ class HardenCommand(HardenCfg, WorkerFlags):
 
     def execute(self) -> None:
         """Hardens."""
-        from qd.workers.evaluator import Compute
+        from qd.workers.compute import Compute
         from train.harden import harden
 
         robot, compute = get_robot(self.robot), Compute.resolve(self.device, self.workers, self.num_envs)

@@ -24,7 +24,7 @@ from qd.search.archive import read_archive
 from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, differences, preset
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity
 from sim.files.atomic import is_leftover, read_json, to_json, write_atomically
 from sim.files.command import Interrupted

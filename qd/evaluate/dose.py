@@ -14,7 +14,7 @@ from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import describe_controllers
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
@@ -62,7 +62,7 @@ def measure_dose(
         sets = {name: dose_set(dose, count, seed) for name, dose in doses.items()}
         results = cross_sets(
             controllers, sets, robot=robot, compute=compute, episodes=episodes,
-            how="resolved" if resolved else "searched", cache=crossings_folder(robot),
+            engine="resolved" if resolved else "search", cache=crossings_folder(robot),
         )  # fmt: skip
         rows = {
             (name, controller): rows_of(name, dose, controller, results[name][controller])

@@ -25,8 +25,9 @@ from qd.evaluate.tables import Tables, check_seeds, make_tables
 from qd.faults.numbers import EPISODES
 from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, search_seed
-from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
 from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, resolve_policy
 from sim.files.command import publish
 from sim.robots.find import get_robot, read_penalty_scales
@@ -61,25 +62,25 @@ def cross_sets(
     compute: Compute,
     episodes: int,
     *,
-    how: How = "searched",
+    engine: Engine = "search",
     reward: bool = False,
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
     note: str = "",
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Set -> controller -> its crossings, as :meth:`qd.workers.cross.Crossings.cross` makes them.
+    """Set -> controller -> its crossings, as :meth:`qd.workers.crosser.Crosser.cross` makes them.
 
     Prints the rates of each, with ``note`` behind the name of the set.
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     largest = max(map(len, sets.values()))
-    with Crossings(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crossings:
+    with Crosser(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crosser:
         for controller, policy in controllers.items():
             for name, terrains in sets.items():
-                label = f"{controller} on {name}{note}" + (f" ({how})" if how != "searched" else "")
-                result = crossings.cross(
-                    policy, terrains.terrains, terrains.seeds, replicas=episodes, space=terrains.space, how=how,
-                    reward=reward, penalties_from_s=penalties_from_s, label=label, at_most=largest,
+                label = f"{controller} on {name}{note}" + (f" ({engine})" if engine != "search" else "")
+                result = crosser.cross(
+                    policy, terrains.to_cross, replicas=episodes, engine=engine, reward=reward,
+                    penalties_from_s=penalties_from_s, label=label, room=largest,
                 )  # fmt: skip
                 rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
                 print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)

@@ -33,7 +33,7 @@ from qd.faults.searches import Search, find_certifiers
 from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity, describe_controllers, is_same_controller
 from sim.files.atomic import prepare_output
 from sim.files.command import publish

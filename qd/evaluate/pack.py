@@ -23,7 +23,7 @@ from qd.evaluate.show import show_pack_test
 from qd.faults.numbers import EPISODES
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity, crosser_name
 from sim.files.atomic import read_json, write_atomically
 from sim.files.command import publish, say

@@ -28,8 +28,9 @@ from sim.robots.training import PaperCfg
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space
+from sim.terrains.spaces.registry import get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 Purpose = Literal["test", "validation"]
 """What terrains are for: numbers to report, or the choice of settings."""
@@ -79,6 +80,12 @@ class TerrainSet:
 
     def __len__(self) -> int:
         return len(self.seeds)
+
+    @property
+    def to_cross(self) -> Terrains:
+        """The terrains as what crosses them takes them."""
+        kind: dict[str, Any] = {"heights" if self.terrains.ndim == 3 else "genes": self.terrains}
+        return Terrains(seeds=self.seeds, space=load_space(self.space), **kind)
 
     @property
     def certified(self) -> NDArray[np.bool_] | None:

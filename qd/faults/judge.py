@@ -22,8 +22,8 @@ from qd.faults.stages.fresh import with_families
 from qd.search.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
 from qd.show import figures
-from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import Crosser
 from sim.controllers.spec import ControllerSpec, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 
@@ -58,9 +58,9 @@ def judge(
     if any(stage.with_certifiers for stage in chosen):
         check_certifiers(certifiers, search, compute.device)
     calls = sum(stage.count_crossings(certifiers) for stage in chosen)
-    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crossings:
+    with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crosser:
         archive = search.read_archive()
-        judging = Judging(search=search, certifiers=certifiers, crossings=crossings)
+        judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
         _check_stages(chosen, archive, judging)
         if archive.fresh is not None and archive.family is None:
             archive = with_families(archive, search)

@@ -7,7 +7,7 @@ from pathlib import Path
 from qd.search.archive import Archive, read_archive
 from qd.search.directory import RunDirectory, check_config, check_space
 from qd.search.settings import SearchCfg, as_settings, find_policy, is_searched
-from qd.workers.evaluator import check_policy
+from qd.workers.compute import check_policy
 from sim.controllers.spec import controller_hash, resolve_policy, weights_file
 from sim.robots.find import robot_of
 from sim.robots.robot import RobotCfg

@@ -19,8 +19,11 @@ from qd.search.progress import Bar, clock, describe_iteration, describe_search
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg
 from qd.show.figures import write_figures
-from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline, check_policy, episode_seeds
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import invalid_iterations, invalid_reasons, refuse_all_invalid
+from qd.workers.pipeline import Pipeline, PipelineCfg
+from qd.workers.seeds import episode_seeds
 from qd.workers.shards import join_results
 from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.atomic import to_json, write_atomically
@@ -28,7 +31,9 @@ from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot, robot_of, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
+from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space, is_own
+from sim.terrains.terrains import Terrains
 
 UNTIL_FROM = 20
 """Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
@@ -64,18 +69,18 @@ def search(
     policy = policy or resolve_policy(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
     space, run = get_space(cfg.space, cfg.space_sha256), RunDirectory(path)
-    evaluator = EvaluatorCfg(
+    crossing = PipelineCfg(
+        compute=compute,
         robot=robot,
         policy=policy,
         num_terrains=cfg.scheduler.num_terrains,
-        num_replicas=cfg.replicas,
+        replicas=cfg.replicas,
         lots=cfg.scheduler.num_groups,
-        **vars(compute),
         space=space.name,  # where its code is now
     )
     with claimed(path):
         if (finished := run.read_finished(cfg)) is not None:
-            say(describe_search(cfg, path, cfg.iterations, compute.device, evaluator.num_workers))
+            say(describe_search(cfg, path, cfg.iterations, compute.device, crossing.num_workers))
             return finished
         saved = run.load(cfg)
         if saved is None:
@@ -85,15 +90,15 @@ def search(
             scheduler, metrics = saved
         scheduler.compute_on(compute.device)
         done, last = len(metrics), _last_iteration(cfg, metrics, until)
-        say(describe_search(replace(cfg, iterations=last), path, done, compute.device, evaluator.num_workers))
+        say(describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
         if note := scaled_by_another(robot, policy):
             print(note)
         if done < last:
             try:
-                with compute.open(evaluator) as pipeline:
+                with open_pipeline(crossing) as pipeline:
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
                     with Bar(f"iteration {done + 1}/{last}: compiling and evaluating", last, done) as bar:
-                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
+                        _run_iterations(cfg, space, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name, until)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
@@ -117,8 +122,8 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, unt
 
 
 def _run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar,
-    until: float | None,
+    cfg: SearchCfg, space: TerrainSpace, run: RunDirectory, scheduler: Scheduler, metrics: Metrics,
+    pipeline: Pipeline, bar: Bar, until: float | None,
 ) -> None:  # fmt: skip
     """Runs the iterations that are left, and saves each.
 
@@ -131,7 +136,7 @@ def _run_iterations(
     def put(genes: NDArray[np.float32], iteration: int, group: int) -> None:
         """Its seeds are those of the group's places in the iteration."""
         seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.group_rows(group)]
-        pipeline.put(genes, seeds[: len(genes)])
+        pipeline.put(Terrains(genes=genes, seeds=seeds[: len(genes)], space=space))
 
     pipeline.clear()
     num_under_way, began = 0, time.perf_counter()

@@ -49,9 +49,9 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
     def execute(self) -> None:
         """Prints the numbers, writes them and the figures."""
         from qd.show.replay import replay
-        from qd.workers.evaluator import resolve_device
+        from qd.workers.compute import choose_device
 
-        replay(self._source(), device=resolve_device(self.device), out=self.out)
+        replay(self._source(), device=choose_device(self.device), out=self.out)
 
     def _source(self) -> Any:
         from qd.show.elites import open_run
@@ -92,10 +92,10 @@ class FilmCommand(ReplayCommand):
     def execute(self) -> None:
         """Makes the films."""
         from qd.show.film import film_source
-        from qd.workers.evaluator import resolve_device
+        from qd.workers.compute import choose_device
 
         film_source(
-            self._source(), episode=self.episode, gif=self.gif, beside=self.beside, device=resolve_device(self.device),
+            self._source(), episode=self.episode, gif=self.gif, beside=self.beside, device=choose_device(self.device),
             out=self.out, whole=self.whole, shadows=self.shadows,
         )  # fmt: skip
 
@@ -173,7 +173,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
         from qd.evaluate.make_pack import make_pack
         from qd.faults.searches import find_search
         from qd.search.directory import find_run
-        from qd.workers.evaluator import Compute
+        from qd.workers.compute import Compute
 
         making, robot = self.making, get_robot(self.robot or "anymal")
         run = find_run(robot, self.run, published="never")

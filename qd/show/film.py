@@ -21,7 +21,7 @@ from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
 from qd.show.replay import ReplaySource, save
-from qd.workers.evaluator import check_policy
+from qd.workers.compute import check_policy
 from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights

@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +16,19 @@ from numpy.typing import NDArray
 from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.progress import Bar
-from qd.workers.cross import Cache
-from qd.workers.evaluator import episode_seeds
-from qd.workers.seeds import Stream
+from qd.workers.cache import Cache
+from qd.workers.compute import Compute
+from qd.workers.crosser import Crosser
+from qd.workers.seeds import Stream, episode_seeds
 from sim.controllers.spec import controller_hash
 from sim.files.provenance import code_fingerprint
 from sim.recording.file import read_recording, write_recording
-from sim.recording.recorder import Recording, record
+from sim.recording.recorder import Recording, make_recording
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
-from sim.rollout import Rollout
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space, identity, load_space
+from sim.terrains.terrains import Terrains
 
 FOLDER = RUNS / "recordings"
 AT_ONCE = 32
@@ -53,6 +53,13 @@ class Wanted:
     """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
     ground: GroundMaps | None = field(default=None, compare=False)
     """Friction and softness beside heights."""
+
+    @property
+    def terrains(self) -> Terrains:
+        """The terrain as what crosses it takes it."""
+        kind: dict[str, Any] = {"heights" if self.terrain.ndim == 2 else "genes": self.terrain[None]}
+        seeds = np.array([self.terrain_seed], np.uint32)
+        return Terrains(seeds=seeds, space=load_space(self.space), ground=self.ground, **kind)
 
     @property
     def kind(self) -> tuple[Any, ...]:
@@ -95,38 +102,32 @@ Cross = Callable[[Sequence[Wanted], Callable[[float], None]], list[Recording]]
 """Crosses terrains of one :attr:`Wanted.kind`, and calls back with the share that is done."""
 
 
-class Simulation:
-    """Crosses terrains by simulation; a controller is loaded once."""
+class RecordingCrosser:
+    """Crosses terrains and records the crossings; the simulation of each kind stays open."""
 
     def __init__(self, robot: RobotCfg, device: str) -> None:
-        self._robot, self._device = robot, device
-        self._rollouts: dict[Any, Rollout] = {}
+        self._robot = robot
+        self._device = device
+        self._crossers: dict[Any, Crosser] = {}
 
     def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> list[Recording]:
         """Recordings of all, in their order."""
-        first, key = wanted[0], (len(wanted), wanted[0].kind)
-        if key not in self._rollouts:
-            self._rollouts[key] = Rollout(
-                self._robot, first.policy, num_terrains=len(wanted), num_replicas=first.replicas, device=self._device,
-                space=load_space(first.space), with_ground=first.ground is not None,
-                with_conditions=first.ground is not None and first.ground.conditions is not None,
-            )  # fmt: skip
-        grounds = [crossing.ground for crossing in wanted if crossing.ground is not None]
-        recording = record(
-            self._rollouts[key],
-            np.stack([crossing.terrain for crossing in wanted]),
-            np.array([crossing.terrain_seed for crossing in wanted], np.uint32),
-            policy=first.policy,
-            ground=reduce(GroundMaps.joined, grounds) if grounds else None,
-            labels=[crossing.label for crossing in wanted],
-            seed=first.seed,
-            progress=progress,
+        first = wanted[0]
+        if first.kind not in self._crossers:
+            self._crossers[first.kind] = Crosser(self._robot, Compute(self._device, workers="1"))
+        terrains = Terrains.join([crossing.terrains for crossing in wanted])
+        result = self._crossers[first.kind].cross(
+            first.policy, terrains, replicas=first.replicas, record=True, progress=progress, invalid_ok=True
         )
+        recording = make_recording(
+            self._robot, first.policy, terrains, result, device=self._device,
+            labels=[crossing.label for crossing in wanted], seed=first.seed,
+        )  # fmt: skip
         return [recording.of_terrain(k) for k in range(len(wanted))]
 
 
 class Recordings:
-    """The recordings of a robot that are stored; what is missing ``cross`` makes, by default a :class:`Simulation`."""
+    """The stored recordings of a robot; ``cross`` makes what is missing, by default a :class:`RecordingCrosser`."""
 
     def __init__(
         self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER, cross: Cross | None = None
@@ -135,7 +136,7 @@ class Recordings:
         self._about = [robot_identity(robot), robot.penalties, on_gpu, code_fingerprint(("kernels", "sim"))]
         self._cache = Cache(folder)
         self._at_once = AT_ONCE if on_gpu else 1
-        self._cross = cross or Simulation(robot, device)
+        self._cross = cross or RecordingCrosser(robot, device)
 
     def read(self, wanted: Wanted) -> Recording | None:
         """The recording of some crossings; None if there is none, or it is damaged."""

@@ -12,10 +12,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.resource_tracker import ensure_running
 from typing import Any, NoReturn
 
-from numpy.typing import NDArray
-
 from sim.files.command import UserError, with_traceback
-from sim.rollout import Rollout
 
 
 class EvaluatorError(UserError):
@@ -28,7 +25,7 @@ class WorkerProcess:
     ``build``, a module-level function, is called in the process with ``cfg`` and ``num_terrains``.
     """
 
-    def __init__(self, num_terrains: int, build: Callable[[Any, int], Rollout], cfg: Any) -> None:
+    def __init__(self, num_terrains: int, build: Callable[[Any, int], Any], cfg: Any) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads and CUDA may hang
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
@@ -41,10 +38,10 @@ class WorkerProcess:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()  # so that its death ends the stream here
 
-    def send(self, terrains: NDArray, seeds: NDArray) -> None:
-        """Hands out terrains to evaluate, behind those handed out before; raises what :meth:`receive` does."""
+    def send(self, *task: Any) -> None:
+        """Hands out a task, such as terrains, behind those handed out before; raises what :meth:`receive` does."""
         try:
-            self.connection.send((terrains, seeds))
+            self.connection.send(task)
         except OSError:
             while True:  # behind its last results it may have said why it ended
                 self.receive()
@@ -77,9 +74,9 @@ class WorkerProcess:
         self.connection.close()
 
 
-def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Rollout]) -> None:
+def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[[Any, int], Any]) -> None:
     """A worker's life: build, then evaluate until the other end closes."""
-    inbox: queue.SimpleQueue[tuple[NDArray, NDArray] | None] = queue.SimpleQueue()
+    inbox: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
     under_way = 0
 
     def put_in(*, wait: bool) -> None:
@@ -115,7 +112,7 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
         _send_last(connection, "failed", with_traceback(error, f"{type(error).__name__}: {error}"))
 
 
-def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[NDArray, NDArray] | None]") -> None:
+def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
     """Takes in what is handed out while the worker crosses terrains, so that nobody waits for it to be read."""
     try:
         while True:

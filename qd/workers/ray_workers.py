@@ -4,8 +4,6 @@ Ray places the workers and notices when one dies. What is done here is what Ray 
 true, and that other workers are free while one is gone.
 """
 
-import logging
-import os
 import socket
 import sys
 import tempfile
@@ -18,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import ray
-from numpy.typing import NDArray
 from ray.exceptions import RayError, RayTaskError
 
-from qd.workers.evaluator import Build, EvaluatorCfg, Pipeline, WorkerStatus, available_cores, parse_workers
+from qd.workers import cluster
+from qd.workers.compute import available_cores, parse_workers
+from qd.workers.pipeline import Build, Pipeline, PipelineCfg, WorkerStatus
 from qd.workers.process import EvaluatorError
 from qd.workers.shards import copied, flaw_of, join_results
 from sim.controllers.spec import ControllerSpec
@@ -32,9 +31,9 @@ from sim.robots.user import PackedRobot, pack_robot
 from sim.rollout import RolloutResult
 from sim.terrains.ground import joined_name, split_name
 from sim.terrains.spaces.registry import is_own
+from sim.terrains.terrains import Terrains
 
 _ROOMS = ("kernels", "sim", "qd")
-_CONNECT_LIMIT_S = 10.0
 _POLL_S = 0.25
 _GROW_EVERY_S = 2.0
 _GATHER_S = 60.0
@@ -73,7 +72,7 @@ class RayWorker:
 
     def __init__(
         self,
-        cfg: EvaluatorCfg,
+        cfg: PipelineCfg,
         controller: PackedCode,
         robot: PackedRobot | str,
         space: PackedCode | None,
@@ -93,18 +92,17 @@ class RayWorker:
                 code = self._space.unpacked(folder / "space")
                 cfg = replace(cfg, space=joined_name(code, split_name(cfg.space)[1]))
             cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
-            self._crosser = self._build(cfg, num_terrains)
+            self._simulator = self._build(cfg, num_terrains)
 
-    def cross(self, terrains: NDArray, seeds: NDArray) -> RolloutResult:
+    def cross(self, terrains: Terrains) -> RolloutResult:
         """Crosses terrains, at most as many as it was prepared for."""
-        self._crosser.put(terrains, seeds)
-        return self._crosser.take()
+        self._simulator.put(terrains)
+        return self._simulator.take()
 
 
 @dataclass(eq=False)
 class _Shard:
-    terrains: NDArray
-    seeds: NDArray
+    terrains: Terrains
     tries: int = 0
     result: RolloutResult | None = None
 
@@ -115,16 +113,19 @@ class RayWorkers(Pipeline):
     A worker that fails in any way is replaced, and its terrains are crossed again by another.
     """
 
-    def __init__(self, cfg: EvaluatorCfg, build: Build) -> None:
+    def __init__(self, cfg: PipelineCfg, build: Build) -> None:
         super().__init__(cfg.num_terrains)
-        gpus = int(cfg.device.startswith("cuda"))
-        self._cfg, self._count = cfg, parse_workers(cfg.workers).count
+        gpus = int(cfg.compute.on_gpu)
+        self._cfg = cfg
+        self._count = parse_workers(cfg.compute.workers).count
         self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
         space = PackedCode.of(split_name(cfg.space)[0]) if is_own(cfg.space) else None
         packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
-        self._arguments = replace(cfg, device="cuda:0" if gpus else "cpu", robot=""), *packed, build
-        self._code, self._size = code_fingerprint(_ROOMS), cfg.terrains_of_worker
+        compute = replace(cfg.compute, device="cuda:0" if gpus else "cpu")
+        self._arguments = replace(cfg, compute=compute, robot=""), *packed, build
+        self._code = code_fingerprint(_ROOMS)
+        self._size = cfg.terrains_of_worker
         self._workers: set[Any] = set()
         self._idle: deque[Any] = deque()
         self._tasks: dict[Any, tuple[Any, _Shard | None]] = {}  # the worker of each, and what it crosses if prepared
@@ -151,10 +152,10 @@ class RayWorkers(Pipeline):
         preparing = sum(shard is None for _, shard in self._tasks.values())
         return WorkerStatus(workers=len(self._workers) - preparing, retries=self._retries)
 
-    def put(self, terrains: NDArray, seeds: NDArray) -> None:
+    def put(self, terrains: Terrains) -> None:
         """Deals a lot out in shards of as many terrains as a worker has room for."""
         size = self._shard_size()
-        lot = [_Shard(terrains[k : k + size], seeds[k : k + size]) for k in range(0, len(terrains), size)]
+        lot = [_Shard(terrains[k : k + size]) for k in range(0, len(terrains), size)]
         if not self._lots:
             self._result_at = time.perf_counter()
         self._lots.append(lot)
@@ -181,7 +182,7 @@ class RayWorkers(Pipeline):
         return self._size
 
     def clear(self) -> None:
-        """Forgets all lots; what workers still cross of them is of no later one."""
+        """Drops all pending lots; what workers still cross of them counts for no later one."""
         self._lots.clear()
         self._waiting.clear()
 
@@ -195,7 +196,7 @@ class RayWorkers(Pipeline):
         if self.status().workers:
             self._seen_at = time.monotonic()
         elif time.monotonic() - self._seen_at > _PATIENCE_S:
-            raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {_resources()}")
+            raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {cluster.resources()}")
         self._deal()
 
     def _start_missing(self) -> None:
@@ -203,7 +204,7 @@ class RayWorkers(Pipeline):
             return
         self._grown_at = time.monotonic()
         actor: Any = RayWorker
-        for _ in range((self._count or max(1, num_devices(self._cfg.device))) - len(self._workers)):
+        for _ in range((self._count or max(1, cluster.num_devices(self._cfg.compute.device))) - len(self._workers)):
             worker = actor.options(**self._resources).remote(*self._arguments)
             self._workers.add(worker)
             self._tasks[worker.prepare.remote(self._shard_size(), self._code)] = worker, None
@@ -211,7 +212,7 @@ class RayWorkers(Pipeline):
     def _deal(self) -> None:
         while self._waiting and self._idle:
             worker, shard = self._idle.popleft(), self._waiting.popleft()
-            self._tasks[worker.cross.remote(shard.terrains, shard.seeds)] = worker, shard
+            self._tasks[worker.cross.remote(shard.terrains)] = worker, shard
 
     def _finish(self, task: Any, worker: Any, shard: _Shard | None) -> None:
         """Takes a task's result; replaces the worker if it failed."""
@@ -220,7 +221,7 @@ class RayWorkers(Pipeline):
         try:
             result = ray.get(task)
             if shard is not None:
-                flaw = flaw_of(result, len(shard.terrains), self._cfg.num_replicas)
+                flaw = flaw_of(result, len(shard.terrains), self._cfg.replicas)
         except RayError as raised:
             error, flaw = raised, _reason_of(raised)
         if flaw is None:
@@ -265,9 +266,9 @@ def _reason_of(error: BaseException) -> str:
 
 
 @contextmanager
-def open_ray_workers(cfg: EvaluatorCfg, build: Build) -> Iterator[RayWorkers]:
-    """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.evaluator.open_evaluator`."""
-    connect(parse_workers(cfg.workers).count)
+def open_ray_workers(cfg: PipelineCfg, build: Build) -> Iterator[RayWorkers]:
+    """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.crosser.open_pipeline`."""
+    cluster.connect(max(available_cores(), parse_workers(cfg.compute.workers).count or 1))
     workers = RayWorkers(cfg, build)
     try:
         workers.open()
@@ -276,52 +277,3 @@ def open_ray_workers(cfg: EvaluatorCfg, build: Build) -> Iterator[RayWorkers]:
         raise EvaluatorError(f"the Ray cluster failed: {_reason_of(error)}") from error
     finally:
         workers.close()
-
-
-def connect(count: int | None) -> None:
-    """Joins the cluster that RAY_ADDRESS names, or starts Ray on this machine for ``count`` workers or one a device."""
-    if ray.is_initialized():
-        return
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's behaviour to come; it warns otherwise
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    address = os.environ.get("RAY_ADDRESS")
-    if address is None:
-        cores = max(available_cores(), count or 1)
-        ray.init(address="local", num_cpus=cores, include_dashboard=False, object_store_memory=256 << 20, **quiet)
-        return
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        if host and port.isdecimal():  # Ray itself would try for minutes where nothing listens
-            socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_LIMIT_S).close()
-        ray.init(address=address, **quiet)
-    except Exception as error:  # of many types: no such host, another version of Ray, a token that is missing
-        reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise OSError(
-            f"no Ray cluster at RAY_ADDRESS={address}: {reason}: start one with `ray start --head`, or unset "
-            "RAY_ADDRESS to use this machine alone"
-        ) from None
-
-
-def cluster_device(name: str | None, count: int | None) -> str:
-    """Device of the workers, ``cuda`` or ``cpu``; for None CUDA where the cluster has it."""
-    if name not in (None, "cpu", "cuda"):
-        raise ValueError(f"with workers on Ray the device must be cpu or cuda, got {name}")
-    connect(count)
-    gpus = num_devices("cuda")
-    if name == "cuda" and not gpus:
-        raise ValueError(f"device cuda: the cluster has no GPU: {_resources()}; give --device cpu, or add a node")
-    device = name or ("cuda" if gpus else "cpu")
-    most = num_devices(device)
-    if count is not None and count > most and not os.environ.get("RAY_ADDRESS"):
-        raise ValueError(f"workers must be at most ray:{most}, one for each GPU of this machine, got ray:{count}")
-    return device
-
-
-def num_devices(device: str) -> int:
-    """GPUs or CPU cores that the cluster has now."""
-    return int(ray.cluster_resources().get("GPU" if device.startswith("cuda") else "CPU", 0))
-
-
-def _resources() -> str:
-    return ", ".join(f"{value:g} {name}" for name, value in ray.cluster_resources().items() if name in ("CPU", "GPU"))

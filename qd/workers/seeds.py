@@ -1,6 +1,9 @@
-"""Streams of seeds, so that what must not share its episodes does not."""
+"""Seeds of episodes, and their streams: what must not share its episodes has a stream of its own."""
 
 from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Stream(IntEnum):
@@ -22,3 +25,12 @@ class Stream(IntEnum):
     """Of ``results/make/search_noise.py``."""
     ABOUT_CONDITIONS = 2000
     """Of ``results/make/conditions.py``."""
+
+
+def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = Stream.SEARCH) -> NDArray[np.uint32]:
+    """Seeds of the terrains of one evaluation, shape (count,); the same for the same numbers.
+
+    So a resumed search repeats nothing. Another ``stream`` shares no episodes with the search.
+    """
+    sequence = np.random.SeedSequence([seed, iteration], spawn_key=(stream,) if stream else ())
+    return sequence.generate_state(count, np.uint32).astype(np.uint32)

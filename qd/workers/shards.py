@@ -5,7 +5,9 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sim.recording.frames import Frames
 from sim.rollout import RolloutResult
 
 _STEPS = ("physics_steps", "robot_steps", "busy_steps")
@@ -23,13 +25,21 @@ def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResul
     changes: dict[str, Any] = {
         name: np.concatenate([getattr(result, name) for result in results]) for name in arrays_of(results[0])
     }
+    if results[0].frames is not None:
+        changes["frames"] = Frames.join([result.frames for result in results if result.frames is not None])
     for name in (*_STEPS, "wall_s"):
         combine = max if join == 0 and name in ("physics_steps", "wall_s") else sum
         changes[name] = combine(getattr(result, name) for result in results)
     return replace(results[0], **changes)
 
 
-def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
+def choose_rows(result: RolloutResult, rows: NDArray[np.intp]) -> RolloutResult:
+    """A result with some of its terrains alone, in the order given."""
+    frames = None if result.frames is None else result.frames[rows]
+    return replace(result, **{name: values[rows] for name, values in arrays_of(result).items()}, frames=frames)
+
+
+def flaw_of(result: Any, count: int, replicas: int) -> str | None:
     """Why a result cannot be one of ``count`` terrains, in words; None if it can.
 
     Memory gone bad on another machine must not become a number in an archive: shapes, finite penalties of every valid
@@ -37,10 +47,10 @@ def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
     """
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
-    shape = (count, num_replicas)
+    shape = (count, replicas)
     wrong = [f"{name} of shape {value.shape}" for name, value in arrays_of(result).items() if value.shape[:2] != shape]
     if wrong:
-        return f"{', '.join(wrong)} for {count} terrains of {num_replicas} episodes"
+        return f"{', '.join(wrong)} for {count} terrains of {replicas} episodes"
     penalties, invalid = result.penalties, result.invalid
     if penalties.shape != (*shape, len(result.penalty_names)):
         return f"penalties of shape {penalties.shape}"
@@ -56,6 +66,6 @@ def flaw_of(result: Any, count: int, num_replicas: int) -> str | None:
 
 
 def arrays_of(result: RolloutResult) -> dict[str, np.ndarray]:
-    """The arrays of a result by their names, which lead with (num_terrains, num_replicas)."""
+    """The arrays of a result by their names, which lead with (num_terrains, replicas)."""
     values = {field.name: getattr(result, field.name) for field in fields(result)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -17,17 +17,18 @@ from qd.faults.stages.fresh import fresh_values
 from qd.search.archive import Archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from qd.workers.shards import arrays_of
 from results.make.common import ONCE, parse
 from sim.terrains.spaces.registry import get_space
+from sim.terrains.terrains import Terrains
 
 ALPHAS = {"alpha_1": 1.0, "alpha_0": 0.0}
 MAX_ELITES = 200
 
 
-def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossings) -> dict[str, Any]:
+def look_again(archive: Archive, cfg: SearchCfg, policy: str, crosser: Crosser) -> dict[str, Any]:
     """What fresh episodes say of some of the elites that a search has found so far."""
     stream = (Stream.ABLATED_ELITES,)
     rng = np.random.default_rng(np.random.SeedSequence([cfg.seed, archive.iterations], spawn_key=stream))
@@ -36,7 +37,8 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crossings: Crossin
     times = -(-FRESH_EPISODES // cfg.replicas)
     genes, seeds = some.genes.repeat(times, axis=0), elite_seeds(some, cfg.seed, times, stream=Stream.FRESH)
     label = "fresh episodes"
-    result = crossings.cross(policy, genes, seeds, replicas=cfg.replicas, space=cfg.space, label=label)
+    terrains = Terrains(genes=genes, seeds=seeds, space=get_space(cfg.space))
+    result = crosser.cross(policy, terrains, replicas=cfg.replicas, label=label)
     by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in arrays_of(result).items()}
     result = replace(result, **{name: value[:, :FRESH_EPISODES] for name, value in by_elite.items()})
     return fresh_numbers(some, fresh_values(some, result, cfg.fitness)) | {"elites": len(archive)}
@@ -49,12 +51,12 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     cfg = script.search_cfg(18, seed=script.seed, **ONCE)
     iterations = [*range(every, cfg.iterations + 1, every)]
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in ALPHAS}
-    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
+    with Crosser(script.robot, script.compute, cache=script.runs / "crossings") as crosser:
         for name, alpha in ALPHAS.items():
             for count in iterations:  # each from the start, so that what was done is found when this is begun again
                 of_alpha = replace(cfg, iterations=count, fitness=replace(cfg.fitness, alpha=alpha))
                 archive = search(of_alpha, script.runs / "ablation" / f"{name}-{count}", script.compute)
-                rows[name].append(look_again(archive, of_alpha, script.policy, crossings))
+                rows[name].append(look_again(archive, of_alpha, script.policy, crosser))
     return script.write(
         {
             "preset": cfg.preset,

@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from qd.faults.families import find_families
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.cross import Crossings, How
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
 from results.make.common import Script, agreement, crossing_rates, parse
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
+from sim.terrains.terrains import Terrains
 
 KEY = 20261123  # with the seed, the entropy of everything drawn here, and nowhere else
 HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it
 
 
 def cross_in_all_ways(
-    script: Script, crossings: Crossings, name: str, genes: NDArray[np.float32], space: str, *, episodes: int = 40
+    script: Script, crosser: Crosser, name: str, genes: NDArray[np.float32], space: str, *, episodes: int = 40
 ) -> dict[str, NDArray[np.uint8]]:
     """Outcomes of a set's episodes by how they were crossed, (num_terrains, num_episodes); fewer terrains in MuJoCo C.
 
@@ -32,16 +34,14 @@ def cross_in_all_ways(
     sequences = [np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)) for stream in (FIRST, SECOND)]
     first, second = (sequence.generate_state(len(genes), np.uint32).astype(np.uint32) for sequence in sequences)
 
-    def cross(seeds: NDArray[np.uint32], how: How, count: int) -> NDArray[np.uint8]:
-        result = crossings.cross(
-            script.policy, genes[:count], seeds[:count], replicas=episodes, space=space, how=how,
-            label=f"{name}, {how}",
-        )  # fmt: skip
-        return result.outcome
+    def cross(seeds: NDArray[np.uint32], engine: Engine, count: int) -> NDArray[np.uint8]:
+        terrains = Terrains(genes=genes[:count], seeds=seeds[:count], space=get_space(space))
+        label = f"{name}, {engine}"
+        return crosser.cross(script.policy, terrains, replicas=episodes, engine=engine, label=label).outcome
 
     return {
-        "search": cross(first, "searched", len(genes)),
-        "again": cross(second, "searched", len(genes)),
+        "search": cross(first, "search", len(genes)),
+        "again": cross(second, "search", len(genes)),
         "resolved": cross(second, "resolved", len(genes)),
         "mujoco_c": cross(second, "mujoco_c", in_mujoco_c),
     }
@@ -68,8 +68,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         "hard_random": (SUPER_GAUSSIAN.hard_random(terrains, draws[HARD_RANDOM]), SUPER_GAUSSIAN.name),
         "elites": (archive.genes[chosen], archive.space),
     }
-    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
-        outcome = {name: cross_in_all_ways(script, crossings, name, *terrains) for name, terrains in sets.items()}
+    with Crosser(script.robot, script.compute, cache=script.runs / "crossings") as crosser:
+        outcome = {name: cross_in_all_ways(script, crosser, name, *terrains) for name, terrains in sets.items()}
     fails = {
         way: crossing_rates(outcome["elites"][way], "goal") < FAILING_GOAL_RATE
         for way in ("search", "again", "resolved")

@@ -11,7 +11,6 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 from torch.profiler import ProfilerActivity, profile
 
 from kernels.episode import Outcome, make_episodes
@@ -21,6 +20,7 @@ from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.base import condition_column
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.terrains import Terrains
 
 SEGMENT_STEPS = 10  # control steps: over 0.2 s a replayed robot still moves as the recorded one did
 SEGMENT_EVERY = 20
@@ -46,14 +46,14 @@ class Segment:
     """Of each control step, shape (num_envs, 7 + num_joints)."""
 
 
-def record_segments(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[Segment]:
+def record_segments(rollout: Rollout, terrains: Terrains) -> list[Segment]:
     """State and targets of the first 10 of every 20 control steps of crossings, as :meth:`Rollout.put` takes them.
 
     Each robot runs one episode, and is left out once that has ended.
     """
     sim, segments = rollout.sim, []
     rollout.clear()
-    rollout.put(terrains, seeds)
+    rollout.put(terrains)
     for step in range(round(rollout.robot.max_duration_s / rollout.robot.control_dt)):
         if step % SEGMENT_EVERY == 0:
             ended = rollout.outcome.numpy() != Outcome.RUNNING
@@ -130,7 +130,7 @@ def replay_rates(motions: list[Motion], rounds: int) -> list[float]:
     return [motion.robot_steps / float(s) for motion, s in zip(motions, seconds, strict=True)]
 
 
-def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32], rounds: int) -> dict[str, float]:
+def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, float]:
     """Physics steps a second, over all robots that have an episode, of contacts and solver alone.
 
     Returns:
@@ -139,13 +139,13 @@ def bare_rates(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint3
         ``conditions``, under conditions on such ground: noise and lag of observations, and others that change nothing.
     """
     sim, robot = rollout.sim, rollout.robot
-    segments = record_segments(rollout, terrains, seeds)
+    segments = record_segments(rollout, terrains)
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_ground=True)
     bank.set_heights(sim.bank.heights.numpy())
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
     walking, ground, conditions = replay_rates([motion, with_maps, motion_under_conditions(sim, segments)], rounds)
-    standing = standing_rate(rollout, motion, terrains, seeds)
+    standing = standing_rate(rollout, motion, terrains)
     return {"walking": walking, "standing": standing, "ground": ground, "conditions": conditions}
 
 
@@ -172,11 +172,11 @@ def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
     return Motion(varied, segments, beside)
 
 
-def standing_rate(rollout: Rollout, motion: Motion, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> float:
+def standing_rate(rollout: Rollout, motion: Motion, terrains: Terrains) -> float:
     """Physics steps a second over all robots that hold the default pose where crossings start."""
     sim, robot = rollout.sim, rollout.robot
     rollout.clear()
-    rollout.put(terrains, seeds)
+    rollout.put(terrains)
     sim.joint_qd.zero_()
     targets = np.zeros(sim.targets.shape, dtype=np.float32)
     targets[:, 7:] = robot.default_joint_pos
@@ -192,11 +192,12 @@ def standing_rates(rollout: Rollout) -> dict[str, float] | None:
     robots do not end at the same height: a biped falls.
     """
     sim, robot, device = rollout.sim, rollout.robot, rollout.sim.device
-    level, seeds = np.zeros((rollout.num_terrains, NUM_ROWS, NUM_COLS)), np.zeros(rollout.num_terrains, np.uint32)
-    ours = standing_rate(rollout, Motion(sim, []), level, seeds)
+    level = np.zeros((rollout.num_terrains, NUM_ROWS, NUM_COLS), np.float32)
+    terrains = Terrains(heights=level, seeds=np.zeros(rollout.num_terrains, np.uint32))
+    ours = standing_rate(rollout, Motion(sim, []), terrains)
     height = sim.joint_q.numpy()[:, 2].mean()
     rollout.clear()
-    rollout.put(level, seeds)
+    rollout.put(terrains)
     model = crossing_model(robot, level[0])
     model.opt.disableflags = MUJOCO.mjtDisableBit.mjDSBL_SENSOR  # which only MuJoCo C is asked for
     for cap in ("iterations", "ls_iterations"):
@@ -224,9 +225,9 @@ def standing_rates(rollout: Rollout) -> dict[str, float] | None:
     return {"num_envs": sim.num_envs, "world_steps_per_s": ours, "world_steps_per_s_mujoco_warp": alone}
 
 
-def kernel_shares(rollout: Rollout, terrains: NDArray[Any], seeds: NDArray[np.uint32]) -> list[dict[str, Any]]:
+def kernel_shares(rollout: Rollout, terrains: Terrains) -> list[dict[str, Any]]:
     """Name and share of the GPU's time of each kernel, the most first, over the second second of crossings."""
-    rollout.put(terrains, seeds)
+    rollout.put(terrains)
     for _ in range(PROFILED_STEPS):
         rollout.control_step()
     with profile(activities=[ProfilerActivity.CUDA]) as profiled:

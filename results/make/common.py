@@ -24,7 +24,7 @@ from qd.search.archive import Archive
 from qd.search.directory import RunDirectory, read_archive_of
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, preset
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
 from sim.controllers.spec import controller_identity
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically

@@ -19,13 +19,14 @@ from qd.search.archive import Archive, goal_rates
 from qd.search.directory import RunDirectory
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.loop import search
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
 from sim.terrains.conditions.base import CONDITIONS
 from sim.terrains.ground import joined_name
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
+from sim.terrains.terrains import Terrains
 
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
@@ -50,14 +51,13 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
     first = len(space.parts(archive.genes[0])) - len(space.conditions) if len(archive) else 0
     seeds = elite_seeds(archive, script.seed, stream=Stream.ABOUT_CONDITIONS)
     run = script.runs / "conditions"
-    with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
+    with Crosser(script.robot, script.compute, cache=run / "crossings") as crosser:
 
         def rates(rows: NDArray[np.int64], taken: Sequence[int], label: str) -> NDArray[np.float64]:
             """Goal rates on elites without some kinds of conditions; NaN of an invalid one."""
             genes = space.without(archive.genes[rows], [first + kind for kind in taken])
-            result = crossings.cross(
-                script.policy, genes, seeds[rows], replicas=EPISODES, space=SPACE, label=label, invalid_ok=True
-            )
+            terrains = Terrains(genes=genes, seeds=seeds[rows], space=space)
+            result = crosser.cross(script.policy, terrains, replicas=EPISODES, label=label, invalid_ok=True)
             return goal_rates(count_outcomes(result))
 
         again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]

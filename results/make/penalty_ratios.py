@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from results.make.common import parse
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -21,8 +22,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     seed = script.seed + 1  # penalties are scaled on the terrains of seed 0
     genes = SUPER_GAUSSIAN.hard_random(terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(terrains, np.uint32)
-    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
-        result = crossings.cross(script.policy, genes, seeds, replicas=episodes, label="hard-random")
+    with Crosser(script.robot, script.compute, cache=script.runs / "crossings") as crosser:
+        terrains_to_cross = Terrains(genes=genes, seeds=seeds)
+        result = crosser.cross(script.policy, terrains_to_cross, replicas=episodes, label="hard-random")
     reached = result.reached_goal & ~result.invalid
     failed = ~result.reached_goal & ~result.invalid
     ratios = {}

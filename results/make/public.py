@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +23,9 @@ from qd.search.loop import search
 from qd.search.settings import preset
 from qd.show.elites import open_run
 from qd.show.replay import select_elites
-from qd.workers.cross import Crossings, How
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
 from results.make.common import agreement, crossing_rates, read_alike, runs_of_today
 from results.make.pictures import take_still
 from results.make.spaces import COUNTS, causes_of
@@ -39,6 +40,7 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.doses import parse_doses
 from sim.terrains.spaces.base import MOST_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
+from sim.terrains.terrains import Terrains
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
 
@@ -102,9 +104,9 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     run = runs / f"{name}-archive"
     robot, named = ready(name, folder, runs, compute)
     policy = str(robot.policy_file)
-    with Crossings(robot, compute, cache=runs / "crossings") as crossings:
-        checked = check_numbers(walk(crossings, policy, seed), robot.speed)
-        agreed = agree(crossings, named, seed, 1 if small else 40)
+    with Crosser(robot, compute, cache=runs / "crossings") as crosser:
+        checked = check_numbers(walk(crosser, policy, seed), robot.speed)
+        agreed = agree(crosser, named, seed, 1 if small else 40)
     rates = evaluate_rates(
         robot, policy, compute=compute, terrains=6 if small else 300, episodes=2 if small else 20, space=named,
         seed=seed, out=runs / f"{name}-rates.json",
@@ -143,17 +145,18 @@ def check_numbers(walked: dict[str, dict[str, float]], speed: float) -> dict[str
     }
 
 
-def agree(crossings: Crossings, space: str, seed: int, terrains: int) -> dict[str, Any]:
+def agree(crosser: Crosser, space: str, seed: int, terrains: int) -> dict[str, Any]:
     """Mean goal rates on hard-random terrains by physics, and how far ours, resolved, lies from MuJoCo C, resolved."""
-    genes, ways = load_space(space).hard_random(terrains, seed + 1), get_args(How)
-    seeds, policy = np.arange(terrains, dtype=np.uint32), str(crossings.robot.policy_file)
+    drawn = load_space(space)
+    genes = drawn.hard_random(terrains, seed + 1)
+    hard_random = Terrains(genes=genes, seeds=np.arange(terrains, dtype=np.uint32), space=drawn)
+    policy = str(crosser.robot.policy_file)
+    engines: dict[str, Engine] = {"searched": "search", "resolved": "resolved", "mujoco_c": "mujoco_c"}
     outcome = {
-        how: crossings.cross(
-            policy, genes, seeds, replicas=10, space=space, how=how, label=f"hard-random, {how}"
-        ).outcome
-        for how in ways
+        name: crosser.cross(policy, hard_random, replicas=10, engine=engine, label=f"hard-random, {engine}").outcome
+        for name, engine in engines.items()
     }
-    rates = {how: float(np.nanmean(crossing_rates(of_way, "goal"))) for how, of_way in outcome.items()}
+    rates = {name: float(np.nanmean(crossing_rates(outcomes, "goal"))) for name, outcomes in outcome.items()}
     return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 

@@ -13,20 +13,23 @@ import numpy as np
 import warp as wp
 
 from qd.search.settings import preset
-from qd.workers.evaluator import EvaluatorCfg, available_cores, open_evaluator
+from qd.workers.compute import Compute, available_cores
+from qd.workers.crosser import open_pipeline
+from qd.workers.pipeline import PipelineCfg
 from results.make.common import parse
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 ROUNDS = 3
 """Evaluations timed of each, after one that is not; the median counts."""
 
 
-def time_evaluation(cfg: EvaluatorCfg, seed: int, rounds: int) -> float:
+def time_evaluation(cfg: PipelineCfg, seed: int, rounds: int) -> float:
     """Seconds of one evaluation of as many terrains as ``cfg`` has under way, by whoever it says."""
     genes = SUPER_GAUSSIAN.hard_random(cfg.num_terrains, seed)
     seeds = np.random.SeedSequence(seed).generate_state(cfg.num_terrains, np.uint32)
-    with open_evaluator(cfg) as evaluate:
-        seconds = [evaluate(genes, seeds).wall_s for _ in range(rounds + 1)]
+    with open_pipeline(cfg) as evaluate:
+        seconds = [evaluate(Terrains(genes=genes, seeds=seeds)).wall_s for _ in range(rounds + 1)]
         status = evaluate.status()
     if status is not None and (status.workers != cfg.num_workers or status.retries):
         raise RuntimeError(f"expected {cfg.num_workers} workers throughout, got {status}: nothing was measured")
@@ -41,21 +44,21 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     devices = wp.get_cuda_device_count() if on_gpu else available_cores()
     counts = (1,) if script.small else [1 << k for k in range(devices.bit_length())]
     search = preset("paper" if on_gpu else "small", script.robot)
-    one_process = EvaluatorCfg(
-        robot=script.robot, policy=script.policy, num_terrains=terrains, num_replicas=replicas, device=script.device,
-        workers="1",
+    one_process = PipelineCfg(
+        compute=Compute(script.device, workers="1"), robot=script.robot, policy=script.policy, num_terrains=terrains,
+        replicas=replicas,
     )  # fmt: skip
     shared = replace(
-        one_process, num_terrains=4 if script.small else search.scheduler.num_terrains, num_replicas=search.replicas
+        one_process, num_terrains=4 if script.small else search.scheduler.num_terrains, replicas=search.replicas
     )
     alone_s, shared_alone_s = (time_evaluation(cfg, script.seed, rounds) for cfg in (one_process, shared))
     rate_alone = terrains * replicas / alone_s
     rows = []
     for count in counts:
-        on_ray = {"workers": f"ray:{count}", "device": script.device.partition(":")[0]}  # which GPU is Ray's to say
-        wide = replace(one_process, num_terrains=terrains * count, **on_ray)
+        on_ray = Compute(script.device.partition(":")[0], workers=f"ray:{count}")  # which GPU is Ray's to say
+        wide = replace(one_process, num_terrains=terrains * count, compute=on_ray)
         rate = terrains * count * replicas / time_evaluation(wide, script.seed, rounds)
-        iteration_s = time_evaluation(replace(shared, **on_ray), script.seed, rounds)
+        iteration_s = time_evaluation(replace(shared, compute=on_ray), script.seed, rounds)
         rows.append(
             {
                 "workers": count,

@@ -19,10 +19,11 @@ from qd.faults.stages.fresh import fresh_values
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.pool import chance_to_stay
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ONCE, Script, file_name, parse
 from sim.terrains.spaces.registry import get_space
+from sim.terrains.terrains import Terrains
 
 SEEDS, EPISODES = (0, 1, 2), 400_000
 LONG_EPISODES = 1_000_000
@@ -53,12 +54,10 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     search(cfg, run, script.compute)
     archive = judge(run, stages=("fresh",), compute=script.compute)
     assert archive.fresh is not None
-    with Crossings(script.robot, script.compute, cache=run / "crossings") as crossings:
+    with Crosser(script.robot, script.compute, cache=run / "crossings") as crosser:
         seeds = elite_seeds(archive, cfg.seed, stream=Stream.FRESH_AGAIN)
-        again = crossings.cross(
-            script.policy, archive.genes, seeds, replicas=FRESH_EPISODES, space=archive.space, label="once more",
-            invalid_ok=True,
-        )  # fmt: skip
+        terrains = Terrains(genes=archive.genes, seeds=seeds, space=get_space(archive.space))
+        again = crosser.cross(script.policy, terrains, replicas=FRESH_EPISODES, label="once more", invalid_ok=True)
     second = fresh_values(archive, again, cfg.fitness)
     both = archive.fresh.valid & second.valid
     numbers = RunDirectory(run).read_summary()

@@ -30,14 +30,17 @@ from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.loop import search
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg, preset
-from qd.workers.cross import Crossings
-from qd.workers.evaluator import EvaluatorCfg, build_rollout, episode_seeds, open_evaluator
+from qd.workers.compute import Compute
+from qd.workers.crosser import Crosser, open_pipeline
+from qd.workers.pipeline import PipelineCfg, build_simulator
+from qd.workers.seeds import episode_seeds
 from results.make.agreement import compare, cross_in_all_ways
 from results.make.bare import bare_rates, kernel_shares, standing_rates
 from results.make.common import ONCE, Script, parse
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
+from sim.terrains.terrains import Terrains
 
 WARM_UP = 2
 WIDE = ("surrogate", "cma_mae+map_elites")
@@ -76,11 +79,11 @@ def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> t
 
 def make_rollout(script: Script, num_terrains: int, num_envs: int, replicas: int) -> Rollout:
     """A simulation of the shipped controller in this process."""
-    cfg = EvaluatorCfg(
-        robot=script.robot, policy=script.policy, num_terrains=num_terrains, num_replicas=replicas,
-        device=script.device, workers="1", num_envs=num_envs,
+    cfg = PipelineCfg(
+        compute=Compute(script.device, workers="1", num_envs=num_envs), robot=script.robot, policy=script.policy,
+        num_terrains=num_terrains, replicas=replicas,
     )  # fmt: skip
-    rollout = build_rollout(cfg, num_terrains)
+    rollout = build_simulator(cfg, num_terrains)
     assert isinstance(rollout, Rollout)
     return rollout
 
@@ -94,7 +97,8 @@ def time_iteration(script: Script) -> dict[str, Any]:
     metrics, terrains = time_search(script, "iteration", cfg, 1 if script.small else 10)
     rate = float(np.median([(1.0 - row["idle_share"]) * row["robot_steps"] / row["wall_s"] for row in metrics]))
     rollout = make_rollout(script, len(terrains), cfg.episodes_per_iteration, cfg.replicas)
-    bare = bare_rates(rollout, terrains, np.arange(len(terrains), dtype=np.uint32), rounds=1 if script.small else 3)
+    crossed = Terrains(genes=terrains, seeds=np.arange(len(terrains)))
+    bare = bare_rates(rollout, crossed, rounds=1 if script.small else 3)
     return {
         "num_envs": cfg.episodes_per_iteration,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
@@ -154,12 +158,13 @@ def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]])
     iterations = range(2, len(lots) // num_groups + 1)
     lots = lots[num_groups:]
     seeds = np.concatenate([episode_seeds(cfg.seed, iteration, num_terrains) for iteration in iterations])
-    evaluator = EvaluatorCfg(
-        robot=script.robot, policy=script.policy, num_terrains=num_terrains, num_replicas=cfg.replicas,
-        lots=num_groups, device=script.device, workers="1",
+    evaluator = PipelineCfg(
+        compute=Compute(script.device, workers="1"), robot=script.robot, policy=script.policy,
+        num_terrains=num_terrains, replicas=cfg.replicas, lots=num_groups,
     )  # fmt: skip
-    with open_evaluator(evaluator) as pipeline:
-        lots_ended = [time.perf_counter() for _ in pipeline.in_lots(np.concatenate(lots), seeds, len(lots[0]))]
+    with open_pipeline(evaluator) as pipeline:
+        terrains = Terrains(genes=np.concatenate(lots), seeds=seeds)
+        lots_ended = [time.perf_counter() for _ in pipeline.in_lots(terrains, len(lots[0]))]
     return np.diff(lots_ended[num_groups - 1 :: num_groups])[WARM_UP - 2 :].tolist()
 
 
@@ -174,13 +179,14 @@ def time_crossings(
 ) -> dict[str, float]:
     """Episodes a second on hard-random terrains of a space, with ``each`` episodes a robot."""
     num_terrains = max(1, num_envs * each // REPLICAS)
-    genes = load_space(space).hard_random(num_terrains, seed)
-    cfg = EvaluatorCfg(
-        robot=robot, policy=str(robot.policy_file), num_terrains=max(1, num_terrains * 4 // each), space=space,
-        num_replicas=REPLICAS, num_envs=num_envs, device=device, workers="1",
+    drawn = load_space(space)
+    genes = drawn.hard_random(num_terrains, seed)
+    cfg = PipelineCfg(
+        compute=Compute(device, workers="1", num_envs=num_envs), robot=robot, policy=str(robot.policy_file),
+        num_terrains=max(1, num_terrains * 4 // each), space=space, replicas=REPLICAS,
     )  # fmt: skip
-    with open_evaluator(cfg) as evaluate:
-        result = evaluate(genes, np.arange(num_terrains, dtype=np.uint32))
+    with open_pipeline(cfg) as evaluate:
+        result = evaluate(Terrains(genes=genes, seeds=np.arange(num_terrains, dtype=np.uint32), space=drawn))
     rate = result.outcome.size / result.wall_s
     return {"num_envs": num_envs, "episodes_per_s": rate, "idle_share": result.idle_share}
 
@@ -197,7 +203,7 @@ def time_kernels(script: Script) -> dict[str, Any]:
     num_terrains = PROFILED // REPLICAS
     rollout = make_rollout(script, num_terrains, PROFILED, REPLICAS)
     genes = SUPER_GAUSSIAN.hard_random(num_terrains, script.seed)
-    shares = kernel_shares(rollout, genes, np.arange(num_terrains, dtype=np.uint32))
+    shares = kernel_shares(rollout, Terrains(genes=genes, seeds=np.arange(num_terrains)))
     return {"kernels_num_envs": PROFILED, "kernels": shares}
 
 
@@ -205,8 +211,8 @@ def measure_agreement(script: Script) -> dict[str, Any]:
     """Agreement with finer physics and MuJoCo C on a few hard-random terrains."""
     terrains, episodes = 1 if script.small else 40, 10
     genes = SUPER_GAUSSIAN.hard_random(terrains, script.seed)
-    with Crossings(script.robot, script.compute, cache=script.runs / "crossings") as crossings:
-        outcome = cross_in_all_ways(script, crossings, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=episodes)
+    with Crosser(script.robot, script.compute, cache=script.runs / "crossings") as crosser:
+        outcome = cross_in_all_ways(script, crosser, "hard-random", genes, SUPER_GAUSSIAN.name, episodes=episodes)
     return {"agreement": {"episodes": episodes, **compare(outcome, np.arange(terrains), script.seed)}}
 
 

@@ -1,15 +1,7 @@
-"""Crossings in plain MuJoCo C, one after another in each of several processes."""
+"""Crossings in plain MuJoCo C, one after another."""
 
-import multiprocessing
-import os
-import signal
-import threading
-import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import lru_cache
@@ -29,7 +21,6 @@ from kernels.rewards import Rewards
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
-from sim.crossing import resolved as with_contact_resolved
 from sim.mujoco_c.model import (
     NO_SOFTNESS,
     Array,
@@ -47,7 +38,7 @@ from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, terrains_of
 from sim.terrains.conditions.base import nominal_row, split_row
 from sim.terrains.ground import GroundMaps
-from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.terrains import Terrains
 
 _WARNINGS = [
     getattr(mj.mjtWarning, f"mjWARN_{name}")
@@ -87,7 +78,7 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     return to_mujoco(joint_q.numpy()[order], joint_qd.numpy()[order], np.array(base_com))
 
 
-class Episodes:
+class EpisodeStates:
     """States of the episodes of one terrain, stepped one by one."""
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: Array | None = None) -> None:
@@ -140,7 +131,7 @@ class Episodes:
         self._targets[running] = targets
 
 
-def _judge(robot: RobotCfg, episodes: Episodes, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
+def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
     """Outcome of each running episode after a physics step, the gravest of several."""
     cfg = CrossingCfg
     qpos, qvel = episodes.qpos[running], episodes.qvel[running]
@@ -157,7 +148,7 @@ def _judge(robot: RobotCfg, episodes: Episodes, running: NDArray[np.intp], base:
 
 
 @torch.inference_mode()
-def cross(
+def cross_in_mujoco_c(
     robot: RobotCfg,
     policy: Policy,
     heights: NDArray[np.float32],
@@ -173,7 +164,7 @@ def cross(
     than in the parallel simulation.
     """
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
-    episodes = Episodes(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
+    episodes = EpisodeStates(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
     count, base = len(starts.qpos), np.array([name in robot.base_geoms for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
     default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
@@ -182,8 +173,8 @@ def cross(
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
-    most = round(robot.max_duration_s / robot.physics_dt)
-    for step in range(most):
+    max_steps = round(robot.max_duration_s / robot.physics_dt)
+    for step in range(max_steps):
         running = np.flatnonzero(outcome == Outcome.RUNNING)
         if len(running) == 0:
             break
@@ -195,8 +186,8 @@ def cross(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )
             rows = episodes.disturb(rows, running, step)
-            asked = rows if remembers else rows[running]
-            action = policy(torch.as_tensor(asked, dtype=torch.float32)).numpy().astype(np.float64)
+            observed = rows if remembers else rows[running]
+            action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy().astype(np.float64)
             action = action[running] if remembers else action
             limited = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
             action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
@@ -204,7 +195,7 @@ def cross(
             episodes.hold(running, default + robot.action_scale * action)
         episodes.step(running)
         judged = _judge(robot, episodes, running, base)
-        judged[(judged == Outcome.RUNNING) & (step + 1 >= most)] = Outcome.TIME_OUT
+        judged[(judged == Outcome.RUNNING) & (step + 1 >= max_steps)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1
         state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
@@ -223,86 +214,63 @@ def cross(
     )
 
 
-_CHUNK = 25  # episodes at a time: enough for the policy's batch, few enough to share out
-_worker: dict[str, Any] = {}
+_CHUNK = 25  # episodes at a time: enough for the policy's batch
 
 
-def _exit_with_parent(parent: int) -> None:
-    """Ends this process once its parent is gone, which a pool's workers would otherwise outlive."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
+class MujocoC:
+    """Crosses terrains in plain MuJoCo C, from the starts that a rollout of their seeds has (:class:`Rollout`)."""
+
+    def __init__(
+        self, robot: RobotCfg, policy: str, *, replicas: int, solver: SolverCfg | None = None, device: str = "cpu"
+    ) -> None:
+        """The first of ``replicas`` episodes a terrain begin as a rollout's do, which may have fewer.
+
+        The Warp ``device`` makes the terrains and draws the starts.
+        """
+        prepare_torch("cpu")
+        self._robot = robot
+        self._policy = load_policy(policy, robot, "cpu")
+        self._replicas = replicas
+        self._time_constant_s = (solver or SolverCfg()).time_constant_s
+        self._device = device
+        self._pending: deque[Terrains] = deque()
+
+    def put(self, terrains: Terrains) -> None:
+        """Queue terrains, which are crossed when they are taken."""
+        if terrains.genes is not None and "softness" in terrains.space.ground:
+            raise ValueError(NO_SOFTNESS)
+        self._pending.append(terrains)
+
+    def clear(self) -> None:
+        """Drop all pending lots."""
+        self._pending.clear()
+
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
+        """Cross the lot that was put in first."""
+        terrains = self._pending.popleft()
+        heights, ground = terrains.heights, terrains.ground
+        if heights is None:
+            heights, ground = terrains_of(terrains.values, terrains.space, device=self._device)
+        results = []
+        for index, (grid, seed) in enumerate(zip(heights, terrains.seeds, strict=True)):
+            starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)
+            maps = None if ground is None else ground[index : index + 1]
+            chunks = [
+                cross_in_mujoco_c(
+                    self._robot, self._policy, grid, starts[first : first + _CHUNK],
+                    time_constant_s=self._time_constant_s, ground=maps,
+                )
+                for first in range(0, self._replicas, _CHUNK)
+            ]  # fmt: skip
+            results.append(_join(chunks, axis=1))
+            if progress is not None:
+                progress((index + 1) / len(heights))
+        return _join(results, axis=0)
 
 
-def _start_worker(robot: RobotCfg, policy: str, parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
-    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
-    prepare_torch("cpu")
-    _worker.update(robot=robot, policy=load_policy(policy, robot, "cpu"))
-
-
-def _cross_chunk(
-    heights: NDArray[np.float32], ground: GroundMaps | None, starts: Starts, time_constant_s: float | None
-) -> RolloutResult:
-    robot, policy = _worker["robot"], _worker["policy"]
-    return cross(robot, policy, heights, starts, time_constant_s=time_constant_s, ground=ground)
-
-
-def cross_terrains(
-    robot: RobotCfg,
-    policy: str,
-    terrains: NDArray[np.float32],
-    seeds: NDArray[np.uint32],
-    *,
-    space: TerrainSpace,
-    num_episodes: int,
-    processes: int,
-    resolved: bool,
-    device: str = "cpu",
-) -> Iterator[RolloutResult]:
-    """Cross terrains in plain MuJoCo, shared out over processes, from the starts that a rollout of their seeds has.
-
-    Terrains are genes of the space, shape (num_terrains, num_genes), or heights [m], (num_terrains, NUM_ROWS,
-    NUM_COLS); seeds are uint32, one a terrain. The first of ``num_episodes`` a terrain begin as a rollout's do, which
-    may have fewer. Contact is ``resolved`` (:func:`sim.crossing.resolved`), or the search's settings hold. The Warp
-    ``device`` makes the terrains and draws the starts. Yields the crossings of each terrain, in order.
-    """
-    if terrains.ndim == 2 and "softness" in space.ground:  # before any work
-        raise ValueError(NO_SOFTNESS)
-    robot, solver = with_contact_resolved(robot) if resolved else (robot, SolverCfg())
-    heights, ground = (terrains, None) if terrains.ndim == 3 else terrains_of(terrains, space, device=device)
-    with _process_pool(robot, policy, processes) as pool:
-        crossings = []
-        for number, (grid, seed) in enumerate(zip(heights, seeds, strict=True)):
-            starts = draw_starts(robot, grid, int(seed), num_episodes, device)
-            patches = None if ground is None else ground[number : number + 1]
-            chunks = [starts[first : first + _CHUNK] for first in range(0, num_episodes, _CHUNK)]
-            crossings.append(
-                [pool.submit(_cross_chunk, grid, patches, chunk, solver.time_constant_s) for chunk in chunks]
-            )
-        for chunks in crossings:
-            yield _join([chunk.result() for chunk in chunks])
-
-
-@contextmanager
-def _process_pool(robot: RobotCfg, policy: str, processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that have the controller loaded; an OSError if one of them dies."""
-    others = set(multiprocessing.active_children())
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, spawn, _start_worker, (robot, policy, os.getpid()))
-    try:
-        yield pool
-    except BrokenProcessPool as error:
-        raise OSError(f"a process of plain MuJoCo died: {error}") from None
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()  # a part may have minutes to go
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _join(parts: Sequence[RolloutResult]) -> RolloutResult:
-    names = [name for name, value in vars(parts[0]).items() if isinstance(value, np.ndarray)]
-    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names}
-    return replace(parts[0], **joined)
+def _join(results: Sequence[RolloutResult], *, axis: int) -> RolloutResult:
+    names = [name for name, value in vars(results[0]).items() if isinstance(value, np.ndarray)]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(result, name) for result in results], axis=axis) for name in names
+    }
+    return replace(results[0], **joined)

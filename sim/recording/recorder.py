@@ -5,9 +5,9 @@ the state at ``k * dt``: frame 0 the start, the last one the end of the control 
 ``dt`` after its end. The frames of an invalid episode end before the step that broke it.
 """
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,19 +17,12 @@ from kernels.episode import Outcome
 from kernels.penalties import COLLISION_FORCE, penalty_columns
 from sim.controllers.spec import controller_identity
 from sim.files.provenance import provenance
+from sim.recording.frames import FRAME_ARRAYS, Frames
+from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout, RolloutResult
 from sim.terrains.ground import GroundMaps
+from sim.terrains.terrains import Terrains
 
-FRAME_ARRAYS: dict[str, type[np.floating]] = {
-    "base_position": np.float32,
-    "base_quaternion": np.float32,
-    "joint_position": np.float16,
-    "foot_force": np.float16,
-    "penalties": np.float32,
-    "command": np.float16,
-}
-"""Arrays with a row a frame, and how exact they are kept: half a milliradian of a joint moves a foot by 0.3 mm. In
-memory all are float32, in which a force can be squared."""
 _MAX_FORCE = 60_000.0  # [N]; what a float16 can hold
 
 
@@ -129,11 +122,11 @@ class _Frames:
     def __init__(self, rollout: Rollout, num_terrains: int) -> None:
         self._rollout = rollout
         robot = rollout.robot
-        self._shape = (num_terrains, rollout.num_replicas)
+        self._shape = (num_terrains, rollout.replicas)
         self._feet = [robot.geom_names.index(name) for name in robot.foot_geoms]
         self._num_base = len(robot.base_geoms)  # the first ones
         self._columns = penalty_columns(robot.penalties)
-        self._num_frames = np.zeros(num_terrains * rollout.num_replicas, dtype=np.int32)
+        self._num_frames = np.zeros(num_terrains * rollout.replicas, dtype=np.int32)
         self._ended = np.zeros(len(self._num_frames), dtype=bool)
         self._frames: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []
 
@@ -178,42 +171,68 @@ class _Frames:
         self._frames.append((row, frame, rounded))
         self._num_frames[row] += 1
 
-    def stacked(self) -> dict[str, Any]:
-        """All frames by name once the episodes are over, and how many each episode has."""
-        most = int(self._num_frames.max())
-        stacks: dict[str, Any] = {"num_frames": self._num_frames.reshape(self._shape)}
+    def frames(self, heights: NDArray[np.float32], ground: GroundMaps | None) -> Frames:
+        """All frames once the episodes are over."""
+        longest = int(self._num_frames.max())
+        arrays: dict[str, NDArray[Any]] = {}
         for name, first in self._frames[0][2].items():
             fill, dtype = (np.nan, np.float32) if name in FRAME_ARRAYS else (False, np.bool_)
-            stack = np.full((len(self._num_frames), most, *first.shape[1:]), fill, dtype)
+            array = np.full((len(self._num_frames), longest, *first.shape[1:]), fill, dtype)
             for row, frame, values in self._frames:
-                stack[row, frame] = values[name]
-            stacks[name] = stack.reshape(*self._shape, *stack.shape[1:])
-        return stacks
+                array[row, frame] = values[name]
+            arrays[name] = array.reshape(*self._shape, *array.shape[1:])
+        return Frames(
+            num_frames=self._num_frames.reshape(self._shape), arrays=arrays, heights=heights, ground=ground
+        )
 
 
-def record(
-    rollout: Rollout,
-    terrains: NDArray[Any],
-    seeds: NDArray[Any],
+class RolloutRecorder:
+    """Crosses lots of terrains by a rollout, one after the other; its results have the frames of all episodes.
+
+    The episodes are those that the rollout would run without it. On the host a frame of an episode takes some 110
+    bytes: 4,000 whole episodes are half a gigabyte.
+    """
+
+    def __init__(self, rollout: Rollout) -> None:
+        self._rollout = rollout
+        self._pending: deque[Terrains] = deque()
+
+    def put(self, terrains: Terrains) -> None:
+        """Queue a lot, which is crossed when it is taken."""
+        self._pending.append(terrains)
+
+    def clear(self) -> None:
+        """Drop all pending lots."""
+        self._pending.clear()
+
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
+        """Cross the lot that was put in first."""
+        terrains = self._pending.popleft()
+        collector = _Frames(self._rollout, len(terrains))
+        result = self._rollout.evaluate(terrains, watcher=collector, progress=progress)
+        bank = self._rollout.sim.bank
+        maps = bank.ground_maps()
+        heights: Any = bank.heights[: len(terrains)].numpy()
+        frames = collector.frames(
+            heights.copy(),  # on the CPU numpy() is a view
+            None if maps is None else maps[: len(terrains)],
+        )
+        return replace(result, frames=frames)
+
+
+def make_recording(
+    robot: RobotCfg,
+    policy: str,
+    terrains: Terrains,
+    result: RolloutResult,
     *,
-    policy: str | Path,
-    ground: GroundMaps | None = None,
+    device: str,
     labels: Sequence[str] | None = None,
     seed: int = 0,
-    progress: Callable[[float], None] | None = None,
 ) -> Recording:
-    """Runs a rollout's episodes and records them; the episodes are those that ``rollout.evaluate`` would run.
-
-    On the host a frame of an episode takes some 110 bytes: 4,000 whole episodes are half a gigabyte.
-
-    Terrains, seeds, ground and progress are those of ``rollout.evaluate``. The recording names and hashes ``policy``,
-    which the rollout's controller was loaded from, and has the terrains' labels and what their seeds were drawn with.
-    """
-    frames = _Frames(rollout, len(terrains))
-    result = rollout.evaluate(terrains, seeds, ground=ground, watcher=frames, progress=progress)
-    maps = rollout.sim.bank.ground_maps()
-    heights: Any = rollout.sim.bank.heights[: len(terrains)].numpy()
-    robot = rollout.robot
+    """The recording of a result with frames; ``seed`` is what the terrains' seeds were drawn with."""
+    frames = result.frames
+    assert frames is not None
     return Recording(
         robot=robot.name,
         joint_names=robot.joint_names,
@@ -222,17 +241,18 @@ def record(
         geom_names=robot.geom_names,
         dt=robot.control_dt,
         labels=tuple(labels or (f"terrain {k}" for k in range(len(terrains)))),
-        heights=heights.copy(),  # on the CPU numpy() is a view
-        ground=None if maps is None else maps[: len(terrains)],
-        genes=terrains.astype(np.float32) if terrains.ndim == 2 else None,
-        seeds=seeds.astype(np.uint32),
+        heights=frames.heights,
+        ground=frames.ground,
+        genes=None if terrains.genes is None else terrains.genes.astype(np.float32),
+        seeds=terrains.seeds.astype(np.uint32),
         origin={
-            **controller_identity(robot, str(policy)),
-            "policy": str(policy),
-            "space": rollout.space.name,
-            "space_sha256": rollout.space.sha256,
-            **provenance(rollout.sim.device, seed),
+            **controller_identity(robot, policy),
+            "policy": policy,
+            "space": terrains.space.name,
+            "space_sha256": terrains.space.sha256,
+            **provenance(device, seed),
         },
         **{name: getattr(result, name) for name in ("outcome", "invalidity", "fallen", "duration_s")},
-        **frames.stacked(),
+        num_frames=frames.num_frames,
+        **frames.arrays,
     )

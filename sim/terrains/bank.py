@@ -13,6 +13,7 @@ from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 _ALL = slice(None)
 
@@ -99,6 +100,13 @@ class TerrainBank:
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
         self._set_conditions(space.condition_rows(valid), slots)
+
+    def set(self, terrains: Terrains, slots: slice = _ALL) -> None:
+        """Replace the terrains of some slots."""
+        if terrains.heights is not None:
+            self.set_heights(terrains.heights, slots, ground=terrains.ground)
+        else:
+            self.set_genes(terrains.values, terrains.space, slots)
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""

@@ -5,6 +5,7 @@ The conditions of a crossing go with them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +50,7 @@ class GroundMaps:
     def __len__(self) -> int:
         return len(self.friction)
 
-    def __getitem__(self, rows: slice) -> "GroundMaps":
+    def __getitem__(self, rows: slice | NDArray[Any]) -> "GroundMaps":
         conditions = None if self.conditions is None else self.conditions[rows]
         return GroundMaps(
             friction=self.friction[rows], time_constant_s=self.time_constant_s[rows], conditions=conditions

@@ -23,6 +23,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.bench import counterparts
 from tests.bench.ceiling import Work
 
@@ -53,11 +54,11 @@ class Scene:
 def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: int, walk_s: float, seed: int) -> Scene:
     """Lets robots walk for ``walk_s`` seconds by their shipped controller: at 0.75 m/s, the bumps begin after 2 m."""
     rollout = Rollout(
-        robot, robot.policy_file, num_terrains=num_terrains, num_replicas=math.ceil(num_envs / num_terrains),
+        robot, robot.policy_file, num_terrains=num_terrains, replicas=math.ceil(num_envs / num_terrains),
         num_envs=num_envs, device=device, cfg=CrossingCfg(),
     )  # fmt: skip
     genes = SUPER_GAUSSIAN.hard_random(num_terrains, seed)
-    rollout.put(genes, np.arange(num_terrains))
+    rollout.put(Terrains(genes=genes, seeds=np.arange(num_terrains)))
     for _ in range(round(walk_s / robot.control_dt)):
         rollout.control_step()
     sim = rollout.sim

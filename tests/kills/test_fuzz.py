@@ -17,7 +17,7 @@ import torch
 
 from qd.search.archive import read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
-from qd.workers.cross import Cache
+from qd.workers.cache import Cache
 from sim.controllers.loaders import load_policy
 from sim.recording.file import read_recording
 from sim.robots.find import get_robot

@@ -17,22 +17,22 @@ class Crosser:
         self.cfg, self.num_terrains = cfg, num_terrains
         self.lots = []
 
-    def put(self, terrains, seeds):
-        self.lots.append((terrains, seeds))
-        assert sum(len(lot) for lot, _ in self.lots) <= self.num_terrains
+    def put(self, terrains):
+        self.lots.append(terrains)
+        assert sum(map(len, self.lots)) <= self.num_terrains
 
     def clear(self):
         self.lots.clear()
 
     def take(self, progress=None):
-        return self.evaluate(*self.lots.pop(0), progress=progress)
+        return self.evaluate(self.lots.pop(0), progress=progress)
 
-    def evaluate(self, terrains, seeds, *, progress=None):
-        assert len(terrains) == len(seeds) <= self.num_terrains
+    def evaluate(self, terrains, *, progress=None):
+        assert len(terrains) <= self.num_terrains
         if progress is not None:
             progress(0.5)
             progress(1.0)
-        return stand_in.evaluate(terrains, seeds, self.cfg.num_replicas)
+        return stand_in.evaluate(terrains.values, terrains.seeds, self.cfg.replicas)
 
 
 class Failing(Crosser):
@@ -44,8 +44,8 @@ class Failing(Crosser):
         if self.how == "build":
             raise ValueError("policy 'x' does not fit:\nuse another")
 
-    def evaluate(self, terrains, seeds, *, progress=None):
-        result = super().evaluate(terrains, seeds, progress=progress)
+    def evaluate(self, terrains, *, progress=None):
+        result = super().evaluate(terrains, progress=progress)
         for number in range(int(self.times)):
             try:
                 (Path(self.folder) / str(number)).touch(exist_ok=False)

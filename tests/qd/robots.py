@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from qd.workers.evaluator import EvaluatorCfg
+from qd.workers.pipeline import PipelineCfg
 from sim.robots.find import get_robot
 from sim.rollout import RolloutResult
 from tests.qd import stand_in
@@ -16,7 +16,7 @@ OTHER = {"C-G": str(get_robot("anymal").panel / "C-G.pt")}
 
 
 def by_stand_in(cfg, genes, seeds):
-    return stand_in.evaluate(genes, seeds, cfg.num_replicas)
+    return stand_in.evaluate(genes, seeds, cfg.replicas)
 
 
 def bump_stops(cfg, genes, seeds):
@@ -43,7 +43,7 @@ class Robots:
         return [seed for _, seed in self.crossed]
 
     @contextmanager
-    def __call__(self, cfg: EvaluatorCfg):
+    def __call__(self, cfg: PipelineCfg):
         self.opened.append(cfg)
 
         def evaluate(genes, seeds):
@@ -52,7 +52,7 @@ class Robots:
             self.crossed += [(cfg, seed) for seed in seeds.tolist()]
             result = self.rule(cfg, genes, seeds)
             if not isinstance(result, RolloutResult):
-                collided = np.repeat(result[:, None], cfg.num_replicas, axis=1)
+                collided = np.repeat(result[:, None], cfg.replicas, axis=1)
                 result = stand_in.make_result(np.ones((*collided.shape, 6)), base_collision=collided)
             return replace(result, reward=np.full(result.outcome.shape, 9.0)) if cfg.reward else result
 

@@ -15,7 +15,7 @@ from qd.search.loop import search
 from qd.search.presets import SchedulerCfg
 from qd.search.settings import SearchCfg
 from qd.show import figures
-from qd.workers.evaluator import Compute
+from qd.workers import crosser
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.identity import robot_identity
@@ -53,7 +53,8 @@ def without_figures(patch: pytest.MonkeyPatch) -> None:
 def crossing_by(opener) -> Iterator[None]:
     """``faultline archive`` crosses terrains by this meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Compute, "open", lambda self, cfg: opener(cfg))
+        patch.setattr(crosser, "open_pipeline", opener)
+        patch.setattr(searching, "open_pipeline", opener)
         yield
 
 

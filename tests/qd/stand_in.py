@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from kernels.episode import Outcome
-from qd.workers.evaluator import Compute, EvaluatorCfg, Pipeline
+from qd.workers.compute import Compute
+from qd.workers.pipeline import Pipeline, PipelineCfg
 from sim.rollout import RolloutResult
 
 PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
@@ -52,11 +54,11 @@ def result_of(outcomes, *, names=PENALTIES[:2], vel_x=0.0, reward=None, **given)
     return replace(make_result(penalties, invalid=invalid, names=names), outcome=outcome, **given)
 
 
-def evaluate(genes: np.ndarray, seeds: np.ndarray, num_replicas: int = 4) -> RolloutResult:
+def evaluate(genes: np.ndarray, seeds: np.ndarray, replicas: int = 4) -> RolloutResult:
     """Penalties that differ between terrains by their genes and between replicas by their seed."""
     genes = np.asarray(genes, dtype=np.float64)
     hardness = np.stack([np.abs(genes[:, k::6]).mean(axis=1) for k in range(6)], axis=1)
-    noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, size=(num_replicas, 6)) for seed in seeds])
+    noise = np.stack([np.random.default_rng(int(seed)).uniform(0.9, 1.1, size=(replicas, 6)) for seed in seeds])
     penalties = 4.0 * hardness[:, None] ** 3 * noise * SCALES
     collides = (genes[:, 7] > 0.3)[:, None] & (noise[:, :, 0] > 0.95)
     return make_result(penalties, base_collision=collides)
@@ -76,28 +78,32 @@ class Stub(Pipeline):
         super().__init__(num_terrains=1_000_000)
         self.evaluate, self.lots, self.most_lots = evaluate, [], 0
 
-    def put(self, terrains, seeds):
-        self.lots.append((terrains, seeds))
+    def put(self, terrains):
+        self.lots.append(terrains)
         self.most_lots = max(self.most_lots, len(self.lots))
 
     def take(self, progress=None):
-        return self.evaluate(*self.lots.pop(0))
+        terrains = self.lots.pop(0)
+        return self.evaluate(terrains.values, terrains.seeds)
 
     def clear(self):
         self.lots.clear()
 
 
 @contextmanager
-def open_stand_in(cfg: EvaluatorCfg) -> Iterator:
+def open_stand_in(cfg: PipelineCfg) -> Iterator:
     """Opened like the real evaluator."""
-    yield Stub(lambda genes, seeds: evaluate(genes, seeds, cfg.num_replicas))
+    yield Stub(lambda genes, seeds: evaluate(genes, seeds, cfg.replicas))
 
 
 def compute_by(opener, compute: Compute = Compute(workers="1")) -> Compute:  # noqa: B008 - frozen
     """Where terrains are crossed by what this opens."""
 
-    class Opened(Compute):
-        def open(self, cfg):
-            return opener(cfg)
+    return StandInCompute(**vars(compute), opener=opener)
 
-    return Opened(**vars(compute))
+
+@dataclass(frozen=True)
+class StandInCompute(Compute):
+    """Where terrains are crossed by what ``opener`` opens; tests/conftest.py has pipelines opened by it."""
+
+    opener: Any = None

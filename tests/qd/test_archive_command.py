@@ -17,7 +17,7 @@ from qd.search import settings
 from qd.search.archive import read_archive
 from qd.search.loop import say_what_stops_the_robot
 from qd.search.methods.registry import METHODS
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
 from tests.builders import fresh_values

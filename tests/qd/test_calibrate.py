@@ -40,7 +40,7 @@ def test_scales_are_means_over_failing_episodes_or_over_all_if_under_200_fail():
 
 def robots(change=lambda result: result, **kwargs):
     """The stand-in, whose result is changed."""
-    return Robots(lambda cfg, genes, seeds: change(stand_in.evaluate(genes, seeds, cfg.num_replicas)), **kwargs)
+    return Robots(lambda cfg, genes, seeds: change(stand_in.evaluate(genes, seeds, cfg.replicas)), **kwargs)
 
 
 def failing(share):

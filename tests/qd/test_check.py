@@ -6,7 +6,7 @@ import pytest
 
 from qd.check import check_robot, ensure_ready
 from qd.commands import CheckCommand
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.terrains.spaces.registry import get_space, space_at

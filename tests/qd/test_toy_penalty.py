@@ -8,7 +8,7 @@ from faultline import main
 from kernels.penalties import PENALTIES
 from qd.search.archive import read_archive
 from qd.show.figures import draw_archive
-from qd.workers.evaluator import Pipeline, build_rollout
+from qd.workers.pipeline import Pipeline, build_simulator
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot
 from sim.robots.identity import robot_identity
@@ -21,7 +21,7 @@ SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "2", "--replicas"
 @contextmanager
 def open_here(cfg):
     """Crosses in this process, which knows the penalty."""
-    yield Pipeline(cfg.num_terrains, build_rollout(cfg, cfg.num_terrains))
+    yield Pipeline(cfg.num_terrains, build_simulator(cfg, cfg.num_terrains))
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
-from qd.workers.evaluator import Compute
+from qd.search import loop
+from qd.workers import crosser
 from results.make import bare, common, docs, search, speed, tables, train_speed
 from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.terrains import Terrains
 from tests.qd.searches import rows_of, run, without_figures
 from tests.qd.stand_in import Stub, make_result
 from train.ppo.learner import Ranks
@@ -50,7 +52,7 @@ def open_made_up(cfg):
     """Half of the episodes are too late, wherever they are."""
 
     def cross(terrains, seeds):
-        rng, shape = np.random.default_rng(int(seeds[0])), (len(seeds), cfg.num_replicas)
+        rng, shape = np.random.default_rng(int(seeds[0])), (len(seeds), cfg.replicas)
         result = make_result(rng.uniform(0.5, 2.0, (*shape, 6)), late=rng.uniform(size=shape) < 0.5)
         return replace(result, reward=np.ones(shape) if cfg.reward else None)
 
@@ -61,9 +63,10 @@ def open_made_up(cfg):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_trial_writes_its_file(name, tmp_path, monkeypatch):
     script = importlib.import_module(f"results.make.{name}")
-    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
+    monkeypatch.setattr(crosser, "open_pipeline", open_made_up)
+    monkeypatch.setattr(loop, "open_pipeline", open_made_up)
     without_figures(monkeypatch)
-    monkeypatch.setattr(speed, "open_evaluator", open_made_up)
+    monkeypatch.setattr(speed, "open_pipeline", open_made_up)
     (tmp_path / "results").symlink_to(MAKE.parent)
     monkeypatch.chdir(tmp_path)  # made-up crossings are stored under runs/ here
     out = tmp_path / "anymal" / FILES[name]
@@ -74,7 +77,8 @@ def test_a_trial_writes_its_file(name, tmp_path, monkeypatch):
 
 
 def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
+    monkeypatch.setattr(crosser, "open_pipeline", open_made_up)
+    monkeypatch.setattr(loop, "open_pipeline", open_made_up)
     without_figures(monkeypatch)
     monkeypatch.chdir(tmp_path)
     words = ["--small", "--device", "cpu", "--out", str(tmp_path / "anymal/search.json")]
@@ -193,7 +197,8 @@ def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
 
 
 def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(Compute, "open", lambda self, cfg: open_made_up(cfg))
+    monkeypatch.setattr(crosser, "open_pipeline", open_made_up)
+    monkeypatch.setattr(loop, "open_pipeline", open_made_up)
     monkeypatch.chdir(tmp_path)
     without_figures(monkeypatch)
     out = tmp_path / "anymal/search.json"
@@ -219,7 +224,7 @@ def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
     # Two robots for 60 control steps, of which the first 10 of every 20 are replayed. One ends behind the 15th: of
     # (2 + 1 + 1) * 10 control steps, 4 physics steps each, count.
     rollout = Rollout(
-        replace(anymal, max_duration_s=1.2), anymal.policy_file, num_terrains=1, num_replicas=2, device=device
+        replace(anymal, max_duration_s=1.2), anymal.policy_file, num_terrains=1, replicas=2, device=device
     )
     steps, step = [], rollout.control_step
 
@@ -230,8 +235,8 @@ def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
             rollout.outcome.assign([rollout.outcome.numpy()[0], Outcome.TIME_OUT])
 
     rollout.control_step = end_one
-    level, seeds = np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), np.zeros(1, np.uint32)
-    motion = bare.Motion(rollout.sim, bare.record_segments(rollout, level, seeds))
+    level = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.zeros(1, np.uint32))
+    motion = bare.Motion(rollout.sim, bare.record_segments(rollout, level))
     assert motion.robot_steps == 160
     assert motion.replay() > 0.0 and rollout.sim.parked.numpy().tolist() == [0, 2]
     assert rollout.sim.joint_q.numpy()[1, 2] == PARKING_HEIGHT

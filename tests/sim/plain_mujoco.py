@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim.controllers.loaders import load_policy
-from sim.mujoco_c.crossing import Episodes, cross
+from sim.mujoco_c.crossing import EpisodeStates, cross_in_mujoco_c
 from sim.mujoco_c.model import GROUND, crossing_model
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
@@ -41,15 +41,15 @@ def cross_and_keep(robot, policy, heights, starts, seconds, **how):
     """Crosses for so long [s]; the robots as they are then, and the result."""
     kept = []
 
-    class Kept(Episodes):
+    class Kept(EpisodeStates):
         def __init__(self, *given):
             super().__init__(*given)
             kept.append(self)
 
     robot = dataclasses.replace(robot, max_duration_s=seconds)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sim.mujoco_c.crossing.Episodes", Kept)
-        result = cross(robot, load_policy(policy, robot, "cpu"), heights, starts, **how)
+        patch.setattr("sim.mujoco_c.crossing.EpisodeStates", Kept)
+        result = cross_in_mujoco_c(robot, load_policy(policy, robot, "cpu"), heights, starts, **how)
     return kept[0], result
 
 

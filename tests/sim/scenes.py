@@ -134,4 +134,4 @@ def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
     """A rollout of 0.6 s, by default of robots that hold their pose; ``cfg`` are settings of the crossing."""
     robot = dataclasses.replace(robot, max_duration_s=cfg.pop("max_duration_s", 0.6))
     cfg = CrossingCfg(**{"poll_every_s": 0.1} | cfg)
-    return Rollout(robot, policy, num_terrains=num_terrains, num_replicas=replicas, device=device, cfg=cfg)
+    return Rollout(robot, policy, num_terrains=num_terrains, replicas=replicas, device=device, cfg=cfg)

@@ -13,6 +13,7 @@ from sim.rollout import Rollout
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.sim.policies import stretch
 from tests.sim.scenes import FLAT, ONLY_ANYMAL, spike
 
@@ -38,10 +39,15 @@ class FearsDepth:
         return torch.where((deep > 0.0) & (deep < 0.5), torch.nan, self.walker(row))
 
 
+def on_grids(rows):
+    """Some of the grids, with their seeds."""
+    return Terrains(heights=GRIDS[rows], seeds=SEEDS[rows])
+
+
 def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrains=6, duration_s=2.4):
     return Rollout(
         dataclasses.replace(robot, max_duration_s=duration_s),
-        policy or FearsDepth(robot, device), num_terrains=num_terrains, num_replicas=REPLICAS, device=device,
+        policy or FearsDepth(robot, device), num_terrains=num_terrains, replicas=REPLICAS, device=device,
         num_envs=num_envs, cfg=cfg,
     )  # fmt: skip
 
@@ -49,7 +55,7 @@ def rollout_of(robot, num_envs, policy=None, cfg=NEAR, device="cpu", num_terrain
 @pytest.fixture(scope="module")
 def alone(robot):
     """Every terrain crossed with one robot an episode."""
-    return rollout_of(robot, None).evaluate(GRIDS, SEEDS)
+    return rollout_of(robot, None).evaluate(on_grids(slice(None)))
 
 
 def check_same(expected, result, rows=slice(None)):
@@ -67,7 +73,7 @@ def test_any_number_of_robots_runs_the_same_episodes_in_any_order(robot, alone):
     assert len(np.unique(alone.duration_s)) > 8 and len(np.unique(alone.penalties[..., 0])) > 20
     queued, order = rollout_of(robot, 7), [2, 0, 5, 3, 1, 4]
     for rows in (slice(None), order, slice(3, 4)):
-        result = queued.evaluate(GRIDS[rows], SEEDS[rows])
+        result = queued.evaluate(on_grids(rows))
         check_same(alone, result, rows)
         assert result.robot_steps == 7 * result.physics_steps
 
@@ -79,15 +85,15 @@ def test_lots_run_into_each_other(anymal, alone):
 
     def put_third(share):
         if rollout.num_free == 2:
-            rollout.put(GRIDS[lots[2]], SEEDS[lots[2]])
+            rollout.put(on_grids(lots[2]))
 
     for rows in lots[:2]:
-        rollout.put(GRIDS[rows], SEEDS[rows])
+        rollout.put(on_grids(rows))
     results = [rollout.take(put_third)]
     assert rollout.num_free == 3
-    rollout.put(GENES, SEEDS[lots[3]])  # behind the others: in the last slot and in the first
+    rollout.put(Terrains(genes=GENES, seeds=SEEDS[lots[3]]))  # behind the others: in the last slot and in the first
     with pytest.raises(ValueError, match="terrains"):
-        rollout.put(GRIDS[:2], SEEDS[:2])
+        rollout.put(on_grids(slice(2)))
     results += [rollout.take() for _ in range(3)]
     for rows, result in zip(lots, results, strict=True):
         check_same(alone, result, rows)
@@ -104,13 +110,13 @@ def test_lots_run_into_each_other(anymal, alone):
 
 def test_lots_in_which_robots_go_on_after_the_goal(anymal):
     cfg = dataclasses.replace(NEAR, reward=True)
-    expected = rollout_of(anymal, None, cfg=cfg).evaluate(GRIDS[:4], SEEDS[:4])
+    expected = rollout_of(anymal, None, cfg=cfg).evaluate(on_grids(slice(4)))
     rollout = rollout_of(anymal, 6, cfg=cfg, num_terrains=3)
     lots = slice(0, 2), slice(2, 3), slice(3, 4)
     for rows in lots[:2]:
-        rollout.put(GRIDS[rows], SEEDS[rows])
+        rollout.put(on_grids(rows))
     results = [rollout.take()]
-    rollout.put(GRIDS[lots[2]], SEEDS[lots[2]])  # where robots of the first lot stood
+    rollout.put(on_grids(lots[2]))  # where robots of the first lot stood
     results += [rollout.take(), rollout.take()]
     for rows, result in zip(lots, results, strict=True):
         check_same(expected, result, rows)
@@ -124,7 +130,7 @@ def test_lots_in_which_robots_go_on_after_the_goal(anymal):
 def test_a_world_that_broke_and_a_failure_leave_a_rollout_that_works(anymal, alone):
     """Every robot's first episode ends in a state that is not finite, then the host fails: no later episode differs."""
     rollout = rollout_of(anymal, 4)
-    rollout.put(GRIDS[:1], SEEDS[:1])
+    rollout.put(on_grids(slice(1)))
     rollout.control_step()
     for array in (rollout.sim.joint_qd, rollout.sim.solver.mjw_data.qacc_warmstart):
         array.fill_(np.nan)
@@ -134,14 +140,14 @@ def test_a_world_that_broke_and_a_failure_leave_a_rollout_that_works(anymal, alo
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        rollout.evaluate(GRIDS[2:4], SEEDS[2:4], progress=stop)
-    check_same(alone, rollout.evaluate(GRIDS[:3], SEEDS[:3]), slice(0, 3))
+        rollout.evaluate(on_grids(slice(2, 4)), progress=stop)
+    check_same(alone, rollout.evaluate(on_grids(slice(3))), slice(0, 3))
 
 
 def test_an_episode_that_begins_in_contact_forgets_what_its_world_did_before(anymal):
     """Feet begin in the ground, so that the solver's first step has contacts, for which it would start warm."""
     low, how = dataclasses.replace(anymal, default_base_height=0.5), {"cfg": FAR, "duration_s": 0.1}
-    expected, queued = (rollout_of(low, num, stretch, **how).evaluate(GRIDS[:2], SEEDS[:2]) for num in (None, 1))
+    expected, queued = (rollout_of(low, num, stretch, **how).evaluate(on_grids(slice(2))) for num in (None, 1))
     check_same(expected, queued)
 
 
@@ -176,15 +182,15 @@ class CountsTogether(CountsByRow):
 
 def test_a_policy_that_remembers_begins_every_episode_anew(anymal):
     short = {"cfg": FAR, "duration_s": 1.0}
-    expected = rollout_of(anymal, None, CountsTogether(), **short).evaluate(GRIDS[:5], SEEDS[:5])
-    forgetful = rollout_of(anymal, None, stretch, **short).evaluate(GRIDS[:5], SEEDS[:5])
+    expected = rollout_of(anymal, None, CountsTogether(), **short).evaluate(on_grids(slice(5)))
+    forgetful = rollout_of(anymal, None, stretch, **short).evaluate(on_grids(slice(5)))
     assert not np.array_equal(expected.penalties, forgetful.penalties)
-    check_same(expected, rollout_of(anymal, 7, CountsByRow(), **short).evaluate(GRIDS[:5], SEEDS[:5]))
+    check_same(expected, rollout_of(anymal, 7, CountsByRow(), **short).evaluate(on_grids(slice(5))))
     # One that cannot forget single robots lets them begin together.
     policy = CountsTogether()
     rollout = rollout_of(anymal, 7, policy, **short)
-    rollout.put(GRIDS[:3], SEEDS[:3])
-    rollout.put(GRIDS[3:5], SEEDS[3:5])
+    rollout.put(on_grids(slice(3)))
+    rollout.put(on_grids(slice(3, 5)))
     check_same(expected, rollout.take(), slice(0, 3))
     check_same(expected, rollout.take(), slice(3, 5))
     assert policy.resets == 3  # 20 episodes on 7 robots: 7, 7, 6
@@ -200,7 +206,7 @@ def test_a_gpus_robots_run_the_same_episodes(anymal, device):
     """With the same starts to the bit; what follows differs by rounding, since a GPU adds in any order."""
     cfg = dataclasses.replace(NEAR, poll_every_s=0.1)
     queued, cpu = (
-        rollout_of(anymal, num_envs, cfg=cfg, device=where, duration_s=0.2).evaluate(GRIDS[[0, 2, 4]], SEEDS[:3])
+        rollout_of(anymal, num_envs, cfg=cfg, device=where, duration_s=0.2).evaluate(on_grids(np.array([0, 2, 4])))
         for num_envs, where in ((5, device), (None, "cpu"))
     )
     np.testing.assert_array_equal(queued.outcome, cpu.outcome)
@@ -210,11 +216,19 @@ def test_a_gpus_robots_run_the_same_episodes(anymal, device):
     np.testing.assert_allclose(queued.penalties[..., columns], cpu.penalties[..., columns], rtol=0.02, atol=2e-3)
 
 
-@pytest.mark.parametrize("failure", [RuntimeError("Failed to allocate 6000000000 bytes"), MemoryError()])
-def test_what_does_not_fit_the_device_is_said(anymal, monkeypatch, failure):
+OUT_OF_MEMORY = [
+    RuntimeError("Failed to allocate 6000000000 bytes on device 'cuda:0'"),  # as Warp says it
+    torch.OutOfMemoryError("CUDA out of memory."),
+    MemoryError(),
+]
+
+
+@pytest.mark.parametrize("failure", [*OUT_OF_MEMORY, RuntimeError("this controller is out of memory cells")])
+def test_only_what_does_not_fit_the_device_is_said_so(anymal, monkeypatch, failure):
     def fail(*args, **kwargs):
         raise failure
 
     monkeypatch.setattr("sim.rollout.TerrainBank", fail)
-    with pytest.raises(ValueError, match="--num-envs"):
+    error, field = (ValueError, "num_envs") if failure in OUT_OF_MEMORY else (RuntimeError, "memory cells")
+    with pytest.raises(error, match=field):
         rollout_of(anymal, None, stretch)

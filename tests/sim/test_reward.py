@@ -9,6 +9,7 @@ import pytest
 from kernels.episode import Outcome
 from sim.reward import Reward
 from sim.robots.training import RewardCfg, TrainingCfg
+from sim.terrains.terrains import Terrains
 from tests.sim.policies import stand
 from tests.sim.scenes import FLAT, crossing, positions, put, spike
 
@@ -37,7 +38,7 @@ def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
     # At the goal with the first physics step; the first command was to walk, the 29 after it to stand:
     # .02 s * (exp(-2.25) + 29) = .582.
     rollout = rewarded(tracker, device, start=(14.3, 4.0))
-    result = rollout.evaluate(FLAT[None], np.array([1]))
+    result = rollout.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1])))
     assert result.reached_goal.all()
     np.testing.assert_allclose(result.duration_s, tracker.physics_dt, atol=1e-6)
     assert result.physics_steps == 120
@@ -52,7 +53,7 @@ def test_a_base_collision_costs_its_price_once_and_nothing_is_paid_after_it(anym
     robot, totals = paid_for(anymal, only_positive=True, termination=-200.0, tracking_lin_vel=1.0), []
     for duration in (0.8, 1.6):
         rollout = rewarded(robot, device, start=(start, 4.0), max_duration_s=duration)
-        result = rollout.evaluate(spike(start)[None], np.array([1]))
+        result = rollout.evaluate(Terrains(heights=spike(start)[None], seeds=np.array([1])))
         assert (result.base_collision if start == 2.0 else result.reached_goal).all()
         assert result.physics_steps < 160  # it was noticed that nobody earns any more
         totals.append(result.reward)
@@ -73,7 +74,7 @@ def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker,
             q[episode == 2, 8] = np.nan
         put(rollout.sim, q)
 
-    result = rollout.evaluate(np.stack([FLAT, FLAT]), np.arange(2), progress=break_one)
+    result = rollout.evaluate(Terrains(heights=np.stack([FLAT, FLAT]), seeds=np.arange(2)), progress=break_one)
     assert result.outcome[:, 0].tolist() == [Outcome.INVALID, Outcome.GOAL]
     assert np.isnan(result.reward[0, 0]) and np.isfinite(result.reward.ravel()[1:]).all()
     # 11 steps told to walk, 9 told to stand, and then no more.
@@ -88,7 +89,7 @@ def test_asking_for_the_reward_changes_nothing_else(anymal):
             anymal, "cpu", anymal.policy_file, num_terrains=2, replicas=3, start=(13.3, 4.0), start_position_range=0.1,
             start_velocity_range=0.2, start_joint_range=0.2, max_duration_s=1.2, reward=reward,
         )  # fmt: skip
-        results.append(rollout.evaluate(np.stack([FLAT, spike(13.3)]), np.array([5, 6])))
+        results.append(rollout.evaluate(Terrains(heights=np.stack([FLAT, spike(13.3)]), seeds=np.array([5, 6]))))
     without, paid = results
     assert len(np.unique(without.outcome)) >= 2 and without.reached_goal.any()
     for field in ("penalties", "outcome", "fallen", "duration_s", "final_position"):

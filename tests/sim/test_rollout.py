@@ -7,6 +7,7 @@ from kernels.episode import Invalidity, Outcome
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.sim.policies import Remembers
 from tests.sim.scenes import FLAT, crossing, positions, put
 
@@ -20,7 +21,7 @@ def rollout(anymal, device):
 
 def test_a_robot_that_stands_times_out(anymal, device):
     # "Success" without the goal: the full time, no collision, upright, still at the start.
-    result = crossing(anymal, device).evaluate(FLAT[None], np.array([1]))
+    result = crossing(anymal, device).evaluate(Terrains(heights=FLAT[None], seeds=np.array([1])))
     assert (result.outcome == Outcome.TIME_OUT).all()
     assert not (result.base_collision | result.reached_goal | result.invalid | result.fallen).any()
     np.testing.assert_allclose(result.duration_s, 0.6, atol=1e-6)
@@ -33,8 +34,8 @@ def test_a_robot_that_stands_times_out(anymal, device):
 
 def test_the_shipped_controller_walks_to_the_edge_of_the_goal(robot, device):
     terrains = np.stack([FLAT, crossing_terrain("stairs_up_down", 4, 3)])
-    rollout = Rollout(robot, robot.policy_file, num_terrains=2, num_replicas=4, device=device)
-    result = rollout.evaluate(terrains, np.array([1, 2], np.uint32))
+    rollout = Rollout(robot, robot.policy_file, num_terrains=2, replicas=4, device=device)
+    result = rollout.evaluate(Terrains(heights=terrains, seeds=np.array([1, 2], np.uint32)))
     assert result.reached_goal.all() and not result.fallen.any()
     # 11.5 m at 0.75 m/s: it keeps up with its command, and does not run ahead of it.
     assert ((result.duration_s > 14.0) & (result.duration_s < 18.0)).all()
@@ -45,8 +46,8 @@ def test_the_shipped_controller_walks_to_the_edge_of_the_goal(robot, device):
 
 def test_a_robot_whose_legs_whip_as_it_falls_has_failed(cassie, device):
     # On this terrain all eight fall, and two of them swing an ankle at more than 100 rad/s before the pelvis is down.
-    rollout = Rollout(cassie, cassie.policy_file, num_terrains=1, num_replicas=8, device=device)
-    result = rollout.evaluate(SUPER_GAUSSIAN.hard_random(300, 0)[7:8], np.array([7], np.uint32))
+    rollout = Rollout(cassie, cassie.policy_file, num_terrains=1, replicas=8, device=device)
+    result = rollout.evaluate(Terrains(genes=SUPER_GAUSSIAN.hard_random(300, 0)[7:8], seeds=np.array([7], np.uint32)))
     assert result.base_collision.sum() >= 6 and not result.invalid.any()
 
 
@@ -61,7 +62,7 @@ def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
         q[:, 3], q[:, 6] = np.sin(own / 2), np.cos(own / 2)
         put(flyer.sim, q)
 
-    result = flyer.evaluate(FLAT[None], np.array([1]), progress=turn)
+    result = flyer.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1])), progress=turn)
     assert result.fallen.tolist() == [[False, False, True, True]]
     assert (result.outcome == Outcome.TIME_OUT).all()  # tilt alone ends nothing
 
@@ -69,7 +70,7 @@ def test_a_robot_has_fallen_that_tilts_by_more_than_60_degrees(anymal, device):
 def test_robots_that_are_done_wait_above_the_ground(anymal, device):
     # One starts at the goal, the other walks on: the first is over at once and touches nothing from then on.
     rollout = crossing(anymal, device, replicas=2, num_terrains=2, start=(2.0, 4.0), goal_radius=0.5)
-    rollout.put(np.stack([FLAT, FLAT]), np.arange(2))
+    rollout.put(Terrains(heights=np.stack([FLAT, FLAT]), seeds=np.arange(2)))
     q, first = positions(rollout.sim), rollout.episode.numpy() == 0
     q[first, :2] = 14.0, 4.0
     put(rollout.sim, q)
@@ -85,7 +86,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout):
     rough, seeds = [crossing_terrain(kind, 9, 2) for kind in ("stairs_up_down", "boxes", "noise")], np.arange(TERRAINS)
     grids = np.stack([FLAT, *rough])
     shares = []
-    clean = rollout.evaluate(grids, seeds, progress=shares.append)
+    clean = rollout.evaluate(Terrains(heights=grids, seeds=seeds), progress=shares.append)
     assert shares == [5 * k / 30 for k in range(1, 7)]  # at every poll
 
     def break_one(share):
@@ -93,7 +94,7 @@ def test_a_broken_state_is_invalid_and_harms_nobody_else(rollout):
         values[rollout.episode.numpy() == 6, 8] = 3000.0  # terrain 1, replica 2
         rollout.sim.joint_qd.assign(values)
 
-    result = rollout.evaluate(grids, seeds, progress=break_one)
+    result = rollout.evaluate(Terrains(heights=grids, seeds=seeds), progress=break_one)
     expected = np.zeros((TERRAINS, REPLICAS), bool)
     expected[1, 2] = True
     np.testing.assert_array_equal(result.invalid, expected)
@@ -111,7 +112,7 @@ def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_the
     # The 51st control step begins at 1 s; its first physics step of 0.005 s is judged invalid. Clipping made a limit of
     # NaN once: robots threw themselves about, and fell as others do.
     rollout = crossing(anymal, device, Remembers(most=50), max_duration_s=1.2)
-    result = rollout.evaluate(FLAT[None], np.array([1]))
+    result = rollout.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1])))
     assert (result.invalidity == Invalidity.ACTION).all() and result.invalid.all()
     np.testing.assert_allclose(result.duration_s, 1.005, atol=1e-6)
 
@@ -119,4 +120,4 @@ def test_actions_that_are_not_finite_make_their_episodes_invalid_in_the_step_the
 def test_wrong_input_is_named(rollout):
     for num_terrains, num_seeds, field in ((5, 5, "terrains"), (0, 0, "terrains"), (4, 3, "seeds")):
         with pytest.raises(ValueError, match=field):
-            rollout.evaluate(np.zeros((num_terrains, 64)), np.arange(num_seeds))
+            rollout.evaluate(Terrains(heights=np.zeros((num_terrains, 64)), seeds=np.arange(num_seeds)))

@@ -9,7 +9,7 @@ import torch
 from qd.faults.searches import controllers_in
 from sim.controllers.described import read_controller
 from sim.controllers.loaders import load_policy
-from sim.mujoco_c.crossing import cross, draw_starts
+from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.find import get_robot
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_toml
@@ -89,7 +89,7 @@ def test_it_learns_goes_on_and_crosses(robot, tmp_path, capsys):
     torch.testing.assert_close(copy.network(rows), after.network(rows))
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
     brief = replace(robot, max_duration_s=0.2)
-    assert not cross(brief, after, flat, draw_starts(brief, flat, 2, 3, "cpu")).invalid.any()
+    assert not cross_in_mujoco_c(brief, after, flat, draw_starts(brief, flat, 2, 3, "cpu")).invalid.any()
     (tmp_path / "further").mkdir()
     # As a hardening does: with its critic.
     further = begun(robot, cfg_of(robot, policy=str(run / "checkpoint.pt")), tmp_path / "further")

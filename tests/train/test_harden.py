@@ -13,7 +13,7 @@ from kernels.episode import Outcome
 from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.evaluate.sets import generated_set, make_sets, split_elites
 from qd.search.archive import read_archive, write_archive
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
 from sim.robots.find import get_robot
@@ -76,7 +76,7 @@ class World:
     def open(self, cfg):
         def evaluate(terrains, seeds, progress=None):
             arrive = "tune-" in cfg.policy and not any(f"/{name}/" in cfg.policy for name in self.worse)
-            ends = np.full((len(seeds), cfg.num_replicas), Outcome.BASE_COLLISION, np.uint8)
+            ends = np.full((len(seeds), cfg.replicas), Outcome.BASE_COLLISION, np.uint8)
             ends[:, 1::2] = Outcome.GOAL if arrive else Outcome.BASE_COLLISION
             return result_of(ends, names=ROBOT.penalties, reward=np.ones(ends.shape))
 

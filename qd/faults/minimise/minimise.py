@@ -21,8 +21,8 @@ from qd.faults.stages.base import Judging
 from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
 from qd.search.directory import claimed
 from qd.show.figures import draw_minimal, save_figure
-from qd.workers.cross import Crossings
-from qd.workers.evaluator import Compute, check_policy
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import Crosser
 from sim.controllers.spec import controller_identity
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import choose_elites, command_line
@@ -60,7 +60,7 @@ def minimise(
     if judged:
         check_certifiers(certifiers, search, compute.device)
     device_kind = compute.device.partition(":")[0]
-    with claimed(run), Crossings(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crossings:
+    with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crosser:
         archive = search.read_archive()
         numbers = _choose_failing(archive, elite, search, max_elites=_MAX_ELITES[device_kind])
         cases = {
@@ -68,10 +68,10 @@ def minimise(
                 archive, n, search.space, search.robot.footprint[1], how, on_gpu=device_kind == "cuda"
             ) for n in numbers
         }  # fmt: skip
-        minima = take_apart(archive, cases, search, crossings)
+        minima = take_apart(archive, cases, search, crosser)
         elites = _as_elites(archive, minima, search.space)
         if judged:
-            judging = Judging(search=search, certifiers=certifiers, crossings=crossings)
+            judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
             for stage in ("resolved", "others"):
                 elites = STAGES[stage].run(elites, judging)
         if not numbers:

@@ -20,9 +20,10 @@ from qd.faults.searches import Search
 from qd.faults.stages.base import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.terrains import Terrains
 
 SCALE_STEPS = 5
 """Halvings of the interval that holds the least scale which still fails: it is known to 1/32."""
@@ -215,7 +216,7 @@ def open_case(
     )
 
 
-def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crossings: Crossings) -> dict[int, Minimal]:
+def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crosser: Crosser) -> dict[int, Minimal]:
     """Finds the minimal terrains of some elites, all of them together, by number of the elite; counts of cases grow.
 
     All subsets of an elite are crossed from the same starts, fresh episodes from others. Starts follow from the
@@ -227,13 +228,18 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, cros
         seeds[fresh] = elite_seeds(archive, search.cfg.seed, times, stream=stream).reshape(-1, times)
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
     minima = dict[int, Minimal]()
+    room = _max_rows(cases.values())
     while trials := _next_trials(steps, minima):
         rows = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
-        result = crossings.cross(
-            search.policy, np.concatenate(rows), np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
-            replicas=_ROW_EPISODES, space=search.space.name, at_most=_max_rows(cases.values()), invalid_ok=True,
-            label=f"{len(minima)} of {len(cases)} elites done",
-        )  # fmt: skip
+        terrains = Terrains(
+            genes=np.concatenate(rows),
+            seeds=np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
+            space=search.space,
+        )
+        label = f"{len(minima)} of {len(cases)} elites done"
+        result = crosser.cross(
+            search.policy, terrains, replicas=_ROW_EPISODES, room=room, invalid_ok=True, label=label
+        )
         ends = np.cumsum([trial.rows for _, trial in trials])
         for (number, trial), counts in zip(trials, np.split(count_outcomes(result), ends[:-1]), strict=True):
             cases[number].counts[trial] = counts.sum(axis=0)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from qd.faults.numbers import EPISODES
 from qd.faults.searches import Search
 from qd.search.archive import Archive
-from qd.workers.cross import Crossings, How
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
 from qd.workers.seeds import Stream
 from sim.rollout import RolloutResult
+from sim.terrains.terrains import Terrains
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,18 +25,18 @@ class Judging:
     search: Search
     certifiers: Mapping[str, str]
     """Other controllers by name."""
-    crossings: Crossings
+    crosser: Crosser
 
     def cross(
         self, archive: Archive, rows: NDArray[np.int64], policy: str, *, stream: Stream, label: str,
-        how: How = "searched",
+        engine: Engine = "search",
     ) -> NDArray[np.int64]:  # fmt: skip
         """Outcomes of 20 episodes of a controller on some elites, shape (len(rows), 4)."""
         seeds = elite_seeds(archive, self.search.cfg.seed, stream=stream)[rows]
-        result = self.crossings.cross(
-            policy, archive.genes[rows], seeds, replicas=EPISODES, space=self.search.space.name, how=how, label=label,
-            invalid_ok=True,
-        )  # fmt: skip
+        terrains = Terrains(genes=archive.genes[rows], seeds=seeds, space=self.search.space)
+        result = self.crosser.cross(
+            policy, terrains, replicas=EPISODES, engine=engine, label=label, invalid_ok=True
+        )
         return count_outcomes(result)
 
 

@@ -12,6 +12,7 @@ from qd.search.archive import Archive, FreshValues
 from qd.search.fitness import BIT_EPISODES, FitnessCfg, evaluate_rollout
 from qd.workers.seeds import Stream
 from sim.rollout import RolloutResult
+from sim.terrains.terrains import Terrains
 
 
 class Fresh(Stage):
@@ -26,10 +27,9 @@ class Fresh(Stage):
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with fresh values, families and causes, by descending corrected fitness."""
         search = judging.search
-        result = judging.crossings.cross(
-            search.policy, archive.genes, elite_seeds(archive, search.cfg.seed, stream=Stream.FRESH),
-            replicas=FRESH_EPISODES, space=search.space.name, label="fresh episodes",
-        )  # fmt: skip
+        seeds = elite_seeds(archive, search.cfg.seed, stream=Stream.FRESH)
+        terrains = Terrains(genes=archive.genes, seeds=seeds, space=search.space)
+        result = judging.crosser.cross(search.policy, terrains, replicas=FRESH_EPISODES, label="fresh episodes")
         corrected = archive.corrected_by(fresh_values(archive, result, search.cfg.fitness))
         if not np.array_equal(archive.cell, corrected.cell):
             print(f"Elites of {search.run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)

@@ -42,7 +42,7 @@ class Others(Stage):
             crossed = goal_rates(outcomes) >= FAILING_GOAL_RATE
             resolved = np.zeros_like(outcomes)
             resolved[crossed] = judging.cross(
-                archive, rows[crossed], policy, how="resolved", stream=Stream.OTHERS_RESOLVED,
+                archive, rows[crossed], policy, engine="resolved", stream=Stream.OTHERS_RESOLVED,
                 label=f"{name}, contact resolved",
             )  # fmt: skip
             archive = _add_outcomes(archive, name, policy, rows, outcomes, resolved)

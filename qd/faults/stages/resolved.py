@@ -23,6 +23,6 @@ class Resolved(Stage):
         """The archive with outcomes of the controller that was searched."""
         rows = np.flatnonzero(archive.failing)
         outcomes = judging.cross(
-            archive, rows, judging.search.policy, how="resolved", stream=Stream.RESOLVED, label="contact resolved"
+            archive, rows, judging.search.policy, engine="resolved", stream=Stream.RESOLVED, label="contact resolved"
         )
         return replace(archive, resolved_outcomes=put_rows(archive.resolved_outcomes, rows, outcomes))

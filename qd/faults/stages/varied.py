@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +10,13 @@ from numpy.typing import NDArray
 from qd.faults.numbers import EPISODES
 from qd.faults.stages.base import Judging, Stage, count_outcomes, elite_seeds, put_rows
 from qd.search.archive import OUTCOMES, Archive
+from qd.workers.compute import Compute
+from qd.workers.pipeline import PipelineCfg, build_simulator
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
-from sim.rollout import Rollout
 from sim.terrains.spaces.registry import load_space
 from sim.terrains.spaces.under_conditions import varied_genes, varied_name
+from sim.terrains.terrains import Terrains
 
 
 class Varied(Stage):
@@ -35,9 +38,10 @@ class Varied(Stage):
         """Refuses a search that cannot have conditions, and faults whose certifier is not at hand."""
         _check_certifiers(archive, judging, renewed="others" in before)
         if before:  # else the stage itself finds out at once
-            search, device = judging.search, judging.crossings.compute.device
-            space = load_space(varied_name(search.space))
-            Rollout(search.robot, search.policy, num_terrains=1, num_replicas=1, device=device, space=space)
+            search, compute = judging.search, judging.crosser.compute
+            local = Compute(compute.device if compute.on_gpu else "cpu")
+            sizes: dict[str, Any] = {"num_terrains": 1, "replicas": 1, "space": varied_name(search.space)}
+            build_simulator(PipelineCfg(compute=local, robot=search.robot, policy=search.policy, **sizes), 1)
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with outcomes of all controllers under the same conditions."""
@@ -49,10 +53,10 @@ class Varied(Stage):
         genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, space.num_genes)
 
         def cross(policy: str, chosen: NDArray[np.bool_], label: str) -> NDArray[np.int64]:
-            result = judging.crossings.cross(
-                policy, genes[chosen].reshape(-1, space.num_genes), seeds[chosen].ravel(), replicas=1,
-                space=space.name, label=f"{label}, varied conditions", invalid_ok=True,
-            )  # fmt: skip
+            chosen_genes = genes[chosen].reshape(-1, space.num_genes)
+            terrains = Terrains(genes=chosen_genes, seeds=seeds[chosen].ravel(), space=space)
+            label = f"{label}, varied conditions"
+            result = judging.crosser.cross(policy, terrains, replicas=1, label=label, invalid_ok=True)
             return count_outcomes(result).reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
 
         searched = cross(search.policy, np.ones(len(rows), bool), "searched")

@@ -18,7 +18,7 @@ from qd.show.report.evaluation import compare_controllers, write_rounds
 from qd.show.report.page import Table, check_page, encode_figure, publish_page
 from qd.show.report.pictures import explain_missing_pictures, find_failure, find_same_moment, render_close_pictures
 from qd.show.report.search import collect_content
-from qd.workers.evaluator import check_policy, resolve_device
+from qd.workers.compute import check_policy, choose_device
 from sim.controllers.spec import resolve_policy
 from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
@@ -69,7 +69,7 @@ def write_report(
     missing = [_explain_no_crossings(opened_run, policy, device)]
     if not missing[0]:
         missing = [explain_missing_pictures()]
-        recordings = Recordings(opened_run.robot, device=resolve_device(device), cross=cross)
+        recordings = Recordings(opened_run.robot, device=choose_device(device), cross=cross)
         cases = cross_cases(
             opened_run, ranking, controller, heads, others, recordings, episodes=episodes, pictured=not missing[0]
         )
@@ -99,7 +99,7 @@ def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[i
 def _explain_no_crossings(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
     """Why the search's controller cannot cross terrains, empty if it can; a controller of the user must be able to."""
     try:
-        check_policy(opened_run.policy(policy), opened_run.robot, resolve_device(device))
+        check_policy(opened_run.policy(policy), opened_run.robot, choose_device(device))
     except ValueError as error:
         if policy is not None:
             raise

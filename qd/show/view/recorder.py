@@ -39,11 +39,11 @@ class Simulator:
 
     def __init__(self, cancelled: Event, num_terrains: int) -> None:
         import sim.simulation  # noqa: F401  Newton takes seconds to load: now, and not when somebody waits
-        from qd.show.recordings import Simulation
+        from qd.show.recordings import RecordingCrosser
 
         self._cancelled = cancelled
-        self._make_simulation = Simulation
-        self._simulation: Simulation | None = None
+        self._make_crosser = RecordingCrosser
+        self._crosser: RecordingCrosser | None = None
 
     def put(self, task: Any, robot: Any) -> None:
         """Accept a task of a robot."""
@@ -62,8 +62,8 @@ class Simulator:
             if isinstance(self._task, partial):
                 self._task(progress=report)
                 return self._task.keywords["out"]
-            self._simulation = self._simulation or self._make_simulation(self._robot, "cpu")
-            return self._simulation([self._task], report)[0]
+            self._crosser = self._crosser or self._make_crosser(self._robot, "cpu")
+            return self._crosser([self._task], report)[0]
         except _CancelledError:
             return None
         except (ValueError, OSError) as error:

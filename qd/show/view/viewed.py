@@ -13,7 +13,7 @@ from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Wanted, on_elite
 from qd.show.view.listing import Listing
-from qd.workers.evaluator import check_policy
+from qd.workers.compute import check_policy
 from sim.controllers.spec import ControllerSpec, parse_controllers
 from sim.robots.robot import RobotCfg
 

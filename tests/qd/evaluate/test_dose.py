@@ -40,9 +40,9 @@ def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
     assert first["interval"] == pytest.approx([0.757, 1.0], abs=1e-3) and first["resolved"] is False
     half = {(row["element"], row["controller"]): row["value"] for row in report["half"]}
     assert half["step_up", "base"] == pytest.approx(0.15) and half["step_up", "C-G"] == pytest.approx(0.275)
-    assert not any(cfg.resolved for cfg in robots.opened)
+    assert not any(cfg.engine == "resolved" for cfg in robots.opened)
     resolved = measure_dose(anymal, controllers, doses, resolved=True, **given)
-    assert robots.opened[-1].resolved and all(row["resolved"] for row in resolved["dose"])
+    assert robots.opened[-1].engine == "resolved" and all(row["resolved"] for row in resolved["dose"])
     assert Path("runs/anymal-dose/dose-resolved.json").exists()
 
 

@@ -15,7 +15,7 @@ from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
 from qd.evaluate.tables import is_regression
 from qd.search.archive import write_archive
-from qd.workers.evaluator import Compute
+from qd.workers.compute import Compute
 from sim.files.command import run_command
 from tests.builders import make_archive
 from tests.qd.robots import Robots
@@ -71,7 +71,7 @@ def test_the_tables_from_end_to_end(anymal, archive, tmp_path):
     assert mended == sorted(split_elites(make_archive(30)).test[:4].tolist())
     # Each controller crossed four sets, in one simulation a size; the far elites are among the generated ones.
     assert [cfg.policy for cfg, _ in robots.crossed] == [STAND] * 16 + [STRETCH] * 16
-    assert all(cfg.reward and cfg.num_replicas == 2 for cfg in robots.opened)
+    assert all(cfg.reward and cfg.replicas == 2 for cfg in robots.opened)
 
 
 @pytest.mark.parametrize("where", ["test", "independent"])

@@ -89,9 +89,9 @@ def crosses(policy, resolved, genes):
 
 
 def result_of(cfg, genes, seeds):
-    if cfg.num_replicas == 40:
+    if cfg.replicas == 40:
         return stand_in.evaluate(genes, seeds, 40)
-    return ~crosses(cfg.policy, cfg.resolved, genes)
+    return ~crosses(cfg.policy, cfg.engine == "resolved", genes)
 
 
 def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
@@ -105,7 +105,7 @@ def numbers_in(path):
 
 def test_bars_say_how_many_are_to_come(path, monkeypatch):
     bars = []
-    monkeypatch.setattr("qd.workers.cross.Bar", lambda text: bars.append(text) or Bar(text))
+    monkeypatch.setattr("qd.workers.crosser.Bar", lambda text: bars.append(text) or Bar(text))
     judged(path)
     assert bars == ["1 of 3: contact resolved", "2 of 3: C-G", "3 of 3: C-G, contact resolved"]
 
@@ -136,7 +136,10 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     faults = int((failing & again & other).sum())
     assert 0 < faults < (failing & again).sum() < failing.sum() < len(archive)
     # A controller that does not cross at the search's settings is not asked with contact resolved.
-    asked = [[cfg.resolved for cfg, _ in robots.crossed if cfg.policy == policy] for policy in (SHIPPED, OTHER["C-G"])]
+    asked = [
+        [cfg.engine == "resolved" for cfg, _ in robots.crossed if cfg.policy == policy]
+        for policy in (SHIPPED, OTHER["C-G"])
+    ]
     assert asked[0] == [True] * failing.sum()
     assert (asked[1].count(False), asked[1].count(True)) == (failing.sum(), (failing & once).sum())
     assert len(set(robots.seeds)) == len(robots.seeds)

@@ -259,7 +259,7 @@ def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
 
     @contextlib.contextmanager
     def opener(cfg):
-        yield stand_in.Stub(lambda genes, seeds: noisy(genes, seeds, cfg.num_replicas))
+        yield stand_in.Stub(lambda genes, seeds: noisy(genes, seeds, cfg.replicas))
 
     scheduler = dataclasses.replace(CFG.scheduler, method="map_elites", emitters=4, batch_size=15)
     once = run(tmp_path / "once", opener=opener, scheduler=scheduler, iterations=20)

@@ -162,7 +162,7 @@ def test_a_gif_has_as_many_colours_as_its_size_allows():
 def run(tmp_path, monkeypatch):
     """The newest run: three elites; the simulation is replaced."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("qd.show.recordings.Simulation", lambda robot, device: stand_in_cross([]))
+    monkeypatch.setattr("qd.show.recordings.RecordingCrosser", lambda robot, device: stand_in_cross([]))
     monkeypatch.setattr("qd.show.film.FPS", 2)
     monkeypatch.setattr("qd.show.film.GIF_FPS", 2.0)
     return write_run(Path("runs/anymal-small-0"), small_archive(3))

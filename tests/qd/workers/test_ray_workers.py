@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.workers.evaluator import EvaluatorCfg, open_evaluator, resolve_device
+from qd.workers.compute import Compute, choose_device
+from qd.workers.crosser import open_pipeline
+from qd.workers.pipeline import PipelineCfg
+from sim.terrains.terrains import Terrains
 from tests.builders import free_port
 from tests.qd import crossers, stand_in
 
@@ -21,15 +24,16 @@ Cluster = pytest.importorskip("ray.cluster_utils").Cluster
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 120.0
-CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=8, num_replicas=4, device="cpu", workers="ray:2")
+CFG = PipelineCfg(robot="anymal", policy="p", num_terrains=8, replicas=4, compute=Compute(workers="ray:2"))
 GENES = np.random.default_rng(0).uniform(-1, 1, (21, 64)).astype(np.float32)
 SEEDS = np.arange(100, 121, dtype=np.uint32)
+TERRAINS = Terrains(genes=GENES, seeds=SEEDS)
 
 
 @pytest.fixture(scope="module")
 def cluster():
     """One Ray for the tests of the file, ended after them."""
-    resolve_device("cpu", "ray:4")
+    choose_device("cpu", "ray:4")
     yield
     ray.shutdown()
 
@@ -42,7 +46,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
     def interrupt(share: float) -> None:
         raise KeyboardInterrupt
 
-    with open_evaluator(dataclasses.replace(CFG, workers="ray:3"), build=crossers.Crosser) as evaluate:
+    with open_pipeline(dataclasses.replace(CFG, workers="ray:3"), build=crossers.Crosser) as evaluate:
         for count in (1, 8, 21):
             assert_crossed(evaluate(GENES[:count], SEEDS[:count]), slice(count))
         with pytest.raises(KeyboardInterrupt):
@@ -61,7 +65,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
 @pytest.mark.parametrize("how", ["die", "raise", "nan"])
 def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, how):
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:3")
-    with open_evaluator(cfg, build=crossers.Failing) as evaluate:
+    with open_pipeline(cfg, build=crossers.Failing) as evaluate:
         for _ in range(3):
             assert_crossed(evaluate(GENES, SEEDS), slice(21))
         assert evaluate.status().retries == 3
@@ -69,25 +73,27 @@ def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, h
 
 def test_what_every_worker_refuses_ends_the_evaluation(cluster, tmp_path):
     cfg = dataclasses.replace(CFG, policy=f"refuse:{tmp_path}:99")
-    with pytest.raises(ValueError, match="terrains"), open_evaluator(cfg, build=crossers.Failing) as evaluate:
+    with pytest.raises(ValueError, match="terrains"), open_pipeline(cfg, build=crossers.Failing) as evaluate:
         evaluate(GENES[:8], SEEDS[:8])
 
 
 def test_a_worker_of_other_code_is_refused(cluster, monkeypatch):
     monkeypatch.setattr("qd.workers.ray_workers.code_fingerprint", lambda rooms: "of this machine")
-    with pytest.raises(ValueError, match="code"), open_evaluator(CFG, build=crossers.Crosser):
+    with pytest.raises(ValueError, match="code"), open_pipeline(CFG, build=crossers.Crosser):
         pass
 
 
 GROWING_RUN = """
 import sys, time
 from tests.qd import crossers
-from tests.qd.workers.test_ray_workers import CFG, GENES, SEEDS, open_evaluator, resolve_device
-resolve_device("cpu", "ray")
-with open_evaluator(CFG.__class__(**{**vars(CFG), "workers": "ray"}), build=crossers.Crosser) as evaluate:
+from tests.qd.workers.test_ray_workers import CFG, TERRAINS, open_pipeline
+from qd.workers.compute import Compute, choose_device
+choose_device("cpu", "ray")
+cfg = CFG.__class__(**{**vars(CFG), "compute": Compute(workers="ray")})
+with open_pipeline(cfg, build=crossers.Crosser) as evaluate:
     for line in sys.stdin:  # how many workers to wait for
         while True:
-            total = evaluate(GENES, SEEDS).penalties.sum()
+            total = evaluate(TERRAINS).penalties.sum()
             if evaluate.status().workers == int(line):
                 break
             time.sleep(0.1)
@@ -125,4 +131,4 @@ def test_no_cluster_at_the_address_is_an_error(monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{free_port()}")
     monkeypatch.setattr("ray.is_initialized", lambda: False)  # other tests have a Ray of their own
     with pytest.raises(OSError, match="RAY_ADDRESS"):
-        resolve_device("cpu", "ray:2")
+        choose_device("cpu", "ray:2")

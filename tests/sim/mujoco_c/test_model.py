@@ -11,12 +11,13 @@ from kernels.episode import Invalidity, Outcome
 from kernels.penalties import penalty_columns
 from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
-from sim.mujoco_c.crossing import Episodes, cross, cross_terrains, draw_starts
+from sim.mujoco_c.crossing import EpisodeStates, MujocoC, cross_in_mujoco_c, draw_starts
 from sim.mujoco_c.model import GROUND, crossing_model, to_mujoco
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.kernels import oracle
 from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
 from tests.sim.plain_mujoco import cross_and_keep, rays_from_above
@@ -28,8 +29,8 @@ FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
 
 def test_starts_are_those_of_the_rollout(robot):
-    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=EPISODES, device="cpu")
-    rollout.put(SUPER_GAUSSIAN.hard_random(1, 5), np.array([77], np.uint32))
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=EPISODES, device="cpu")
+    rollout.put(Terrains(genes=SUPER_GAUSSIAN.hard_random(1, 5), seeds=np.array([77], np.uint32)))
     sim = rollout.sim
     expected = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.sensors.base_com))
     # Asking for more episodes does not change the first.
@@ -91,8 +92,8 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
         metres, radians = 5e-4, 0.01
     policy = robot.policy_file if robot.name == "anymal" else "tests.sim.policies:sway"
     shipped, robot, solver = robot, dataclasses.replace(robot, **changes), SolverCfg(time_constant_s=time_constant_s)
-    rollout = Rollout(robot, policy, num_terrains=1, num_replicas=EPISODES, device="cpu", solver=solver)
-    rollout.put(FLAT[None], np.array([1000], np.uint32))
+    rollout = Rollout(robot, policy, num_terrains=1, replicas=EPISODES, device="cpu", solver=solver)
+    rollout.put(Terrains(heights=FLAT[None], seeds=np.array([1000], np.uint32)))
     starts = draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
     plain, result = cross_and_keep(robot, policy, FLAT, starts, seconds, time_constant_s=time_constant_s)
     for _ in range(round(seconds / robot.control_dt)):
@@ -131,7 +132,7 @@ def test_a_motor_gives_what_its_speed_leaves_it_in_both(tmp_path, device, kind):
     sim.physics_step()
     np.testing.assert_allclose(sim.joint_torque.numpy()[:, 6 + joint], TORQUES, atol=1e-4)
     everyone, starts = np.arange(len(SPEEDS)), to_mujoco(standing(robot, len(SPEEDS), z=5.0), joint_qd, np.zeros(3))
-    plain = Episodes(robot, crossing_model(robot, FLAT), starts)
+    plain = EpisodeStates(robot, crossing_model(robot, FLAT), starts)
     plain.hold(everyone, pose[:, 7:])
     plain.step(everyone)
     np.testing.assert_allclose([data.qfrc_actuator[6 + joint] for data in plain.data], TORQUES, atol=1e-9)
@@ -143,7 +144,7 @@ def test_a_target_counts_after_the_delay_in_both(tmp_path, device):
     pose, everyone = standing(robot, 2, z=5.0), np.arange(2)
     sim = simulate(robot, np.repeat(FLAT[None], 2, axis=0), device)
     put(sim, pose)
-    plain = Episodes(robot, crossing_model(robot, FLAT), to_mujoco(pose, np.zeros((2, 14)), np.zeros(3)))
+    plain = EpisodeStates(robot, crossing_model(robot, FLAT), to_mujoco(pose, np.zeros((2, 14)), np.zeros(3)))
     pose[:, 7] += 0.1  # 6 N m
     sim.targets.assign(np.float32(pose))
     plain.hold(everyone, pose[:, 7:])
@@ -167,7 +168,7 @@ def test_what_ends_a_crossing(robot):
     starts.qpos[2, 2] = 0.05  # its belly in the ground
     starts.qvel[3, 8] = 5000.0  # a joint far too fast
     policy = load_policy(robot.policy_file, robot, "cpu")
-    result = cross(dataclasses.replace(robot, max_duration_s=0.1), policy, heights, starts)
+    result = cross_in_mujoco_c(dataclasses.replace(robot, max_duration_s=0.1), policy, heights, starts)
     assert result.outcome.tolist() == [[Outcome.GOAL, Outcome.OUT, Outcome.BASE_COLLISION, Outcome.INVALID]]
     assert result.invalidity.tolist() == [[0, 0, 0, Invalidity.STATE]]
     assert result.penalty_names == robot.penalties
@@ -176,27 +177,25 @@ def test_what_ends_a_crossing(robot):
 
 
 @pytest.mark.slow
-def test_episodes_shared_out_over_processes_come_back_in_order(cassie):
-    """Those of a terrain in two parts, at the search's settings, are what one process says of each start."""
-    crossed = cross_terrains(
-        cassie, "tests.sim.policies:stand", np.stack([FLAT, FLAT + np.float32(0.2)]), np.uint32([3, 4]),
-        space=SUPER_GAUSSIAN, num_episodes=26, processes=2, resolved=False,
-    )  # fmt: skip
-    for number, result in zip(range(2), crossed, strict=True):
-        heights = FLAT + np.float32(0.2 * number)
-        starts = draw_starts(cassie, heights, 3 + number, 26, "cpu")
-        expected = cross(cassie, stand, heights, starts[25:])
-        assert result.outcome.shape == (1, 26) and result.penalties.shape == (1, 26, len(cassie.penalties))
-        np.testing.assert_array_equal(result.duration_s[:, 25:], expected.duration_s)
-        np.testing.assert_array_equal(result.penalties[:, 25:], expected.penalties)
+def test_terrains_come_back_in_order_and_each_episode_is_what_its_start_alone_makes(cassie):
+    grids = np.stack([FLAT, FLAT + np.float32(0.2)])
+    simulator = MujocoC(cassie, "tests.sim.policies:stand", replicas=26)
+    simulator.put(Terrains(heights=grids, seeds=np.array([3, 4])))
+    result = simulator.take()
+    assert result.outcome.shape == (2, 26) and result.penalties.shape == (2, 26, len(cassie.penalties))
+    for index, heights in enumerate(grids):
+        starts = draw_starts(cassie, heights, 3 + index, 26, "cpu")
+        expected = cross_in_mujoco_c(cassie, stand, heights, starts[25:])
+        np.testing.assert_array_equal(result.duration_s[index, 25:], expected.duration_s[0])
+        np.testing.assert_array_equal(result.penalties[index, 25:], expected.penalties[0])
 
 
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
     starts = draw_starts(anymal, FLAT, 5, 3, "cpu")
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
     policy, robot = Remembers(), dataclasses.replace(anymal, max_duration_s=0.1)
-    result = cross(robot, policy, FLAT, starts)
+    result = cross_in_mujoco_c(robot, policy, FLAT, starts)
     assert (policy.resets, policy.asked) == (1, [3] * 5)
-    expected = cross(robot, stand, FLAT, starts)
+    expected = cross_in_mujoco_c(robot, stand, FLAT, starts)
     np.testing.assert_array_equal(result.outcome, expected.outcome)
     np.testing.assert_array_equal(result.penalties, expected.penalties)

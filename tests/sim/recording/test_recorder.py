@@ -9,31 +9,43 @@ import pytest
 from kernels.episode import Outcome
 from sim.crossing import CrossingCfg
 from sim.recording.file import read_recording, write_recording
-from sim.recording.recorder import FRAME_ARRAYS, Recording, record
+from sim.recording.frames import FRAME_ARRAYS
+from sim.recording.recorder import Recording, RolloutRecorder, make_recording
 from sim.rollout import Rollout
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.sim.plain_mujoco import to_c
 from tests.sim.scenes import FLAT, slope, spike
 
 SHORT = CrossingCfg(poll_every_s=0.5)
 SEEDS = np.array([5, 6], np.uint32)
 SLOPE = slope(np.deg2rad(4), np.deg2rad(-3))  # other along x than along y, and no mirror image of itself
+TERRAINS = Terrains(heights=np.stack([spike(), SLOPE]), seeds=SEEDS)
 
 
 @pytest.fixture(scope="module")
 def rollout(anymal, device):
     robot = dataclasses.replace(anymal, max_duration_s=1.0)
-    return Rollout(robot, anymal.policy_file, num_terrains=2, num_replicas=4, device=device, cfg=SHORT)
+    return Rollout(robot, anymal.policy_file, num_terrains=2, replicas=4, device=device, cfg=SHORT)
 
 
 @pytest.fixture(scope="module")
 def recording(rollout, anymal) -> Recording:
     """Episodes that end in the middle of a control step, on a spike, beside some that last."""
-    return record(rollout, np.stack([spike(), SLOPE]), SEEDS, policy=anymal.policy_file, labels=["spike", "slope"])
+    return record(rollout, TERRAINS, labels=["spike", "slope"])
+
+
+def record(rollout, terrains, *, labels=None, progress=None) -> Recording:
+    recorder = RolloutRecorder(rollout)
+    recorder.put(terrains)
+    robot = rollout.robot
+    result = recorder.take(progress)
+    policy = str(robot.policy_file)
+    return make_recording(robot, policy, terrains, result, device=rollout.sim.device, labels=labels)
 
 
 def test_recorded_episodes_are_those_of_an_evaluation(rollout, recording):
-    result = rollout.evaluate(np.stack([spike(), SLOPE]), SEEDS)
+    result = rollout.evaluate(TERRAINS)
     names = ("outcome", "duration_s", "fallen", "penalties")  # float32 sums, stored as they are: equal, not close
     for name in names if rollout.sim.device == "cpu" else ("outcome",):
         np.testing.assert_array_equal(getattr(recording.result(), name), getattr(result, name))
@@ -46,7 +58,7 @@ def test_recorded_episodes_are_those_of_an_evaluation(rollout, recording):
 
 
 def test_frames_begin_at_the_start_and_go_on_to_the_end(rollout, recording, anymal):
-    rollout.put(np.stack([spike(), SLOPE]), SEEDS)
+    rollout.put(TERRAINS)
     robots = np.argsort(rollout.episode.numpy())  # on a GPU they take episodes in any order
     start = np.array(rollout.sim.joint_q.numpy())[robots].reshape(2, 4, -1)
     np.testing.assert_array_equal(recording.base_position[:, :, 0], start[..., :3])
@@ -89,8 +101,7 @@ def test_an_episode_that_breaks_ends_with_its_last_good_frame(rollout, anymal):
         values[rollout.episode.numpy() == 6, 8] = np.nan  # terrain 1, replica 2
         rollout.sim.joint_q.assign(values)
 
-    terrains = np.stack([FLAT, FLAT])
-    recording = record(rollout, terrains, SEEDS, policy=anymal.policy_file, progress=break_joint)
+    recording = record(rollout, Terrains(heights=np.stack([FLAT, FLAT]), seeds=SEEDS), progress=break_joint)
     assert recording.outcome[1, 2] == Outcome.INVALID and np.isnan(recording.result().penalties[1, 2]).all()
     assert recording.num_frames[1, 2] == 26  # broken after 0.5 s, in the 26th control step; frames 0 to 25
     np.testing.assert_allclose(recording.duration_s[1, 2], 0.505, atol=1e-6)
@@ -116,7 +127,7 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
 
 def test_terrains_given_by_genes_are_stored_as_genes(rollout, anymal, tmp_path):
     genes = SUPER_GAUSSIAN.uniform_random(2, 3)
-    recording = record(rollout, genes, SEEDS, policy=anymal.policy_file)
+    recording = record(rollout, Terrains(genes=genes, seeds=SEEDS))
     write_recording(tmp_path / "a.npz", recording)
     with np.load(tmp_path / "a.npz") as content:
         assert "heights" not in content

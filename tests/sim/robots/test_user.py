@@ -13,7 +13,7 @@ from matplotlib.image import imsave
 from kernels.episode import Outcome
 from sim.controllers.adapters import read_row
 from sim.crossing import resolved
-from sim.mujoco_c.crossing import cross, draw_starts
+from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.identity import robot_digest
@@ -22,6 +22,7 @@ from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes
 from sim.robots.skeleton import Skeleton
 from sim.robots.user import PackedRobot, pack_robot
+from sim.terrains.terrains import Terrains
 from tests.sim.dogs import (
     DRIVE,
     GAINS,
@@ -120,9 +121,10 @@ def test_a_blind_robot_crosses_in_both_simulators(tmp_path, device):
     def hold(row):
         return read_row(row, dog).last_action
 
-    assert crossing(dog, device, hold).evaluate(FLAT[None], np.array([1])).outcome.tolist() == [[Outcome.TIME_OUT] * 4]
+    flat = Terrains(heights=FLAT[None], seeds=np.array([1]))
+    assert crossing(dog, device, hold).evaluate(flat).outcome.tolist() == [[Outcome.TIME_OUT] * 4]
     short = dataclasses.replace(dog, max_duration_s=0.1)
-    result = cross(short, hold, FLAT, draw_starts(short, FLAT, 1, 2, "cpu"))
+    result = cross_in_mujoco_c(short, hold, FLAT, draw_starts(short, FLAT, 1, 2, "cpu"))
     assert result.outcome.tolist() == [[Outcome.TIME_OUT] * 2]
 
 

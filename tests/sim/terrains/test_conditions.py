@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from sim.crossing import CrossingCfg
-from sim.mujoco_c.crossing import Episodes, draw_starts
+from sim.mujoco_c.crossing import EpisodeStates, draw_starts
 from sim.mujoco_c.model import Starts, crossing_model
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
@@ -20,12 +20,17 @@ from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.registry import get_space, identity, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.sim.dogs import write_dog
 from tests.sim.plain_mujoco import cross_and_keep
 
 SPACE = get_space("+".join(("super_gaussian", *CONDITIONS)))
 EPISODES = 3
 FLAT_GENES = np.zeros(SUPER_GAUSSIAN.num_genes, np.float32)
+
+
+def under_conditions(rows: np.ndarray, seeds: np.ndarray) -> Terrains:
+    return Terrains(genes=rows, seeds=seeds, space=SPACE)
 
 
 def genes(**values: float) -> np.ndarray:
@@ -51,7 +56,7 @@ def rollouts(anymal):
 
     def of(robot, policy):
         if robot.name not in made:
-            sizes = {"num_terrains": 1, "num_replicas": EPISODES, "device": "cpu", "space": SPACE}
+            sizes = {"num_terrains": 1, "replicas": EPISODES, "device": "cpu", "space": SPACE}
             made[robot.name] = Rollout(robot, policy, **sizes)
         return made[robot.name]
 
@@ -66,7 +71,7 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, roll
         assert conditions[condition_column(name)] == pytest.approx(value, rel=1e-5)
     rollout = rollouts(anymal, anymal.policy_file)
     rollout.clear()
-    rollout.put(row[None], np.array([1000], np.uint32))
+    rollout.put(under_conditions(row[None], np.array([1000], np.uint32)))
     heights = rollout.sim.bank.heights.numpy()[0]
     assert not heights.any()
     for _ in range(round(seconds / anymal.control_dt)):
@@ -94,11 +99,11 @@ CFG = CrossingCfg(start=(10.0, 4.0))  # 3.5 m to the goal
 
 def test_nominal_conditions_change_no_bit(robot):
     short = dataclasses.replace(robot, max_duration_s=0.4)
-    sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu"}
+    sizes = {"num_terrains": 2, "replicas": 2, "device": "cpu"}
     terrains, seeds = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32)
-    without = Rollout(short, robot.policy_file, **sizes).evaluate(terrains, seeds)
+    without = Rollout(short, robot.policy_file, **sizes).evaluate(Terrains(genes=terrains, seeds=seeds))
     nominal = np.concatenate([terrains, np.tile(genes()[64:], (2, 1))], axis=1)
-    plain = Rollout(short, robot.policy_file, **sizes, space=SPACE).evaluate(nominal, seeds)
+    plain = Rollout(short, robot.policy_file, **sizes, space=SPACE).evaluate(under_conditions(nominal, seeds))
     np.testing.assert_array_equal(plain.penalties, without.penalties)
     np.testing.assert_array_equal(plain.final_position, without.final_position)
 
@@ -108,12 +113,12 @@ def test_an_episode_depends_on_its_own_conditions_alone(anymal, device):
     short = dataclasses.replace(anymal, max_duration_s=1.0)
     many = [genes(), *(genes(**case) for case in CASES.values()), genes(noise=2.0)]
     rows, seeds = np.stack(many), np.full(len(many), 5, np.uint32)
-    sizes = {"num_replicas": 2, "device": device, "space": SPACE, "cfg": CFG}
-    alone = Rollout(short, anymal.policy_file, num_terrains=len(rows), **sizes).evaluate(rows, seeds)
+    sizes = {"replicas": 2, "device": device, "space": SPACE, "cfg": CFG}
+    alone = Rollout(short, anymal.policy_file, num_terrains=len(rows), **sizes).evaluate(under_conditions(rows, seeds))
     few = Rollout(short, anymal.policy_file, num_terrains=len(rows), num_envs=3, **sizes)
     order = np.random.default_rng(0).permutation(len(rows))
     for _ in range(2):
-        result = few.evaluate(rows[order], seeds)
+        result = few.evaluate(under_conditions(rows[order], seeds))
         if device == "cpu":
             np.testing.assert_array_equal(result.final_position, alone.final_position[order])
             np.testing.assert_array_equal(result.penalties, alone.penalties[order])
@@ -126,12 +131,13 @@ def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts
     row = genes(payload=0.2, push_x=-0.5, push_time=0.2, friction=0.5)
     seeds, heights = np.array([3], np.uint32), np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
     short = dataclasses.replace(anymal, max_duration_s=0.5)
-    sizes = {"num_terrains": 1, "num_replicas": EPISODES, "device": "cpu"}
-    by_genes = Rollout(short, anymal.policy_file, **sizes, space=SPACE).evaluate(row[None], seeds)
+    sizes = {"num_terrains": 1, "replicas": EPISODES, "device": "cpu"}
+    by_genes = Rollout(short, anymal.policy_file, **sizes, space=SPACE).evaluate(under_conditions(row[None], seeds))
     rollout = Rollout(short, anymal.policy_file, **sizes, with_conditions=True)
     ground = under(SPACE.condition_rows(row[None])[0])
-    np.testing.assert_array_equal(rollout.evaluate(heights, seeds, ground=ground).penalties, by_genes.penalties)
-    assert (rollout.evaluate(heights, seeds).penalties != by_genes.penalties).any()
+    by_heights = rollout.evaluate(Terrains(heights=heights, seeds=seeds, ground=ground))
+    np.testing.assert_array_equal(by_heights.penalties, by_genes.penalties)
+    assert (rollout.evaluate(Terrains(heights=heights, seeds=seeds)).penalties != by_genes.penalties).any()
     again = terrains_of(row[None], SPACE)[1]
     np.testing.assert_array_equal(again.rows, ground.rows)
     assert (again.friction == 1.0).all()  # the factor is a condition, and no patch's
@@ -140,7 +146,7 @@ def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts
     np.testing.assert_array_equal(joined[1:].rows, [nominal_row(), nominal_row()])
     plain = Rollout(short, anymal.policy_file, **sizes, with_ground=True)
     with pytest.raises(ValueError, match="terrains have conditions"):
-        plain.evaluate(heights, seeds, ground=ground)
+        plain.evaluate(Terrains(heights=heights, seeds=seeds, ground=ground))
     for wrong in ({"delay": 0.5}, {"strength": 0.0}, {"noise": -1.0}):
         (name, value), changed = next(iter(wrong.items())), nominal_row()
         changed[condition_column(name)] = value
@@ -153,7 +159,7 @@ def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(any
     for name, row in {"none": genes(), "noise": genes(noise=2.0), "lag": genes(lag=0.04)}.items():
         rollout = rollouts(anymal, anymal.policy_file)
         rollout.clear()
-        rollout.put(row[None], np.array([7], np.uint32))
+        rollout.put(under_conditions(row[None], np.array([7], np.uint32)))
         order = np.argsort(rollout.episode.numpy())
         rows = [rollout._observation.numpy()[order].copy()]
         for _ in range(4):
@@ -173,8 +179,8 @@ def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(any
 
 def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, device):
     rows = np.stack([genes(), genes(strength=0.6)])
-    rollout = Rollout(anymal, anymal.policy_file, num_terrains=2, num_replicas=1, device=device, space=SPACE)
-    rollout.put(rows, np.array([3, 3], np.uint32))
+    rollout = Rollout(anymal, anymal.policy_file, num_terrains=2, replicas=1, device=device, space=SPACE)
+    rollout.put(under_conditions(rows, np.array([3, 3], np.uint32)))
     sim, order = rollout.sim, np.argsort(rollout.episode.numpy())
     for angle in (0.1, 50.0):  # the second asks for more than there is
         sim.targets.assign(np.float32(np.tile([0.0] * 7 + [angle] * 12, (2, 1))))
@@ -191,7 +197,7 @@ def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, 
 
 def vary(robot, model, row):
     """Changes a model of MuJoCo C as a row of conditions does."""
-    Episodes(robot, model, Starts(qpos=np.zeros((0, 7)), qvel=np.zeros((0, 6))), row.astype(float))
+    EpisodeStates(robot, model, Starts(qpos=np.zeros((0, 7)), qvel=np.zeros((0, 6))), row.astype(float))
 
 
 def test_a_payload_is_a_point_mass_on_the_base(anymal):
@@ -236,8 +242,8 @@ def test_a_payload_is_where_it_is_on_a_base_whose_inertia_lies_at_its_origin(tmp
 def test_a_negative_payload_leaves_a_body_that_can_be(robot, device):
     """Less of the base itself, wherever the payload would be, and no less than half of it."""
     row = genes(payload=-0.05, payload_x=0.2, payload_y=0.2)
-    rollout = Rollout(robot, robot.policy_file, num_terrains=1, num_replicas=1, device=device, space=SPACE)
-    rollout.put(row[None], np.array([1], np.uint32))
+    rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=1, device=device, space=SPACE)
+    rollout.put(under_conditions(row[None], np.array([1], np.uint32)))
     tree = rollout.sim._dynamics._tree
     plain = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
     share = 1.0 - min(0.5, 0.05 * plain.body_subtreemass[1] / plain.body_mass[1])
@@ -256,7 +262,7 @@ def test_times_are_rounded_alike_in_both():
 def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
     monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
-        Rollout(anymal, anymal.policy_file, num_terrains=1, num_replicas=1, device="cpu", space=SPACE)
+        Rollout(anymal, anymal.policy_file, num_terrains=1, replicas=1, device="cpu", space=SPACE)
 
 
 def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing():

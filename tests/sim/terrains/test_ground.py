@@ -9,12 +9,13 @@ import pytest
 from kernels.episode import Outcome
 from kernels.penalties import penalty_columns
 from sim.controllers.loaders import load_policy
-from sim.mujoco_c.crossing import cross, draw_starts
+from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.mujoco_c.model import GROUND, crossing_model
 from sim.rollout import Rollout
 from sim.terrains.bank import TerrainBank
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.sim.plain_mujoco import rays_from_above
 from tests.sim.scenes import FLAT, Stepper, free_body, lying, positions, put, simulate, slope
 
@@ -84,11 +85,12 @@ def patchwork(seed):
 
 def test_walking_over_patches_costs_the_same_in_both(anymal):
     ground, episodes, robot = patchwork(2), 4, dataclasses.replace(anymal, max_duration_s=5.0)
-    sizes = {"num_terrains": 1, "num_replicas": episodes, "device": "cpu"}
-    rollout, seeds = Rollout(robot, anymal.policy_file, **sizes, with_ground=True), np.array([5], np.uint32)
-    ours, on_plain = (rollout.evaluate(FLAT[None], seeds, ground=maps) for maps in (ground, None))
+    sizes = {"num_terrains": 1, "replicas": episodes, "device": "cpu"}
+    rollout = Rollout(robot, anymal.policy_file, **sizes, with_ground=True)
+    flat = [Terrains(heights=FLAT[None], seeds=np.array([5]), ground=maps) for maps in (ground, None)]
+    ours, on_plain = map(rollout.evaluate, flat)
     starts = draw_starts(anymal, FLAT, 5, episodes, "cpu")
-    plain = cross(robot, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, ground=ground)
+    plain = cross_in_mujoco_c(robot, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, ground=ground)
     assert (ours.outcome == plain.outcome).all() and (plain.outcome == Outcome.TIME_OUT).all()
     assert ours.final_position[0, :, 0].min() > 4.5  # over two boundaries
     columns = penalty_columns(("yaw_rate", "vel_x", "vel_y"))
@@ -99,10 +101,10 @@ def test_walking_over_patches_costs_the_same_in_both(anymal):
 
 def test_ground_that_changes_nothing_gives_the_same_bits(anymal):
     genes, seeds = SUPER_GAUSSIAN.hard_random(2, 3), np.array([1, 2], np.uint32)
-    sizes = {"num_terrains": 2, "num_replicas": 2, "device": "cpu"}
+    sizes = {"num_terrains": 2, "replicas": 2, "device": "cpu"}
     robot = dataclasses.replace(anymal, max_duration_s=0.4)
-    without = Rollout(robot, anymal.policy_file, **sizes).evaluate(genes, seeds)
-    plain = Rollout(robot, anymal.policy_file, **sizes, with_ground=True).evaluate(genes, seeds)
+    without = Rollout(robot, anymal.policy_file, **sizes).evaluate(Terrains(genes=genes, seeds=seeds))
+    plain = Rollout(robot, anymal.policy_file, **sizes, with_ground=True).evaluate(Terrains(genes=genes, seeds=seeds))
     np.testing.assert_array_equal(plain.penalties, without.penalties)
     np.testing.assert_array_equal(plain.final_position, without.final_position)
 

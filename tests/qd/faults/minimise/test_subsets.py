@@ -9,7 +9,7 @@ import pytest
 from qd.faults.causes import find_effects
 from qd.faults.minimise.subsets import Case, Trial, find_minimal, open_case, take_apart
 from qd.faults.searches import Search
-from qd.workers.cross import Crossings
+from qd.workers.crosser import Crosser
 from sim.robots.find import get_robot
 from sim.terrains.conditions.base import condition_column
 from sim.terrains.spaces.registry import get_space
@@ -163,12 +163,12 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
 
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
-        with Crossings(ROBOT, compute_by(robots)) as crossings:
+        with Crosser(ROBOT, compute_by(robots)) as crossings:
             return cases, take_apart(archive, cases, search, crossings)
 
     together, alone = Robots(fails), Robots(fails)
     cases, minima = apart((2, 0), together)
-    assert len(together.opened) == 1 and together.crossed[0][0].num_replicas == 5
+    assert len(together.opened) == 1 and together.crossed[0][0].replicas == 5
     assert {number: (minimal.parts, minimal.scale) for number, minimal in minima.items()} == {
         0: ((2, 5), 0.625), 2: ((2, 5), 0.625),
     }  # fmt: skip
@@ -196,7 +196,7 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
     case = open_case(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
     search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
-    with Crossings(ROBOT, compute_by(Robots(fails))) as crossings:
+    with Crosser(ROBOT, compute_by(Robots(fails))) as crossings:
         minimal = take_apart(archive, {0: case}, search, crossings)[0]
     assert (minimal.parts, minimal.scale) == ((3, 8), 0.625)
     effects = find_effects(genes[0], range(11), space)

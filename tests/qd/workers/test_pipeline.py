@@ -8,14 +8,17 @@ import time
 import numpy as np
 import pytest
 
-from qd.workers import evaluator
-from qd.workers.evaluator import EvaluatorCfg, open_evaluator, parse_workers
+from qd.workers import pipeline as module
+from qd.workers.compute import Compute, parse_workers
+from qd.workers.crosser import open_pipeline
+from qd.workers.pipeline import PipelineCfg
 from qd.workers.process import EvaluatorError
 from sim.robots.find import get_robot
+from sim.terrains.terrains import Terrains
 from tests.qd import crossers, stand_in
 from tests.qd.stand_in import assert_same
 
-CFG = EvaluatorCfg(robot="anymal", policy="p", num_terrains=6, num_replicas=4, device="cpu", workers="1")
+CFG = PipelineCfg(robot="anymal", policy="p", num_terrains=6, replicas=4, compute=Compute(workers="1"))
 GENES = np.random.default_rng(0).uniform(-1, 1, (15, 64)).astype(np.float32)
 SEEDS = np.arange(100, 115, dtype=np.uint32)
 
@@ -23,19 +26,24 @@ SEEDS = np.arange(100, 115, dtype=np.uint32)
 class Crosser(crossers.Crosser):
     """Crosses by the stand-in; time and steps say with which seed a shard begins."""
 
-    def evaluate(self, terrains, seeds, *, progress=None):
-        if self.cfg.policy == f"refuse at {seeds[0]}":
+    def evaluate(self, terrains, *, progress=None):
+        steps = int(terrains.seeds[0])
+        if self.cfg.policy == f"refuse at {steps}":
             raise ValueError("terrains of another kind")
-        result = super().evaluate(terrains, seeds, progress=progress)
-        steps = int(seeds[0])
+        result = super().evaluate(terrains, progress=progress)
         return dataclasses.replace(result, wall_s=float(steps), physics_steps=steps, robot_steps=steps)
 
 
 class Echo(crossers.Crosser):
     """Returns the terrains as penalties."""
 
-    def evaluate(self, terrains, seeds, *, progress=None):
-        return dataclasses.replace(stand_in.evaluate(np.zeros((2, 64)), seeds), penalties=terrains)
+    def evaluate(self, terrains, *, progress=None):
+        return dataclasses.replace(stand_in.evaluate(np.zeros((2, 64)), terrains.seeds), penalties=terrains.heights)
+
+
+def drawn(rows):
+    """Some of the terrains."""
+    return Terrains(genes=GENES[rows], seeds=SEEDS[rows])
 
 
 def test_workers_as_the_command_line_names_them():
@@ -48,7 +56,7 @@ def test_workers_as_the_command_line_names_them():
 
 
 @pytest.mark.parametrize(
-    ("num_terrains", "num_replicas", "workers", "processes", "terrains"),
+    ("num_terrains", "replicas", "workers", "processes", "terrains"),
     [
         (8, 4, "2", 2, 4),
         (6, 4, "4", 4, 2),
@@ -58,24 +66,24 @@ def test_workers_as_the_command_line_names_them():
         (9, 4, None, 3, 3),  # one a core
     ],
 )
-def test_sizes(monkeypatch, num_terrains, num_replicas, workers, processes, terrains):
-    monkeypatch.setattr(evaluator, "available_cores", lambda: 3)
-    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, num_replicas=num_replicas, workers=workers)
+def test_sizes(monkeypatch, num_terrains, replicas, workers, processes, terrains):
+    monkeypatch.setattr(module, "available_cores", lambda: 3)
+    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, replicas=replicas, compute=Compute(workers=workers))
     assert (cfg.num_workers, cfg.terrains_of_worker) == (processes, terrains)
 
 
 @pytest.fixture(scope="module", params=["2", "cuda:0"])
 def evaluate(request):
     """Two processes that have six terrains under way, or a simulation in this process, as on a GPU."""
-    changes = {"device": request.param, "workers": None} if request.param != "2" else {"workers": "2"}
-    with open_evaluator(dataclasses.replace(CFG, **changes), build=Crosser) as pipeline:
+    compute = Compute(workers="2") if request.param == "2" else Compute(request.param)
+    with open_pipeline(dataclasses.replace(CFG, compute=compute), build=Crosser) as pipeline:
         yield pipeline
 
 
 @pytest.mark.parametrize("count", [1, 6, 15])
 def test_how_terrains_are_spread_changes_nothing(evaluate, count):
     shares = []
-    result = evaluate(GENES[:count], SEEDS[:count], shares.append)
+    result = evaluate(drawn(slice(count)), shares.append)
     assert_same(result, stand_in.evaluate(GENES[:count], SEEDS[:count], 4))
     assert shares == sorted(shares) and shares[-1] == 1.0
 
@@ -85,26 +93,27 @@ def test_what_a_stopped_evaluation_had_under_way_is_of_no_later_one(evaluate):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate(GENES, SEEDS, stop)  # of lots of three, two are in
-    assert_same(evaluate(GENES[9:12], SEEDS[9:12]), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
+        evaluate(drawn(slice(None)), stop)  # of lots of three, two are in
+    assert_same(evaluate(drawn(slice(9, 12))), stand_in.evaluate(GENES[9:12], SEEDS[9:12], 4))
 
 
 @pytest.mark.parametrize("evaluate", ["2"], indirect=True)
 def test_shards_run_at_the_same_time_and_turns_one_after_the_other(evaluate):
-    result = evaluate(GENES[:6], SEEDS[:6])  # shards begin at seeds 100 and 103
+    result = evaluate(drawn(slice(6)))  # shards begin at seeds 100 and 103
     assert (result.wall_s, result.physics_steps, result.robot_steps) == (103.0, 103, 203)
     # Twelve, of which six fit, go in lots of three, as parts of two and one, one and two, ... in turn: the second parts
     # begin at 102, 104, 108 and 110, or where the other process has its turn at 101, 105, 107 and 111.
-    assert evaluate(GENES[:12], SEEDS[:12]).physics_steps in (102 + 104 + 108 + 110, 101 + 105 + 107 + 111)
+    assert evaluate(drawn(slice(12))).physics_steps in (102 + 104 + 108 + 110, 101 + 105 + 107 + 111)
 
 
 def test_contact_is_resolved_at_the_same_control_rate():
     robot = get_robot("anymal")
-    cfg = EvaluatorCfg(robot=robot, policy=str(robot.policy_file), num_terrains=1, num_replicas=4, resolved=True)
-    rollout = evaluator.build_rollout(cfg, 1)
+    sizes = {"num_terrains": 1, "replicas": 4, "compute": Compute()}
+    cfg = PipelineCfg(robot=robot, policy=str(robot.policy_file), engine="resolved", **sizes)
+    rollout = module.build_simulator(cfg, 1)
     assert (rollout.robot.physics_dt, rollout.robot.control_dt) == (0.001, robot.control_dt)
     assert rollout.sim.solver.mjw_model.geom_solref.numpy()[..., 0] == pytest.approx(0.003)
-    as_searched = evaluator.build_rollout(dataclasses.replace(cfg, resolved=False), 1)
+    as_searched = module.build_simulator(dataclasses.replace(cfg, engine="search"), 1)
     assert as_searched.robot.physics_dt == robot.physics_dt == 0.005
     assert (as_searched.sim.solver.mjw_model.geom_solref.numpy()[..., 0] > 0.005).all()
 
@@ -115,20 +124,20 @@ def test_contact_is_resolved_at_the_same_control_rate():
 )
 def test_why_a_worker_ended_is_known(tmp_path, how, error, reason):
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1")
-    with pytest.raises(error, match=reason), open_evaluator(cfg, build=crossers.Failing) as evaluate:
-        evaluate(GENES, SEEDS)
+    with pytest.raises(error, match=reason), open_pipeline(cfg, build=crossers.Failing) as evaluate:
+        evaluate(drawn(slice(None)))
 
 
 def test_a_worker_that_ended_in_between_is_heard_when_it_gets_the_next_lot():
     """It refuses its second lot while nobody listens: the third cannot be sent, and the reason is no death."""
-    with open_evaluator(dataclasses.replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
+    with open_pipeline(dataclasses.replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
         for lot in (slice(0, 2), slice(2, 4)):
-            evaluate.put(GENES[lot], SEEDS[lot])
+            evaluate.put(drawn(lot))
         assert_same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
         end = time.monotonic() + 20
         with pytest.raises(ValueError, match="terrains of another kind"):
             while time.monotonic() < end:
-                evaluate.put(GENES[4:5], SEEDS[4:5])
+                evaluate.put(drawn(slice(4, 5)))
                 time.sleep(0.02)
 
 
@@ -136,9 +145,9 @@ def test_large_height_maps_go_in_while_results_come_out():
     """8 lots of 3 MB each way through pipes of 64 KB: neither side waits for the other to read."""
     maps = np.zeros((8, 2, 161, 321, 7), np.float32)
     maps[..., 0] = GENES[:8, :1, None, None]
-    with open_evaluator(dataclasses.replace(CFG, num_terrains=16), build=Echo) as evaluate:
+    with open_pipeline(dataclasses.replace(CFG, num_terrains=16), build=Echo) as evaluate:
         for lot in maps:
-            evaluate.put(lot, SEEDS[:2])
+            evaluate.put(Terrains(heights=lot, seeds=SEEDS[:2]))
         for lot in maps:
             np.testing.assert_array_equal(evaluate.take().penalties, lot)
 
@@ -159,7 +168,7 @@ def test_the_first_worker_too_leaves_ctrl_c_to_its_parent():
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
     cfg = dataclasses.replace(CFG, policy=f"sleep:{tmp_path}:2")
-    with open_evaluator(cfg, build=crossers.Failing) as evaluate:
-        evaluate.put(GENES[:6], SEEDS[:6])
+    with open_pipeline(cfg, build=crossers.Failing) as evaluate:
+        evaluate.put(drawn(slice(6)))
         began = time.monotonic()
     assert time.monotonic() - began < 15 and not multiprocessing.active_children()

@@ -1,18 +1,22 @@
 """The crossing service: results of every terrain in order, and what its cache finds, keeps apart and gives up."""
 
+import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from qd.workers import cross as service
-from qd.workers.cross import Cache, Crossings, cross
-from qd.workers.evaluator import Compute
+from qd.workers import crosser as service
+from qd.workers.cache import Cache
+from qd.workers.compute import Compute
+from qd.workers.crosser import Crosser, cross
 from qd.workers.invalid import AllInvalidError
 from sim.files.command import Interrupted
 from sim.robots.find import get_robot
+from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.qd import stand_in
 from tests.qd.robots import Robots
 from tests.qd.stand_in import assert_same, compute_by
@@ -22,11 +26,14 @@ POLICY = str(ROBOT.policy_file)
 TWO_WORKERS = Compute(workers="2")
 GENES = SUPER_GAUSSIAN.hard_random(9, 3)
 SEEDS = np.arange(9, dtype=np.uint32)
+TERRAINS = Terrains(genes=GENES, seeds=SEEDS)
 
 
-def cross_all(opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, **kwargs):
-    with Crossings(ROBOT, compute_by(opened, TWO_WORKERS), cache=cache) as crossings:
-        return crossings.cross(policy, genes, seeds, replicas=replicas, **kwargs)
+def cross_all(
+    opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, space=SUPER_GAUSSIAN, **kwargs
+):
+    with Crosser(ROBOT, compute_by(opened, TWO_WORKERS), cache=cache) as crosser:
+        return crosser.cross(policy, Terrains(genes=genes, seeds=seeds, space=space), replicas=replicas, **kwargs)
 
 
 EXPECTED = stand_in.evaluate(GENES, SEEDS, 20)
@@ -54,7 +61,7 @@ def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_anoth
 
 
 CHANGES = [
-    {"replicas": 10}, {"how": "resolved"}, {"reward": True}, {"penalties_from_s": 1.0}, {"space": "course"},
+    {"replicas": 10}, {"engine": "resolved"}, {"reward": True}, {"penalties_from_s": 1.0}, {"space": COURSE},
     {"policy": str(get_robot("cassie").policy_file)}, {"genes": -GENES}, {"seeds": SEEDS + np.uint32(100)},
 ]  # fmt: skip
 
@@ -71,7 +78,7 @@ def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path,
     cross_all(Robots(), tmp_path)
     for robot, compute in ((get_robot("cassie"), TWO_WORKERS), (ROBOT, Compute("cuda"))):
         opened = Robots()
-        cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute_by(opened, compute), replicas=20,
+        cross({"a": POLICY}, TERRAINS, robot=robot, compute=compute_by(opened, compute), replicas=20,
               cache=tmp_path)  # fmt: skip
         assert len(opened.crossed) == len(GENES)
     monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
@@ -87,7 +94,7 @@ def test_a_reward_of_other_weights_is_not_found_and_what_has_no_reward_is(tmp_pa
         crossed = []
         for robot in (ROBOT, heavier, heavier):
             opened = Robots()
-            cross({"a": POLICY}, GENES, SEEDS, robot=robot, compute=compute_by(opened, TWO_WORKERS), replicas=20,
+            cross({"a": POLICY}, TERRAINS, robot=robot, compute=compute_by(opened, TWO_WORKERS), replicas=20,
                   cache=tmp_path / str(reward), reward=reward)  # fmt: skip
             crossed.append(len(opened.crossed))
         assert crossed == [len(GENES) if time < times else 0 for time in range(3)]
@@ -114,17 +121,19 @@ def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, dam
     assert after.crossed == []
 
 
-def test_the_cache_removes_what_was_not_used_for_longest(tmp_path):
+def test_the_cache_removes_the_least_recently_used_file(tmp_path):
     block = block_of(0)
-    cache = Cache(tmp_path, most_bytes=25_000)
+    cache = Cache(tmp_path, max_bytes=25_000)
     for key in ("a", "b", "c"):
         cache.write(key, block)
     for place, key in enumerate(("a", "b", "c")):
-        service.os.utime(cache.file(key), (place, place))
-    assert cache.read("a") is not None  # now b is the one that was not used for longest
+        os.utime(cache.file(key), (place, place))
+    assert cache.read("a") is not None  # now b is the least recently used one
+    reopened = Cache(tmp_path, max_bytes=25_000)
+    assert all(reopened.read(key, ["values"]) for key in ("a", "b", "c"))  # looking through is no use
     cache.write("d", block)
     assert cache.keys() == ["a", "c", "d"]
-    Cache(tmp_path, most_bytes=10).write("e", block)
+    Cache(tmp_path, max_bytes=10).write("e", block)
     assert cache.keys() == ["e"]
 
 
@@ -135,7 +144,7 @@ def block_of(number):
 def write_often(folder, number):
     block = block_of(number)
     for count in range(40):
-        Cache(folder, most_bytes=20_000).write(f"key-{count % 4}", block)
+        Cache(folder, max_bytes=20_000).write(f"key-{count % 4}", block)
 
 
 def test_processes_share_a_cache(tmp_path):
@@ -150,20 +159,20 @@ def test_processes_share_a_cache(tmp_path):
 
 def test_a_simulation_stays_open_for_calls_that_agree():
     opened = Robots()
-    with Crossings(ROBOT, compute_by(opened, TWO_WORKERS)) as crossings:
-        crossings.cross(POLICY, GENES[:2], SEEDS[:2], replicas=20, at_most=9)
-        crossings.cross(POLICY, GENES, SEEDS, replicas=20)
+    with Crosser(ROBOT, compute_by(opened, TWO_WORKERS)) as crosser:
+        crosser.cross(POLICY, TERRAINS[:2], replicas=20, room=9)
+        crosser.cross(POLICY, TERRAINS, replicas=20)
         assert [cfg.num_terrains for cfg in opened.opened] == [4]  # two lots of a terrain a worker
-        crossings.cross(POLICY, GENES, SEEDS, replicas=20, how="resolved")
-        assert [cfg.resolved for cfg in opened.opened] == [False, True]
+        crosser.cross(POLICY, TERRAINS, replicas=20, engine="resolved")
+        assert [cfg.engine for cfg in opened.opened] == ["search", "resolved"]
 
 
 def test_lots_fill_the_device():
     opened = Robots()
-    genes, seeds = np.zeros((5000, 64), np.float32), np.zeros(5000, np.uint32)
+    terrains = Terrains(genes=np.zeros((5000, 64), np.float32), seeds=np.zeros(5000, np.uint32))
     for compute in (Compute("cuda"), Compute(workers="3")):
-        with Crossings(ROBOT, compute_by(opened, compute)) as crossings:
-            crossings.cross(POLICY, genes, seeds, replicas=20)
+        with Crosser(ROBOT, compute_by(opened, compute)) as crosser:
+            crosser.cross(POLICY, terrains, replicas=20)
     gpu, cpu = opened.opened
     assert (gpu.num_terrains, gpu.envs_of_worker) == (2 * (16_384 // 20), 2 * (16_384 // 20) * 20)
     assert (cpu.num_terrains, cpu.num_workers) == (6, 3)
@@ -178,15 +187,15 @@ def test_no_terrains_open_nothing_and_a_controller_whose_code_has_no_file_is_not
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("flaw", [{"replicas": 0}, {"how": "searchd"}])
+@pytest.mark.parametrize("flaw", [{"replicas": 0}, {"engine": "searchd"}])
 def test_settings_that_mean_nothing_are_refused(flaw):
-    with pytest.raises(ValueError, match="replicas must be 1 or more, how one of"):
-        cross({"a": "shipped"}, np.zeros((1, 64)), np.zeros(1, np.uint32), **{"replicas": 1} | flaw)
+    with pytest.raises(ValueError, match="replicas must be 1 or more, engine"):
+        cross({"a": "shipped"}, TERRAINS[:1], **{"replicas": 1} | flaw)
 
 
 def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
     def invalid(cfg, genes, seeds):
-        result = stand_in.evaluate(genes, seeds, cfg.num_replicas)
+        result = stand_in.evaluate(genes, seeds, cfg.replicas)
         return stand_in.make_result(result.penalties, invalid=np.ones(result.invalid.shape))
 
     with pytest.raises(AllInvalidError):
@@ -194,20 +203,15 @@ def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tm
     assert cross_all(Robots(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
 
 
-def test_mujoco_c_is_stored_apart(tmp_path, monkeypatch):
-    calls = []
+def test_engines_are_stored_apart_and_mujoco_c_refuses_what_it_cannot(tmp_path):
+    def rule(cfg, genes, seeds):
+        return stand_in.evaluate(-genes if cfg.on_mujoco_c else genes, seeds, cfg.replicas)
 
-    def cross_terrains(robot, policy, terrains, seeds, *, num_episodes, resolved, **_):
-        calls.extend(seeds.tolist())
-        for number in range(len(terrains)):
-            row = slice(number, number + 1)
-            yield stand_in.evaluate(-terrains[row], seeds[row], num_episodes)
-
-    monkeypatch.setattr(service, "cross_terrains", cross_terrains)
-    cross_all(Robots(), tmp_path)
-    for _ in range(2):
-        result = cross_all(Robots(), tmp_path, how="mujoco_c")
-        assert calls == SEEDS.tolist()
-        assert_same(result, stand_in.evaluate(-GENES, SEEDS, 20))
-    with pytest.raises(ValueError, match="reward"):
-        cross_all(Robots(), how="mujoco_c", reward=True)
+    cross_all(Robots(rule), tmp_path)
+    for crossed in (SEEDS.tolist(), []):
+        robots = Robots(rule)
+        assert_same(cross_all(robots, tmp_path, engine="mujoco_c"), stand_in.evaluate(-GENES, SEEDS, 20))
+        assert robots.seeds == crossed
+    for asked in ({"reward": True}, {"penalties_from_s": 1.0}, {"record": True}):
+        with pytest.raises(ValueError, match="mujoco_c"):
+            cross_all(Robots(), engine="mujoco_c", **asked)

@@ -1,0 +1,132 @@
+"""Crosser and recordings on disk: arrays by key, in a folder of bounded size.
+
+A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored as
+soon as it is done, with a key for every terrain, and a terrain is found again in whatever lots.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.workers.shards import arrays_of
+from sim.files.atomic import locked, write_atomically
+from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.rollout import RolloutResult
+from sim.terrains.terrains import Terrains
+
+MAX_BYTES = 1_000_000_000
+"""Size of a folder above which the least recently used files are removed."""
+_KEY = "key"
+_ROWS = "rows"
+
+
+class Cache:
+    """Arrays in the files of a folder, by key. A damaged file counts as absent, in a printed line.
+
+    The time of a file says when it was used last: above ``max_bytes`` the least recently used ones are removed.
+    """
+
+    def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
+        self.folder = folder
+        self._max_bytes = max_bytes
+
+    def file(self, key: str) -> Path:
+        """The file of a key."""
+        return self.folder / f"{key}.npz"
+
+    def keys(self, prefix: str = "") -> list[str]:
+        """Keys that have a file, sorted."""
+        return sorted(file.stem for file in self.folder.glob(f"{prefix}*.npz"))
+
+    def read(self, key: str, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]] | None:
+        """The arrays of a key; None if there are none. Reading only those of some ``names`` is no use of the file."""
+        file = self.file(key)
+        try:
+            stored = [name for name in array_names(file) if names is None or name in (*names, _KEY)]
+            arrays = read_arrays(file, stored)
+            if str(arrays.pop(_KEY, "")) != key:
+                raise ValueError("it is another key's")
+        except FileNotFoundError:  # never written, or removed by another process
+            return None
+        except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
+            self._remove_damaged(file, error)
+            return None
+        if names is None:
+            self.touch(key)
+        return arrays
+
+    def _remove_damaged(self, file: Path, error: Exception) -> None:
+        with locked(self.folder):
+            if file.is_file():
+                print(f"{file} is damaged ({' '.join(str(error).split())}): it is made again", flush=True)
+                file.unlink(missing_ok=True)
+
+    def touch(self, key: str) -> None:
+        """Notes that a file was used."""
+        with suppress(FileNotFoundError):
+            os.utime(self.file(key))
+
+    def write(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Stores the arrays of a key in one step."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with locked(self.folder):  # commands that run at once may share it
+            write_atomically(self.file(key), npz_bytes({_KEY: np.array(key), **arrays}))
+            self.remove_least_used(but=key)
+
+    def remove_least_used(self, *, but: str) -> None:
+        """Removes the least recently used files but one until the folder has its size."""
+        files = []
+        for file in self.folder.glob("*.npz"):
+            with suppress(FileNotFoundError):  # removed by another process
+                files.append((file, file.stat()))
+        size = sum(stat.st_size for _, stat in files)
+        for file, stat in sorted(files, key=lambda pair: pair[1].st_mtime_ns):
+            if size <= self._max_bytes:
+                return
+            if file.stem != but:
+                file.unlink(missing_ok=True)
+                size -= stat.st_size
+
+
+class StoredCrossings:
+    """Crosser in a cache by the digest of terrain and seed; ``settings`` is the hash of all else that they depend on.
+
+    Files are looked through once; those that other processes write later are not found.
+    """
+
+    def __init__(self, cache: Cache, settings: str, penalty_names: tuple[str, ...]) -> None:
+        self._cache = cache
+        self._settings = settings
+        self._penalty_names = penalty_names
+        self._index: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
+        for key in cache.keys(settings):
+            rows = (cache.read(key, [_ROWS]) or {}).get(_ROWS, np.zeros((0, 32), np.uint8))
+            self._index.update({row.tobytes(): (key, number) for number, row in enumerate(rows)})
+
+    def read(self, terrains: Terrains) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
+        """Which of the terrains have been crossed, and their results, file by file."""
+        by_file: dict[str, list[tuple[int, int]]] = {}
+        for number, digest in enumerate(terrains.digests()):
+            if entry := self._index.get(digest):
+                by_file.setdefault(entry[0], []).append((number, entry[1]))
+        for key, pairs in by_file.items():
+            numbers, rows = np.array(pairs).T
+            arrays = self._cache.read(key)
+            if arrays is None:  # removed or damaged meanwhile
+                continue
+            del arrays[_ROWS]
+            chosen: dict[str, Any] = {name: values[rows] for name, values in arrays.items()}
+            yield numbers, RolloutResult(**chosen, penalty_names=self._penalty_names)
+
+    def write(self, terrains: Terrains, result: RolloutResult) -> None:
+        """Stores a lot."""
+        digests = terrains.digests()
+        key = f"{self._settings}-{hashlib.sha256(b''.join(digests)).hexdigest()[:32]}"
+        self._cache.write(key, {_ROWS: np.array([[*row] for row in digests], np.uint8), **arrays_of(result)})
+        self._index.update({row: (key, number) for number, row in enumerate(digests)})

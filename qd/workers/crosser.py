@@ -1,0 +1,241 @@
+"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk.
+
+Whatever crosses terrains calls :class:`Crosser`. A command that was stopped goes on when it is run again, since its
+crossings are found in the cache (:mod:`qd.workers.cache`).
+"""
+
+import hashlib
+import importlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.search.progress import Bar
+from qd.workers.cache import Cache, StoredCrossings
+from qd.workers.compute import Compute
+from qd.workers.invalid import report_invalid
+from qd.workers.pipeline import Build, Engine, Pipeline, PipelineCfg, Progress, build_simulator, open_processes
+from qd.workers.shards import choose_rows, join_results
+from sim.controllers.spec import controller_hash, resolve_policy
+from sim.files.command import Interrupted
+from sim.files.provenance import code_fingerprint
+from sim.robots.find import get_robot
+from sim.robots.identity import robot_identity
+from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
+from sim.terrains.spaces.registry import identity
+from sim.terrains.terrains import Terrains
+
+_LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under way
+_LOT_TERRAINS = 3_200  # of a worker at most: their height maps take 600 MB
+_MUJOCO_C_LOT = 4  # terrains of a process
+
+
+@contextmanager
+def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterator[Pipeline]:
+    """Opens what crosses terrains, in as many processes as there is work for or on a Ray cluster, until the end.
+
+    ``build`` makes each worker's simulator.
+    """
+    if cfg.on_ray:
+        with importlib.import_module("qd.workers.ray_workers").open_ray_workers(cfg, build) as workers:
+            yield workers
+    elif cfg.in_process:
+        yield Pipeline(cfg.num_terrains, build(cfg, cfg.num_terrains))
+    else:
+        with open_processes(cfg, build) as processes:
+            yield processes
+
+
+class Crosser:
+    """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
+
+    Crossings that are done are stored in the folder ``cache``, if there is one. ``calls``, if known, count in the bars.
+    """
+
+    def __init__(
+        self,
+        robot: RobotCfg | str,
+        compute: Compute,
+        *,
+        cache: Path | None = None,
+        calls: int | None = None,
+    ) -> None:
+        self.robot = get_robot(robot)
+        self.compute = compute
+        self._cache = None if cache is None else Cache(cache)
+        self._stored: dict[str, StoredCrossings] = {}
+        self._call = 0
+        self._calls = calls
+        self._stack = ExitStack()
+        self._opened: tuple[PipelineCfg, Pipeline] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the simulation that is open."""
+        self._opened = None
+        self._stack.close()
+
+    def cross(
+        self,
+        policy: str,
+        terrains: Terrains,
+        *,
+        replicas: int,
+        engine: Engine = "search",
+        reward: bool = False,
+        penalties_from_s: float = 0.0,
+        record: bool = False,
+        label: str = "",
+        room: int = 0,
+        invalid_ok: bool = False,
+        progress: Progress | None = None,
+    ) -> RolloutResult:
+        """Lets a controller (:func:`sim.controllers.loaders.load_policy`) cross each terrain in ``replicas`` episodes.
+
+        Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the training task's reward
+        too; with ``record`` the result has frames, and is not stored. The progress bar shows ``label``, or ``progress``
+        gets the share that is done. ``room`` are the terrains of the largest call to come that agrees with this one.
+        Invalid episodes are reported on stderr where they are many; a result without a valid one is returned if
+        ``invalid_ok``.
+
+        The result has one row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C
+        does not say why an episode is invalid.
+        """
+        if replicas < 1 or engine not in get_args(Engine):
+            raise ValueError(
+                f"replicas must be 1 or more, engine one of {get_args(Engine)}, got {replicas} and '{engine}'"
+            )
+        self._call += 1
+        label = f"{self._call} of {self._calls}: {label}" if self._calls else label
+        cfg = PipelineCfg(
+            compute=self.compute, robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)),
+            replicas=replicas, engine=engine, space=terrains.space.name, reward=reward, record=record,
+            penalties_from_s=penalties_from_s, with_ground=terrains.has_ground,
+            with_conditions=terrains.has_conditions,
+        )  # fmt: skip
+        if not len(terrains):
+            return _empty_result(cfg, self.robot.penalties)
+        stored = None if record else self._stored_crossings(cfg, terrains)
+        results = list(stored.read(terrains)) if stored else []
+        done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in results)])
+        missing = np.setdiff1d(np.arange(len(terrains)), done)
+        try:
+            for lot, result in self._cross_lots(cfg, terrains[missing], label, room, progress):
+                numbers = missing[lot]
+                if stored:
+                    stored.write(terrains[numbers], result)
+                results.append((numbers, result))
+        except KeyboardInterrupt:
+            kept = "; what was crossed is kept, and the same command goes on" if stored else ""
+            raise Interrupted(f"Stopped{kept}.") from None
+        result = _in_order(results)
+        report_invalid(result, label or policy, all_ok=invalid_ok)
+        return result
+
+    def _stored_crossings(self, cfg: PipelineCfg, terrains: Terrains) -> StoredCrossings | None:
+        """The cache of crossings with these settings; None without a cache, or if the controller's code has no file."""
+        controller = controller_hash(cfg.policy)
+        if self._cache is None or controller is None:
+            return None
+        settings = [robot_identity(self.robot), self.robot.penalties, controller]
+        settings += [identity(terrains.space.name, terrains.space.sha256)]
+        settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
+        settings += [repr(self.robot.training) if cfg.reward else None]  # whose terms the reward has
+        content = json.dumps([*settings, code_fingerprint(("kernels", "sim"))])
+        key = hashlib.sha256(content.encode()).hexdigest()[:32]
+        if key not in self._stored:
+            self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)
+        return self._stored[key]
+
+    def _cross_lots(
+        self, cfg: PipelineCfg, terrains: Terrains, label: str, room: int, progress: Progress | None
+    ) -> Iterator[tuple[slice, RolloutResult]]:
+        """Which of the terrains a lot has, and its result."""
+        if not len(terrains):
+            return
+        count = max(len(terrains), room)
+        lot = _lot_size(replace(cfg, num_terrains=count))
+        try:
+            pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
+            if progress is not None:
+                yield from pipeline.in_lots(terrains, lot, progress)
+                return
+            with Bar(label) as bar:
+                yield from pipeline.in_lots(terrains, lot, bar.move_to)
+        except BaseException:
+            self.close()  # what failed is not used again
+            raise
+
+    def _open(self, cfg: PipelineCfg) -> Pipeline:
+        """A simulation with room for so many terrains; the one that is open if it serves."""
+        if self._opened is not None:
+            opened, pipeline = self._opened
+            if replace(opened, num_terrains=cfg.num_terrains) == cfg and opened.num_terrains >= cfg.num_terrains:
+                return pipeline
+        self.close()
+        pipeline = self._stack.enter_context(open_pipeline(cfg))
+        self._opened = (cfg, pipeline)
+        return pipeline
+
+
+def cross(
+    controllers: Mapping[str, str],
+    terrains: Terrains,
+    *,
+    robot: RobotCfg | str = "anymal",
+    compute: Compute | None = None,
+    replicas: int,
+    engine: Engine = "search",
+    reward: bool = False,
+    penalties_from_s: float = 0.0,
+    cache: Path | None = None,
+) -> dict[str, RolloutResult]:
+    """Lets each controller cross each terrain several times: one result a controller, by its name.
+
+    Arguments are those of :class:`Crosser` and :meth:`Crosser.cross`; without ``compute`` the CPU crosses, by a process
+    a core.
+    """
+    with Crosser(robot, compute or Compute(), cache=cache) as crosser:
+        return {
+            name: crosser.cross(
+                resolve_policy(policy, crosser.robot), terrains, replicas=replicas, engine=engine, reward=reward,
+                penalties_from_s=penalties_from_s, label=name,
+            )
+            for name, policy in controllers.items()
+        }  # fmt: skip
+
+
+def _lot_size(cfg: PipelineCfg) -> int:
+    """Terrains that are crossed between two writes; two lots are under way."""
+    if cfg.on_mujoco_c:
+        return _MUJOCO_C_LOT * cfg.num_workers
+    episodes = _LOT_EPISODES["cuda" if cfg.compute.on_gpu else "cpu"]
+    return max(1, min(episodes // cfg.replicas, _LOT_TERRAINS)) * cfg.num_workers
+
+
+def _in_order(results: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> RolloutResult:
+    """One result of several that hold some of the terrains each."""
+    order = np.argsort(np.concatenate([numbers for numbers, _ in results]))
+    return choose_rows(join_results([result for _, result in results], join=1), order)
+
+
+def _empty_result(cfg: PipelineCfg, penalty_names: tuple[str, ...]) -> RolloutResult:
+    shape = (0, cfg.replicas)
+    return RolloutResult(
+        penalties=np.zeros((*shape, len(penalty_names))), penalty_names=penalty_names,
+        outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
+        duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
+        reward=np.zeros(shape) if cfg.reward else None,
+    )  # fmt: skip
