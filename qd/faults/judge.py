@@ -86,9 +86,7 @@ def _check_stages(stages: Sequence[Stage], archive: Archive, judging: Judging) -
         done = {name for name in done if stage.name not in STAGES[name].needs} | {stage.name}
 
 
-def find_seen(
-    archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]
-) -> NDArray[np.bool_] | None:
+def find_seen(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
     """Whether each certifier of a judged archive has trained on kin of each elite, shape (N, C).
 
     None if the training record of one of them is not at hand.

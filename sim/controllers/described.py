@@ -20,7 +20,7 @@ TERMS: dict[str, tuple[str, ...]] = {
     "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
     "joint_vel": ("joints",), "last_action": (), "clock": ("period_s",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
-"""Fields of each term beside those that all have; docs/controllers.md says what they are."""
+"""Fields of each term besides those of all terms; docs/controllers.md explains them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,21 +34,22 @@ class Term:
     scale: float | tuple[float, ...] = 1.0
     """One factor, or one a column."""
     history: PositiveInt | None = None
-    """How many control steps of it are seen; the controller's if None."""
+    """Number of control steps that the controller sees; as :class:`History` has it if None."""
     at: tuple[float, float, float] | None = None
     """Where the velocity is measured, for example by the IMU, base frame [m]; at the base link's origin if None."""
     limit: float | tuple[float, float, float] | None = None
-    """The largest size of each command that it is told."""
+    """Largest size of each command."""
     joints: tuple[str, ...] | None = None
-    """Other joints than those that it moves; in this order."""
+    """Joints in this order; those that the controller moves if None."""
     period_s: PositiveFloat | None = None
+    """Period of a clock [s]."""
     order: Annotated[str, Meta(pattern="^(x fastest|y fastest)$")] | None = None
     x: tuple[float, ...] | None = None
     """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None
     """Left of it [m]; the robot's ``scan_y`` if None."""
     offset: float | None = None
-    """What is taken off the height of the base over the ground [m]."""
+    """Subtracted from the height of the base over the ground [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class History:
     """How observations of former control steps are laid out."""
 
     length: PositiveInt
-    """Control steps that are seen, the present one among them."""
+    """Control steps that the controller sees, with the present one."""
     newest: Annotated[str, Meta(pattern="^(first|last)$")]
     by: Annotated[str, Meta(pattern="^(row|term)$")]
     """Whole rows one after the other, or all steps of a term before the next."""
@@ -73,26 +74,26 @@ class ControllerCfg:
     observation: tuple[Term, ...] = ()
     """Terms in the order of its columns."""
     joints: tuple[str, ...] | None = None
-    """Joints in its order; others hold the robot's default pose; all of the robot if None."""
+    """Joints that it moves, in its order; the others hold the robot's default pose. All of the robot if None."""
     default: tuple[float, ...] | None = None
-    """Its pose [rad], which angles are relative to; the robot's if None."""
+    """Pose that joint angles are relative to [rad]; the robot's if None."""
     action_scale: float | tuple[float, ...]
     """Radians per unit of action."""
     action_offset: tuple[float, ...] | None = None
-    """Targets at action 0 [rad]; its default pose if None."""
+    """Targets at action 0 [rad]; ``default`` if None."""
     action_clip: float | tuple[tuple[float, float], ...] | None = None
     """Largest size of the network's output, or its limits, one pair a joint."""
     action_delay_steps: NonNegativeInt = 0
-    """Control steps after which an action counts."""
+    """Control steps until an action takes effect."""
     observation_clip: PositiveFloat | None = None
-    """Largest size of a column, after all else."""
+    """Largest size of a column, applied last."""
     history: History | None = None
     activation: Annotated[str, Meta(pattern=f"^({'|'.join(ACTIVATIONS)})$")] | None = None
-    """Between the layers of an rsl_rl checkpoint, which does not say it."""
+    """Function between the layers of an rsl_rl checkpoint that does not name it."""
 
 
 def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
-    """Reads a description, or its text, which is called ``path`` in errors; an error names the field too."""
+    """Reads a description, or its text; errors name ``path`` and the field."""
     content = read_toml(path, text)
     if "model_file" in content:
         raise ValueError(f"{path} must be a controller, got the settings of a robot: name it by --robot")
@@ -105,13 +106,13 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
         name = item.get("term")
         if not isinstance(name, str) or name not in TERMS:
             raise ValueError(f"{path}: observation[{k}].term must be one of {', '.join(TERMS)}, got {name}")
-        place = f"{path}: observation[{k}] ({name})"
-        known = ("term", "clip", "scale", "history", *TERMS[name])
-        if unknown := sorted(item.keys() - known):
-            raise ValueError(f"{place} has no setting {', '.join(unknown)}: there are {', '.join(known)}")
+        label = f"{path}: observation[{k}] ({name})"
+        settings = ("term", "clip", "scale", "history", *TERMS[name])
+        if unknown := sorted(item.keys() - settings):
+            raise ValueError(f"{label} has no setting {', '.join(unknown)}: there are {', '.join(settings)}")
         if missing := {"period_s", "order"} & {*TERMS[name]} - item.keys():
-            raise ValueError(f"{place}: missing '{missing.pop()}'")
-        terms.append(from_builtins(Term, item, place))
+            raise ValueError(f"{label}: missing '{missing.pop()}'")
+        terms.append(from_builtins(Term, item, label))
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
 
 
@@ -122,37 +123,39 @@ def format_controller(cfg: ControllerCfg) -> str:
 
 
 class _Memory(NamedTuple):
-    """What a controller knows of each robot, written in place; 0 as an episode begins."""
+    """State of a controller for each robot, written in place; 0 when an episode begins."""
 
-    steps: torch.Tensor  # control steps since then, float, (num_envs, 1)
+    steps: torch.Tensor  # control steps of the episode, float, (num_envs, 1)
     action: torch.Tensor  # last output of the network, (num_envs, num_actions)
-    sent: torch.Tensor  # outputs that do not count yet, the newest first, (num_envs, action_delay_steps, num_actions)
+    sent: torch.Tensor  # outputs without effect yet, the newest first, (num_envs, action_delay_steps, num_actions)
     past: torch.Tensor  # observations, the newest first, (num_envs, length, width)
 
 
 class Described(torch.nn.Module):
     """The controller of a description, as a policy of the robot's observation row."""
 
-    def __init__(self, cfg: ControllerCfg, robot: RobotCfg, place: str) -> None:
-        """Checks a description, called ``place`` in errors, against its robot; :meth:`use` sets the network."""
+    def __init__(self, cfg: ControllerCfg, robot: RobotCfg, path: str) -> None:
+        """Checks the description of a file against its robot; :meth:`use` sets the network."""
         super().__init__()
-        self.cfg, self.robot, self._place = cfg, robot, place
+        self.cfg = cfg
+        self.robot = robot
+        self._path = path
         self.network: Any = None
-        self._moved = self._numbers(cfg.joints)
+        self._moved = self._find_joints(cfg.joints)
         self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
             if isinstance(values, tuple) and len(values) != self.num_actions:
                 self._refuse(f"{name} must have one value a joint, {self.num_actions}, got {len(values)}")
         self._check_limits("action_clip", cfg.action_clip)
-        self._picked = [self._columns_of(term) for term in cfg.observation]
-        self.widths = [len(columns) for columns in self._picked]
+        self._columns = [self._find_columns(term) for term in cfg.observation]
+        self.widths = [len(columns) for columns in self._columns]
         for k, (term, width) in enumerate(zip(cfg.observation, self.widths, strict=True)):
             if isinstance(term.scale, tuple) and len(term.scale) != width:
                 self._refuse(f"observation[{k}].scale must be one number or {width}, got {len(term.scale)}")
             self._check_limits(f"observation[{k}].clip", term.clip)
-            for size in np.ravel(term.limit or 0.0):
-                self._check_limits(f"observation[{k}].limit", size)
+            for limit in np.ravel(term.limit or 0.0):
+                self._check_limits(f"observation[{k}].limit", limit)
         history = cfg.history
         self.lengths = [term.history or (history.length if history else 1) for term in cfg.observation]
         if max(self.lengths) > 1 and history is None:
@@ -163,64 +166,72 @@ class Described(torch.nn.Module):
 
     def use(self, network: Any, device: torch.device) -> None:
         """Set the network, which has :attr:`observation_size` columns and one action a joint."""
-        cfg, pose, count = self.cfg, self.robot.default_joint_pos, self.num_actions
-        self.network, self._device = network, device
+        cfg = self.cfg
+        self.network = network
+        self._device = device
         self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
 
         def constant(values: Any) -> torch.Tensor:
             return torch.tensor(np.array(values), dtype=torch.float32, device=device)
 
-        own = dict(enumerate(pose)) | dict(zip(self._moved, cfg.default or [pose[k] for k in self._moved], strict=True))
-        minus, limits, scale = [], [], []
-        for term, columns in zip(cfg.observation, self._picked, strict=True):
-            minus += [own[k] if term.term == "joint_pos" else term.offset or 0.0 for k in columns]
+        robot_pose = self.robot.default_joint_pos
+        moved_pose = [robot_pose[k] for k in self._moved]
+        pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, cfg.default or moved_pose, strict=True))
+        zeros: list[float] = []
+        limits: list[Any] = []
+        scale: list[float] = []
+        for term, columns in zip(cfg.observation, self._columns, strict=True):
+            zeros += [pose[k] if term.term == "joint_pos" else term.offset or 0.0 for k in columns]
             scale += [*np.broadcast_to(term.scale, len(columns))]
-            told = np.broadcast_to(math.inf if term.limit is None else term.limit, len(columns))
-            limits += [np.clip((-size, size), *_limits(term.clip)) for size in told]
-        self._index = [torch.tensor(columns, device=device) for columns in self._picked]
-        self._at = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
-        self._minus, self._limits, self._scale = constant(minus), constant(limits).T, constant(scale)
-        self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (count, 2))).T
-        self._joints, self._pose = torch.tensor(self._moved, device=device), constant([pose[k] for k in self._moved])
-        self._offset = constant(cfg.action_offset or [own[k] for k in self._moved])
-        self._radians = constant(np.broadcast_to(cfg.action_scale, count))
+            sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(columns))
+            limits += [np.clip((-size, size), *_limits(term.clip)) for size in sizes]
+        self._index = [torch.tensor(columns, device=device) for columns in self._columns]
+        self._sensors = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
+        self._zeros = constant(zeros)
+        self._limits = constant(limits).T
+        self._scale = constant(scale)
+        self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (self.num_actions, 2))).T
+        self._joints = torch.tensor(self._moved, device=device)
+        self._pose = constant(moved_pose)
+        self._offset = constant(cfg.action_offset or [pose[k] for k in self._moved])
+        self._radians = constant(np.broadcast_to(cfg.action_scale, self.num_actions))
 
     def _refuse(self, problem: str) -> None:
-        raise ValueError(f"{self._place}: {problem}")
+        raise ValueError(f"{self._path}: {problem}")
 
     def _check_limits(self, name: str, clip: Any) -> None:
         if any(lower > upper for lower, upper in np.reshape(_limits(clip), (-1, 2))):
             self._refuse(f"{name} must be above 0, or have its lower limit first, got {clip}")
 
-    def _numbers(self, names: tuple[str, ...] | None) -> tuple[int, ...]:
-        """The robot's numbers of joints, of all of them by default."""
-        own = self.robot.joint_names
-        names = own if names is None else names
-        unknown = [name for name in names if name not in own]
+    def _find_joints(self, names: tuple[str, ...] | None) -> tuple[int, ...]:
+        """Indices of joints of the robot, of all by default."""
+        joints = self.robot.joint_names
+        names = joints if names is None else names
+        unknown = [name for name in names if name not in joints]
         if unknown or len(set(names)) < len(names):
             got = f"no {', '.join(unknown)}" if unknown else "each of them once"
-            self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(own)}")
-        return tuple(own.index(name) for name in names)
+            self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(joints)}")
+        return tuple(joints.index(name) for name in names)
 
-    def _columns_of(self, term: Term) -> Sequence[int]:
-        """Which columns a term takes of its quantity."""
+    def _find_columns(self, term: Term) -> Sequence[int]:
+        """The columns of its quantity that a term takes."""
         if term.term.startswith("joint"):
-            return self._moved if term.joints is None else self._numbers(term.joints)
+            return self._moved if term.joints is None else self._find_joints(term.joints)
         if term.term != "scan":
             return range({"last_action": self.num_actions, "clock": 2}.get(term.term, 3))
         xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
         points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
-        numbers = {(round(float(x), 4), round(float(y), 4)): k
-                   for k, (x, y) in enumerate(zip(*self.robot.scan_points(), strict=True))}  # fmt: skip
+        scan_points = zip(*self.robot.scan_points(), strict=True)
+        index_by_point = {(round(float(x), 4), round(float(y), 4)): k for k, (x, y) in enumerate(scan_points)}
         points = [(round(x, 4), round(y, 4)) for x, y in points]
         if not points:
             self._refuse("a scan must have x and y where the robot has no scan_x and scan_y")
-        if not set(points) <= numbers.keys():
+        if not set(points) <= index_by_point.keys():
             x, y = ([*dict.fromkeys(values)] for values in zip(*points, strict=True))
             self._refuse(
                 f"the scan's points are not those of the robot: write into robot.toml scan_x = {x} and scan_y = {y}"
             )
-        return [numbers[point] for point in points]
+        return [index_by_point[point] for point in points]
 
     @property
     def observation_size(self) -> int:
@@ -229,7 +240,7 @@ class Described(torch.nn.Module):
 
     @property
     def columns(self) -> str:
-        """What the network sees, in words."""
+        """What the network sees, as text."""
         terms = zip(self.cfg.observation, self.widths, self.lengths, strict=True)
         return ", ".join(f"{term.term} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
 
@@ -238,17 +249,20 @@ class Described(torch.nn.Module):
         """Whether it may be captured as a CUDA graph, its ``reset`` too."""
         return is_graph_safe(self.network)
 
-    def _memory_of(self, count: int) -> _Memory:
+    def _get_memory(self, count: int) -> _Memory:
         if count not in self._memories:
-            sizes = ((1,), (self.num_actions,), (self.cfg.action_delay_steps, self.num_actions),
-                     (max(self.lengths), sum(self.widths)))  # fmt: skip
-            self._memories[count] = _Memory(*(torch.zeros((count, *size), device=self._device) for size in sizes))
+            self._memories[count] = _Memory(
+                steps=torch.zeros((count, 1), device=self._device),
+                action=torch.zeros((count, self.num_actions), device=self._device),
+                sent=torch.zeros((count, self.cfg.action_delay_steps, self.num_actions), device=self._device),
+                past=torch.zeros((count, max(self.lengths), sum(self.widths)), device=self._device),
+            )
         return self._memories[count]
 
     @torch.inference_mode()
     def reset(self, rows: torch.Tensor) -> None:
         """Begin an episode where ``rows``, bool, shape (num_envs,), is true."""
-        for values in self._memory_of(len(rows)):
+        for values in self._get_memory(len(rows)):
             values.masked_fill_(rows.reshape(-1, *[1] * (values.ndim - 1)), 0.0)
         if hasattr(self.network, "reset"):
             self.network.reset(rows)
@@ -260,32 +274,34 @@ class Described(torch.nn.Module):
 
     @torch.inference_mode()
     def observe(self, row: torch.Tensor) -> torch.Tensor:
-        """What the network sees of the robot's rows, shape (num_envs, observation_size); once a control step."""
-        clip, memory, sensed = self.cfg.observation_clip, self._memory_of(len(row)), read_row(row, self.robot)
-        parts = [
-            self._quantity(term, sensed, memory, at)[:, index]
-            for term, at, index in zip(self.cfg.observation, self._at, self._index, strict=True)
+        """The network's rows from the robot's, shape (num_envs, observation_size); once a control step."""
+        clip = self.cfg.observation_clip
+        memory = self._get_memory(len(row))
+        sensed = read_row(row, self.robot)
+        columns = [
+            self._compute_quantity(term, sensed, memory, sensor)[:, index]
+            for term, sensor, index in zip(self.cfg.observation, self._sensors, self._index, strict=True)
         ]
-        now = (torch.cat(parts, dim=1) - self._minus).clamp(*self._limits) * self._scale
+        now = (torch.cat(columns, dim=1) - self._zeros).clamp(*self._limits) * self._scale
         return self._with_history(now if clip is None else now.clamp(-clip, clip), memory)
 
     @torch.inference_mode()
     def act(self, output: torch.Tensor) -> torch.Tensor:
-        """The robot's actions of what the network returns, shape (num_envs, num_actions)."""
-        memory = self._memory_of(len(output))
+        """The robot's actions from outputs of the network, shape (num_envs, num_actions)."""
+        memory = self._get_memory(len(output))
         memory.action.copy_(output.clamp(*self._clip))
         memory.steps.add_(1.0)
         queue = torch.cat([memory.action[:, None], memory.sent], dim=1)
         memory.sent.copy_(queue[:, :-1])
-        own = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
-        actions = own.new_zeros(len(own), self.robot.num_joints)  # 0 holds the default pose
-        actions[:, self._joints] = own
+        moved = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
+        actions = moved.new_zeros(len(moved), self.robot.num_joints)  # 0 holds the default pose
+        actions[:, self._joints] = moved
         return actions
 
-    def _quantity(self, term: Term, sensed: Sensed, memory: _Memory, at: torch.Tensor) -> torch.Tensor:
-        """What a term takes its columns from, shape (num_envs, any)."""
+    def _compute_quantity(self, term: Term, sensed: Sensed, memory: _Memory, sensor: torch.Tensor) -> torch.Tensor:
+        """All columns of a term's quantity, shape (num_envs, any)."""
         if term.term == "lin_vel":
-            return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, at.expand_as(sensed.ang_vel))
+            return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, sensor.expand_as(sensed.ang_vel))
         if term.term == "last_action":
             return memory.action
         if term.term == "clock":
@@ -308,5 +324,5 @@ class Described(torch.nn.Module):
 
 
 def _limits(clip: Any) -> Any:
-    """Lower and upper limit of all columns, by a size or None; a pair, or one a column, is that already."""
+    """Lower and upper limit for a size or None; limits, or limits a column, are returned as they are."""
     return clip if isinstance(clip, tuple) else (-math.inf, math.inf) if clip is None else (-clip, clip)

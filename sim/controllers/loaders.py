@@ -14,21 +14,16 @@ import torch
 import warp as wp
 
 from sim.controllers.described import ControllerCfg, Described, read_controller
-from sim.controllers.formats.network import WEIGHTS, Policy, find_widths, load_network
+from sim.controllers.formats.network import Policy, find_widths, load_network
 from sim.controllers.mlp import MlpPolicy, RnnPolicy
 from sim.controllers.runner import action_problem, reset_all
-from sim.controllers.spec import ControllerSpec, find_named, in_one_line, weights_file
+from sim.controllers.spec import ControllerSpec, import_object, in_one_line, weights_file
 from sim.files.atomic import read_json
 from sim.robots.find import get_robot
 from sim.robots.identity import robot_digest
 from sim.robots.robot import RobotCfg
 
-_FORMATS = (
-    f"a description (.toml), {WEIGHTS}, "
-    "module:callable or file.py:callable (a function on device tensors, or a class or factory marked by "
-    "`faultline_factory = True` that is called with (robot, device)), or module:adapter@file (a function that is "
-    "called with (controller, robot))"
-)
+_EXPECTED = "expected a .toml, .pt, .ts or .onnx file, module:callable or module:adapter@file (docs/controllers.md)"
 PolicySpec = str | Path | Policy
 """A controller as :func:`load_policy` takes it, or as a callable."""
 
@@ -80,9 +75,9 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     if device != "cpu" and not torch.cuda.is_available():
         raise ValueError(f"torch {torch.__version__} has no CUDA: install a build with CUDA, or use --device cpu")
     named = ControllerSpec.parse(spec)
-    policy = _load_file(Path(spec), robot, device) if named.place is None else _load_code(named, robot, device)
+    policy = _load_file(Path(spec), robot, device) if named.module is None else _load_code(named, robot, device)
     _try_rows(policy, (robot.observation_size, robot.num_joints), device, str(spec), f"robot '{robot.name}'")
-    if named.place is None and not _separates_rows(policy, robot.observation_size, device):
+    if named.module is None and not _separates_rows(policy, robot.observation_size, device):
         raise ValueError(
             f"policy '{spec}' fails, or acts differently in an episode's first step, beside other rows or after other "
             "steps: it mixes rows, draws at random, or remembers across a reset: export it without that"
@@ -116,17 +111,17 @@ def _print_once(line: str) -> None:
 
 def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
-        target: Any = find_named(str(spec.place), str(spec.name))
+        target: Any = import_object(str(spec.module), str(spec.name))
     except Exception as error:  # a module can fail with anything
-        raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; expected {_FORMATS}") from error
+        raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; {_EXPECTED}") from error
     if not callable(target):
-        raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; expected {_FORMATS}")
+        raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; {_EXPECTED}")
     called, arguments = "robot, device", (robot, device)
     if spec.file is not None:
         called, arguments = "controller, robot", (_load_file(Path(spec.file), robot, device, fits=False), robot)
     elif not getattr(target, "faultline_factory", False):
         if inspect.isclass(target):
-            raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; expected {_FORMATS}")
+            raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; {_EXPECTED}")
         return target
     try:
         policy = target(*arguments)
@@ -143,7 +138,7 @@ def _load_file(path: Path, robot: RobotCfg, device: str, *, fits: bool = True) -
         remedy = f"train one with `{robot.train_command}`, or name another with --policy"
         raise ValueError(f"robot '{robot.name}' has no controller of its own, expected at {path}: {remedy}")
     if not os.path.isfile(path):  # False too for a name that no file can have
-        raise ValueError(f"policy '{path}': no such file; expected {_FORMATS}")
+        raise ValueError(f"policy '{path}': no such file; {_EXPECTED}")
     if path.suffix == ".py":
         raise ValueError(f"policy '{path}' is a Python file: name what to call in it, {path}:CALLABLE")
     if path.suffix == ".toml":

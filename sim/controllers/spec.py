@@ -19,17 +19,17 @@ from sim.robots.robot import RobotCfg
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""
-_NAMED = re.compile(r"(?P<place>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
+_NAMED = re.compile(r"(?P<module>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSpec:
     """``file``, ``module:callable`` or ``module:adapter@file``; a Python file may stand for the module."""
 
-    place: str | None = None
+    module: str | None = None
     """Module, or file whose name ends in .py; None if no code is named."""
     name: str | None = None
-    """What to take of it."""
+    """Name of the callable in it."""
     file: str | None = None
 
     @classmethod
@@ -41,14 +41,14 @@ class ControllerSpec:
         return cls(**match.groupdict())
 
     def __str__(self) -> str:
-        if self.place is None:
+        if self.module is None:
             return str(self.file)
-        return f"{self.place}:{self.name}" + ("" if self.file is None else f"@{self.file}")
+        return f"{self.module}:{self.name}" + ("" if self.file is None else f"@{self.file}")
 
     @property
     def runs_code(self) -> bool:
         """Whether loading it runs Python."""
-        return self.place is not None
+        return self.module is not None
 
     @property
     def label(self) -> str:
@@ -57,8 +57,8 @@ class ControllerSpec:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The Python file, the controller's file and what that needs beside itself, as far as there are such."""
-        files = [Path(self.place)] if self.place is not None and self.place.endswith(".py") else []
+        """The Python file, the controller's file, the weights of a description, and the agent.yaml, if any."""
+        files = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
         if self.file is not None:
             files.append(Path(self.file))
             if files[-1].suffix == ".toml" and (weights := weights_file(files[-1])) is not None:
@@ -68,53 +68,50 @@ class ControllerSpec:
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
-        place, file = self.place, self.file
-        if place is not None and place.endswith(".py"):
-            place = str(folder / Path(place).name)
-        return ControllerSpec(place=place, name=self.name, file=file and str(folder / Path(file).name))
+        module = self.module
+        if module is not None and module.endswith(".py"):
+            module = str(folder / Path(module).name)
+        return ControllerSpec(module=module, name=self.name, file=self.file and str(folder / Path(self.file).name))
 
 
 def weights_file(path: Path) -> Path | None:
-    """File of the weights that a description names, if it can be read.
-
-    Of a description that was sent elsewhere they lie beside it, wherever they lay before.
-    """
+    """File of the weights that a description names, or of that name beside it; None if it cannot be read."""
     try:
         policy = tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
-        named, beside = path.parent / policy, path.parent / Path(policy).name
-        return beside if not named.is_file() and beside.is_file() else named
+        neighbour = path.parent / Path(policy).name
+        return neighbour if neighbour.is_file() and not (path.parent / policy).is_file() else path.parent / policy
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
 def agent_file(weights: Path) -> Path | None:
-    """The settings of the training that an rsl_rl checkpoint, .pt, lies beside, if they are there."""
-    places = (weights.parent / "agent.yaml", weights.parent / "params" / "agent.yaml")
-    return next((place for place in places if weights.suffix == ".pt" and place.is_file()), None)
+    """The agent.yaml of the training that wrote a .pt file, if it is there."""
+    files = (weights.parent / "agent.yaml", weights.parent / "params" / "agent.yaml")
+    return next((file for file in files if weights.suffix == ".pt" and file.is_file()), None)
 
 
 def resolve_policy(policy: str, robot: RobotCfg) -> str:
-    """What to load a controller from that a user or a run names, :data:`SHIPPED` among them."""
+    """The controller that a user or a run names, with the robot's file for :data:`SHIPPED`."""
     return str(robot.policy_file) if policy == SHIPPED else policy
 
 
 def controller_hash(policy: str | Path) -> str | None:
     """SHA-256 of a controller: of its file, or of all its files and the callable's name.
 
-    None if a file is missing, or a module has none. What code reads beside its own file is not in it.
+    None if a file is missing, or a module has none. Files that code reads or imports are not part of it.
     """
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
-    if spec.place is not None and not spec.place.endswith(".py"):
+    if spec.module is not None and not spec.module.endswith(".py"):
         try:
-            module = importlib.util.find_spec(spec.place)
+            found_module = importlib.util.find_spec(spec.module)
         except (ImportError, ValueError):  # no package of that name
-            module = None
-        files.insert(0, Path((module and module.origin) or ""))
+            found_module = None
+        files.insert(0, Path((found_module and found_module.origin) or ""))
     if not all(file.is_file() for file in files):
         return None
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    if spec.place is None and len(hashes) == 1:
+    if spec.module is None and len(hashes) == 1:
         return hashes[0]
     return hashlib.sha256(" ".join([str(spec.name), *hashes]).encode()).hexdigest()
 
@@ -129,7 +126,7 @@ def controller_identity(robot: RobotCfg, policy: str | Path) -> dict[str, str | 
 
 
 _ROOT = Path(__file__).resolve().parents[2]
-_NOT_THE_USERS = (
+_FOLDERS_NOT_OF_USERS = (
     *(_ROOT / room for room in ("kernels", "sim", "qd", "train")),
     *(Path(sysconfig.get_path(kind)) for kind in ("stdlib", "platstdlib", "purelib", "platlib")),
 )
@@ -138,11 +135,11 @@ _NOT_THE_USERS = (
 _ADVICE = re.compile(
     r"(?s)Weights only load failed.*(trusted source\.|WeightsUnpickler error: )|\. (Please use `torch|This is an int).*"
 )
-"""What torch says of any file that it refuses: to load it as code, or that it is damaged."""
+"""Advice of torch about any file that it refuses: to load it as code, or that it is damaged."""
 
 
 def in_one_line(error: BaseException) -> str:
-    """Kind of an error, the first line of what it says, and the innermost line of the user's own code."""
+    """Type of an error, the first line of its text, and the innermost line of the user's code in its traceback."""
     lines = _ADVICE.sub("", str(error)).strip().splitlines()
     first = -1 if lines and lines[0].startswith("The following operation failed") else 0  # TorchScript's trace
     text = ": ".join([type(error).__name__, *lines[first:][:1]]).rstrip(".")
@@ -150,13 +147,13 @@ def in_one_line(error: BaseException) -> str:
         frame
         for frame in traceback.extract_tb(error.__traceback__)
         if not frame.filename.startswith("<")
-        and not any(Path(frame.filename).is_relative_to(folder) for folder in _NOT_THE_USERS)
+        and not any(Path(frame.filename).is_relative_to(folder) for folder in _FOLDERS_NOT_OF_USERS)
     ]
     return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})" if frames else text
 
 
 def run_file(path: Path) -> ModuleType:
-    """Runs a Python file as a module of its own, as it is now; its neighbours can be imported from it."""
+    """Runs a Python file as a module, as it is now; it can import its neighbours."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     path = path.resolve()
@@ -177,21 +174,21 @@ def run_file(path: Path) -> ModuleType:
     return module
 
 
-def find_named(place: str, name: str) -> Any:
-    """What a module, or a file whose name ends in .py, calls ``name``; dots reach into classes. It can fail anyhow."""
-    target: Any = run_file(Path(place)) if place.endswith(".py") else importlib.import_module(place)
-    for part in name.split("."):
-        if not hasattr(target, part):
+def import_object(module: str, name: str) -> Any:
+    """The object called ``name``, with dots into classes, of a module or .py file, which may raise any error."""
+    target: Any = run_file(Path(module)) if module.endswith(".py") else importlib.import_module(module)
+    for attribute in name.split("."):
+        if not hasattr(target, attribute):
             raise AttributeError(f"it has no '{name}', only {', '.join(k for k in vars(target) if k[0] != '_')}")
-        target = getattr(target, part)
+        target = getattr(target, attribute)
     return target
 
 
 def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
-    """Policy and hash of each controller by its name, as files of results have them; ``shipped`` is the robot's own."""
-    own = str(robot.policy_file)
+    """Policy, or ``shipped``, and hash of each controller by its name, as files of results have them."""
+    shipped = str(robot.policy_file)
     return {
-        name: {"policy": SHIPPED if is_same_controller(policy, own) else policy, "sha256": controller_hash(policy)}
+        name: {"policy": SHIPPED if is_same_controller(policy, shipped) else policy, "sha256": controller_hash(policy)}
         for name, policy in controllers.items()
     }
 
@@ -218,7 +215,7 @@ def parse_controllers(policies: Sequence[str], robot: RobotCfg, *, flag: str = "
 
 
 def label_suffix(policy: str) -> str:
-    """The ending of the names of files about a controller that is not the usual one, for example ``-C-G``."""
+    """The ending of the names of files about a controller that is not the shipped one, for example ``-C-G``."""
     if Path(policy).name == "controller.toml":  # as all descriptions are called
         policy = Path(policy).resolve().parent.name
     label = re.sub(r"\.(pt|onnx|toml)$", "", ControllerSpec.parse(policy).label)
@@ -226,11 +223,11 @@ def label_suffix(policy: str) -> str:
 
 
 def crosser_name(robot: RobotCfg, policy: str) -> str:
-    """What files about a robot and its controller are called: by its name, and by the controller if not the shipped."""
+    """How names of files about a robot and its controller begin: the robot, and its controller unless it is shipped."""
     return robot.name + ("" if is_same_controller(policy, str(robot.policy_file)) else label_suffix(policy))
 
 
 def is_same_controller(policy: str, other: str) -> bool:
-    """Whether two names are of the same controller, by name or by its files."""
+    """Whether two policies are the same controller, by name or by the hash of its files."""
     digest = controller_hash(policy)
     return policy == other or (digest is not None and digest == controller_hash(other))

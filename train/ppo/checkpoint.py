@@ -152,9 +152,7 @@ def plain_layers(network: Any, name: str) -> MlpPolicy:
         try:
             policy = MlpPolicy(state, activation)
             rows = torch.randn(64, policy.sizes[0], generator=torch.Generator().manual_seed(0))
-            rows = (
-                policy.mean + policy.std * rows * torch.logspace(-1, 1, 64)[:, None]
-            )  # far from 0, limits show
+            rows = policy.mean + policy.std * rows * torch.logspace(-1, 1, 64)[:, None]  # far from 0, limits show
             if torch.allclose(policy(rows), network(rows), rtol=1e-4, atol=1e-4):
                 return policy
         except (KeyError, RuntimeError):

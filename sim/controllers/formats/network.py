@@ -11,7 +11,6 @@ from sim.controllers.formats.rsl_rl import make_actor, read_weights
 from sim.controllers.formats.torchscript import separate_robots
 from sim.controllers.spec import in_one_line
 
-WEIGHTS = "an rsl_rl checkpoint (.pt), a TorchScript module (.pt, .ts), an ONNX file (.onnx)"
 Policy = Callable[[torch.Tensor], torch.Tensor]
 """Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size).
 
@@ -53,8 +52,8 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
         module, probe = (torch.jit.load(str(path), map_location=place).eval() for place in (device, "cpu"))
     except Exception as error:
         raise ValueError(
-            f"policy '{path}' is neither a checkpoint of plain tensors nor a TorchScript module (truncated, foreign, "
-            f"or holding code): {in_one_line(reason)}; expected {WEIGHTS}"
+            f"policy '{path}' is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module (truncated, "
+            f"foreign, or holding code): {in_one_line(reason)}: give one of these, or an ONNX file that ends in .onnx"
         ) from error
     return module if sizes is None else separate_robots(module, probe, path, sizes[0], device)
 

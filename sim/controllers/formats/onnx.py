@@ -16,22 +16,32 @@ from sim.controllers.mlp import MlpPolicy
 from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.files.atomic import prepare_output, write_atomically
 
-_OPSET, _IR_VERSION = 17, 8  # of 2022: what runs on robots is rarely new
-_OPERATORS = {"elu": "Elu", "selu": "Selu", "relu": "Relu", "lrelu": "LeakyRelu", "tanh": "Tanh", "sigmoid": "Sigmoid",
-              "softplus": "Softplus", "identity": "Identity"}  # fmt: skip
+_OPSET = 17  # of 2022, since robots rarely run a new onnxruntime
+_IR_VERSION = 8
+_OPERATORS = {
+    "elu": "Elu",
+    "selu": "Selu",
+    "relu": "Relu",
+    "lrelu": "LeakyRelu",
+    "tanh": "Tanh",
+    "sigmoid": "Sigmoid",
+    "softplus": "Softplus",
+    "identity": "Identity",
+}
 _ATTRIBUTES = {"elu": {"alpha": 1.0}, "lrelu": {"alpha": 0.01}}
-_CPU, _CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+_CPU = "CPUExecutionProvider"
+_CUDA = "CUDAExecutionProvider"
 
 
 class OnnxPolicy:
-    """A controller that onnxruntime runs, with copies from the device of the tensors and back."""
+    """A controller that onnxruntime runs; tensors are copied from their device and back."""
 
     def __init__(self, data: bytes, device: torch.device, sizes: tuple[int, int] | None) -> None:
-        """Of a file's content; ``sizes`` of observation and action are the file's if None."""
+        """From the content of a file; ``sizes`` of observation and action are those of the file if None."""
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()  # one in worker processes, as prepare_torch has it
+        options.intra_op_num_threads = torch.get_num_threads()  # 1 in worker processes
         options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what is wrong comes as an exception
+        options.log_severity_level = 4  # exceptions report all errors
         options.add_session_config_entry("session.load_model_format", "ONNX")
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers: list[Any] = [_CPU]
@@ -39,30 +49,31 @@ class OnnxPolicy:
             # TF32 would round every product to 10 bits.
             providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
         self.session = onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
-        self.sizes, self.states, self.of_one = _checked_sizes(self.session, sizes)
+        self.sizes, self.states, self.is_single = _check_sizes(self.session, sizes)
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size)."""
         return self.run([observation])[0]
 
     def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Outputs of the graph's inputs, in its order, on their device; a graph of one robot runs once a robot."""
+        """Outputs for the graph's inputs, in its order, on their device; a graph for one robot runs once a robot."""
         values = [value.detach().cpu().float() for value in inputs]
         names = [port.name for port in self.session.get_inputs()]
-        parts = zip(*(value.split(1, dim=-2) for value in values), strict=True) if self.of_one else [values]
-        outputs = [self.session.run(None, dict(zip(names, map(np.asarray, part), strict=True))) for part in parts]
-        return [torch.from_numpy(np.concatenate(output, axis=-2)).to(inputs[0].device)
-                for output in zip(*outputs, strict=True)]  # fmt: skip
+        calls = zip(*(value.split(1, dim=-2) for value in values), strict=True) if self.is_single else [values]
+        results = [self.session.run(None, dict(zip(names, map(np.asarray, call), strict=True))) for call in calls]
+        outputs = [np.concatenate(rows, axis=-2) for rows in zip(*results, strict=True)]
+        return [torch.from_numpy(output).to(inputs[0].device) for output in outputs]
 
 
 class _OnnxRecurrent(Recurrent):
-    """One that remembers: states ``h_in``, ``c_in`` of shape (layers, num_envs, size) go in and come out."""
+    """A controller that remembers: states of shape (layers, num_envs, size) go in and come out."""
 
     graph_safe = False
 
     def __init__(self, policy: OnnxPolicy) -> None:
         super().__init__([torch.zeros(layers, 1, size) for layers, _, size in policy.states], 1)
-        self.sizes, self._run = policy.sizes, policy.run
+        self.sizes = policy.sizes
+        self._run = policy.run
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         action, *after = self._run([rows, *state])
@@ -70,23 +81,24 @@ class _OnnxRecurrent(Recurrent):
 
 
 class OnnxLayers(torch.nn.Module):
-    """A controller whose graph has plain layers alone: in torch's operators, so that it can be captured."""
+    """A controller whose graph has only plain layers, in torch's operators, so that it can be captured."""
 
     def __init__(self, model: Any, policy: OnnxPolicy) -> None:
-        """Of a graph as onnxruntime runs it; a KeyError if it has another operator."""
+        """From a graph and onnxruntime's policy of it; a KeyError if it has another operator."""
         super().__init__()
         self.sizes = policy.sizes
-        self._input, self._output = policy.session.get_inputs()[0].name, policy.session.get_outputs()[0].name
+        self._input = policy.session.get_inputs()[0].name
+        self._output = policy.session.get_outputs()[0].name
         constants = {tensor.name: tensor for tensor in model.graph.initializer}
         self._nodes: list[tuple[Callable[..., Any], list[str], list[str], dict[str, Any]]] = []
         for node in model.graph.node:
-            given = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
+            attributes = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
             if node.op_type == "Constant":
-                constants[node.output[0]] = given["value"]
+                constants[node.output[0]] = attributes["value"]
                 continue
             if node.op_type == "Split":
-                given["parts"] = len(node.output)
-            self._nodes.append((_LAYERS[node.op_type], [*node.input], [*node.output], given))
+                attributes["chunks"] = len(node.output)
+            self._nodes.append((_LAYERS[node.op_type], [*node.input], [*node.output], attributes))
         self._names = list(constants)
         weights = [torch.tensor(numpy_helper.to_array(tensor)) for tensor in constants.values()]
         self.weights = torch.nn.ParameterList(torch.nn.Parameter(weight, requires_grad=False) for weight in weights)
@@ -94,8 +106,8 @@ class OnnxLayers(torch.nn.Module):
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""
         values = dict(zip(self._names, self.weights, strict=True)) | {self._input: with_rows_of_zeros(rows)}
-        for layer, inputs, outputs, given in self._nodes:
-            value = layer(*(values[name] for name in inputs), **given)
+        for layer, inputs, outputs, attributes in self._nodes:
+            value = layer(*(values[name] for name in inputs), **attributes)
             values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
         return values[self._output][: len(rows)]
 
@@ -108,27 +120,27 @@ _LAYERS: dict[str, Callable[..., Any]] = {
     "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Div": torch.div, "MatMul": torch.matmul,
     "Elu": functional.elu, "Selu": functional.selu, "Relu": functional.relu, "Tanh": torch.tanh,
     "Sigmoid": torch.sigmoid, "Softplus": functional.softplus, "Identity": torch.clone,
-    "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **given: torch.addmm(
-        bias, rows, weight.T if given.get("transB") else weight, alpha=alpha, beta=beta
+    "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **attributes: torch.addmm(
+        bias, rows, weight.T if attributes.get("transB") else weight, alpha=alpha, beta=beta
     ),
     "LeakyRelu": lambda value, alpha=0.01: functional.leaky_relu(value, alpha),
-    "Split": lambda value, *, parts, axis=0: value.chunk(parts, axis),
+    "Split": lambda value, *, chunks, axis=0: value.chunk(chunks, axis),
 }  # fmt: skip
-"""What a graph of plain layers may hold. What an operator means beyond this, comparing the outputs finds."""
+"""Operators of a graph of plain layers. Other attributes are found when the outputs are compared."""
 
 
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its graph takes observations (batch, observation_size) and gives actions (batch, num_joints), both float32; one that
-    remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
+    Its graph takes observations (batch, observation_size) and returns actions (batch, num_joints), both float32. A
+    graph that remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
 
-    Nothing but that file is read and no code in it runs: weights beside it are refused, and onnxruntime knows only its
-    own operators. A graph of plain layers becomes a torch module, if random rows of it come out as onnxruntime has
-    them. Another that is made for one robot is changed into one for any number, if it acts as one robot after the other
-    does; else it runs once a robot.
+    Only that file is read, and no code in it runs: weights in other files are refused, and onnxruntime knows only its
+    own operators. A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another
+    graph for one robot is changed into one for any number, if that acts on each robot as before; else it runs once a
+    robot.
     """
-    where = torch.device(device)
+    target = torch.device(device)
     try:
         data = path.read_bytes()
         model = onnx.ModelProto.FromString(data)
@@ -137,41 +149,42 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
         outside = [tensor.name for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
         if outside:
             raise ValueError(f"it keeps {len(outside)} of its tensors in another file ('{outside[0]}' first)")
-        policy = OnnxPolicy(data, where, sizes)
-        if layers := _made_alike(lambda: OnnxLayers(model, policy), policy, 1e-5):
-            return layers.to(where)
-        if policy.of_one:
-            policy = _made_alike(lambda: OnnxPolicy(_set_free(model), where, sizes), policy, 1e-4) or policy
+        policy = OnnxPolicy(data, target, sizes)
+        if layers := _make_if_equal(lambda: OnnxLayers(model, policy), policy, 1e-5):
+            return layers.to(target)
+        if policy.is_single:
+            policy = _make_if_equal(lambda: OnnxPolicy(_free_batch(model), target, sizes), policy, 1e-4) or policy
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
-    if where.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
+    if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
         warnings.warn(
             f"policy '{path}' has more than plain layers and runs on the CPU, since this onnxruntime has no CUDA that "
             "works: install onnxruntime-gpu, or give the rsl_rl checkpoint",
             stacklevel=2,
         )
-    if policy.of_one:
+    if policy.is_single:
         warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
-    return _OnnxRecurrent(policy).to(where) if policy.states else policy
+    return _OnnxRecurrent(policy).to(target) if policy.states else policy
 
 
-def _made_alike(make: Callable[[], Any], policy: OnnxPolicy, near: float) -> Any:
-    """What ``make`` makes if it answers random rows, and states, as the policy does to ``near``; else None."""
-    generator, shapes = torch.Generator().manual_seed(0), [(1, policy.sizes[0]), *policy.states]
+def _make_if_equal(make: Callable[[], Any], policy: OnnxPolicy, tolerance: float) -> Any:
+    """The result of ``make`` if it maps random rows, and states, as the policy does; else None."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(1, policy.sizes[0]), *policy.states]
     try:
         made = make()
         for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
             inputs = [size * torch.randn([*shape[:-2], count, shape[-1]], generator=generator) for shape in shapes]
             for value, expected in zip(made.run(inputs), policy.run(inputs), strict=True):
-                most = near * max(1.0, float(expected.abs().max()))
-                torch.testing.assert_close(value, expected, rtol=0.0, atol=most)
+                largest = max(1.0, float(expected.abs().max()))
+                torch.testing.assert_close(value, expected, rtol=0.0, atol=tolerance * largest)
     except Exception:  # onnxruntime's errors have no base
         return None
     return made
 
 
-def _set_free(model: Any) -> bytes:
-    """A graph for one robot as one for any number."""
+def _free_batch(model: Any) -> bytes:
+    """The graph for any number of robots."""
     constants = {tensor.name for tensor in model.graph.initializer}
     for port in (*model.graph.input, *model.graph.output):
         if port.name not in constants:
@@ -191,12 +204,13 @@ def _tensors(message: Any) -> Iterator[Any]:
                 yield from _tensors(inner)
 
 
-def _checked_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
-    """Widths of observation and action, shapes of the states, and whether it takes one robot alone."""
-    inputs, outputs = session.get_inputs(), session.get_outputs()
+def _check_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
+    """Widths of observation and action, shapes of the states, and whether the graph is for one robot."""
+    inputs = session.get_inputs()
+    outputs = session.get_outputs()
     if [port.name for port in inputs[1:]] != [f"{port.name.removesuffix('_out')}_in" for port in outputs[1:]]:
         raise ValueError(
-            "it must have one input and one output, and if it remembers the states X_in and X_out after them, got "
+            "it must have one input and one output, and after them the states X_in and X_out if it remembers, got "
             f"{', '.join(port.name for port in inputs)} and {', '.join(port.name for port in outputs)}"
         )
     shapes = [list(port.shape or [None, None]) for port in (inputs[0], outputs[0])]  # an output's may be unknown
@@ -229,7 +243,8 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
     if policy.activation not in _OPERATORS:
         raise ValueError(f"ONNX of opset {_OPSET} has no {policy.activation}, only {', '.join(_OPERATORS)}")
     prepare_output(path)
-    nodes, weights = list[Any](), list[Any]()
+    nodes: list[Any] = []
+    weights: list[Any] = []
 
     def node(kind: str, value: str, name: str, tensors: dict[str, torch.Tensor], **attributes: Any) -> str:
         nodes.append(helper.make_node(kind, [value, *tensors], [name], name=f"make_{name}", **attributes))

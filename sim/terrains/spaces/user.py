@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import PATCH, Ground, make_ground
-from sim.controllers.spec import ControllerSpec, controller_hash, find_named, in_one_line
+from sim.controllers.spec import ControllerSpec, controller_hash, import_object, in_one_line
 from sim.device import host_device
 from sim.terrains.ground import GROUND_KINDS, check_map
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
@@ -140,7 +140,7 @@ def load_own(spec: str) -> OwnSpace:
     """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains."""
     place = ControllerSpec.parse(spec)
     try:
-        code: Any = find_named(str(place.place), str(place.name))
+        code: Any = import_object(str(place.module), str(place.name))
         code = code() if inspect.isclass(code) else code
     except Exception as error:  # a user's code can fail with anything
         raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}") from error

@@ -145,9 +145,7 @@ def test_a_map_is_never_overwritten(anymal):
         np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
         with pytest.raises(ValueError, match="size"):
             select_map(Path(folder) / "hill.npz", anymal)
-        assert select_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
-            f"{folder}-hill.npz-anymal"
-        ]
+        assert select_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [f"{folder}-hill.npz-anymal"]
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}

@@ -96,20 +96,20 @@ def test_code_that_fails_is_named(tmp_path, write, anymal, source, call, words):
 
 
 @pytest.mark.parametrize(
-    ("text", "place", "name", "file", "label"),
+    ("text", "module", "name", "file", "label"),
     [
         ("a/C-G@7.pt", None, None, "a/C-G@7.pt", "C-G@7.pt"),
         ("/a b/mine.py:Class.act", "/a b/mine.py", "Class.act", None, "mine.py:Class.act"),
         ("c/mine.py:adapt@d/model:7.pt", "c/mine.py", "adapt", "d/model:7.pt", "mine.py:adapt@model:7.pt"),
     ],
 )
-def test_names_are_taken_apart(tmp_path, text, place, name, file, label):
+def test_names_are_taken_apart(tmp_path, text, module, name, file, label):
     spec = ControllerSpec.parse(text)
-    assert (spec.place, spec.name, spec.file, spec.label) == (place, name, file, label)
+    assert (spec.module, spec.name, spec.file, spec.label) == (module, name, file, label)
     assert str(spec) == text
-    assert spec.runs_code == (place is not None)
+    assert spec.runs_code == (module is not None)
     (tmp_path / "mine.py:act").write_bytes(b"x")  # a file of that name is a file
-    assert ControllerSpec.parse(tmp_path / "mine.py:act").place is None
+    assert ControllerSpec.parse(tmp_path / "mine.py:act").module is None
 
 
 def test_the_hash_is_of_all_that_is_in_files(tmp_path, write):
