@@ -23,7 +23,7 @@ from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
 from qd.show.replay import ReplaySource, save, select_elites, select_map
 from results.make.common import runs_of_today
-from results.make.docs import PAPER_ARCHIVES, ROBOTS, least_minimum, read
+from results.make.docs import PAPER, ROBOTS, least_minimum, read
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.robots.find import get_robot
@@ -103,7 +103,7 @@ def draw_growth() -> Figure:
                     [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows], style, marker=".",
                     color=color, label=label and f"{label}: {count.replace('_', ' ')}",
                 )  # fmt: skip
-        axes.axhline(PAPER_ARCHIVES[robot]["elites"], color="0.5", label="the paper's elites, as found")
+        axes.axhline(read(PAPER)[robot]["archive"]["elites"], color="0.5", label="the paper's elites, as found")
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside right center")
     return figure

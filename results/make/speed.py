@@ -309,7 +309,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     measured = {name: part for name, part in stored.get("measured", {}).items() if (name == "cpu") != on_cpu}
     origin = {name: script.origin[name] for name in ("commit", "device", "date")}
     measured |= {name: origin for name in parts}
-    report = script.origin | stored if on_cpu else {"cpu": stored.get("cpu"), **script.origin}
+    report: dict[str, Any] = script.origin | stored if on_cpu else {"cpu": stored.get("cpu"), **script.origin}
     report = dict.fromkeys(KEYS) | report | numbers | {"measured": measured}
     return script.add(report, training_rates(script, report["device"]))
 

@@ -294,7 +294,7 @@ def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text("Before.\n<!-- table: spaces -->\nold\n<!-- end -->\nBehind.\n")
     counts = {"space": "course", "elites": 1234, "faults": None}
     monkeypatch.setattr(docs, "ROOT", tmp_path)
-    monkeypatch.setattr(docs, "of_robots", lambda file: {"Dog": {"spaces": {"course": counts}}})
+    monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": {"spaces": {"course": counts}}})
     assert docs.main(["--check"]) == 1 and docs.main([]) == 0 and docs.main(["--check"]) == 0
     lines = ["Before.", "<!-- table: spaces -->", "|  | elites |", "|---|---|", "| Dog, course | 1,234 |"]
     assert (tmp_path / "README.md").read_text().splitlines() == [*lines, "<!-- end -->", "Behind."]
