@@ -17,6 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
 from qd.faults.families import way_to_end
+from qd.faults.numbers import SPECIALIST
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
@@ -24,20 +25,24 @@ from qd.show.replay import ReplaySource, save
 from qd.workers.compute import check_policy
 from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
 from sim.crossing import CrossingCfg
+from sim.files.command import command_line
 from sim.mujoco_c.model import surface_heights
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
 from sim.terrains.maps.picture import LENGTH, height_colors
 
-FPS, GIF_FPS = 25, 12.5
-"""Pictures a second of a film and of a GIF, whose pictures last whole hundredths of a second."""
-SIZE, GIF_SIZE = (1280, 720), (480, 270)
-"""Width and height [pixels]."""
-MOST_BYTES = 2_000_000
-"""The largest GIF."""
+FPS = 25
+"""Pictures a second of a film."""
+SIZE = (1280, 720)
+"""Width and height of a film [pixels]."""
+GIF_FPS = 12.5
+"""Pictures a second of a GIF; each lasts whole hundredths of a second."""
+GIF_SIZE = (480, 270)
+"""Width and height of a GIF [pixels]."""
+MAX_GIF_BYTES = 2_000_000
 _COLORS = (256, 128, 96, 64, 48, 32, 16)  # of a GIF; fewer where it would be too large
-_FINER = 2  # than a GIF its pictures are rendered
+_SUPERSAMPLING = 2  # of a GIF's pictures
 _SLOW_S = 1.0  # before the moment of failure
 _DISTANCE = 2.5  # of the camera, in heights or lengths of the robot
 _SMOOTH_S = 0.8  # over which the camera follows the base
@@ -86,8 +91,10 @@ class Shot:
 
 def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
     """Between two poses in proportion, MuJoCo's coordinates, shape (7 + num_joints,); past the last one the last."""
-    low = min(int(frame), len(poses) - 1)
-    first, last, share = poses[low], poses[min(low + 1, len(poses) - 1)].copy(), frame - int(frame)
+    index = min(int(frame), len(poses) - 1)
+    share = frame - int(frame)
+    first = poses[index]
+    last = poses[min(index + 1, len(poses) - 1)].copy()
     last[3:7] *= np.copysign(1.0, first[3:7] @ last[3:7])
     pose = (1.0 - share) * first + share * last
     pose[3:7] /= np.linalg.norm(pose[3:7])
@@ -130,52 +137,59 @@ def render_pictures(
 
     Small ones are rendered twice as fine. ``progress`` is called with the share that is done.
     """
-    recording, dt = shot.recording, shot.recording.dt
+    recording = shot.recording
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
-    poses, chart = recording.qpos(0, shot.episode), draw_map(shot, size[0] // 5)
-    name, beside = ("", None) if shot.beside is None else (shot.beside[0], shot.beside[1].qpos(0, shot.episode))
+    poses = recording.qpos(0, shot.episode)
+    ghost_poses = None if shot.beside is None else shot.beside[1].qpos(0, shot.episode)
+    chart = draw_map(shot, size[0] // 5)
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
-    width, height = (side * (1 if size[0] > GIF_SIZE[0] else _FINER) for side in size)
-    look: dict[str, Any] = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
+    width, height = (side * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for side in size)
+    look: Any = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
     with Renderer(robot, recording.heights[0], **look) as renderer:
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
-            frame = min(time_s / dt, float(len(poses) - 1))
-            pose, here = interpolate_pose(poses, frame), (0, shot.episode, int(frame + 0.5))
-            ghost = None if beside is None else interpolate_pose(beside, time_s / dt)
-            touch = {"touching": recording.touching[here], "foot_force": recording.foot_force[here]}
-            picture = Image.fromarray(renderer.render(pose, camera, ghost=ghost, ghost_name=name, **touch))
-            picture = picture.resize(size, Image.Resampling.BOX)
-            _letter(picture, shot, time_s, slowness[number])
+            frame = min(time_s / recording.dt, float(len(poses) - 1))
+            pose = interpolate_pose(poses, frame)
+            row = (0, shot.episode, int(frame + 0.5))
+            pixels = renderer.render(
+                pose,
+                camera,
+                ghost=None if ghost_poses is None else interpolate_pose(ghost_poses, time_s / recording.dt),
+                ghost_name="" if shot.beside is None else shot.beside[0],
+                touching=recording.touching[row],
+                foot_force=recording.foot_force[row],
+            )
+            picture = Image.fromarray(pixels).resize(size, Image.Resampling.BOX)
+            _write_captions(picture, shot, time_s, slowness[number])
             inset = chart.copy()
-            ImageDraw.Draw(inset).circle(_on_map(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
+            ImageDraw.Draw(inset).circle(_locate(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
             picture.paste(inset, (size[0] - chart.width, 0))
             yield np.asarray(picture)
             progress((number + 1) / len(times))
 
 
-def _letter(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> None:
-    """Writes the title at the top of a picture, the time at its bottom, and from it on the moment of failure."""
-    unit, draw = picture.height / 540, ImageDraw.Draw(picture)
-    width = picture.width / unit
+def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> None:
+    """Writes the title at the top, the time at the bottom, and from the moment of failure on how the robot fails."""
+    unit = picture.height / 540
+    draw = ImageDraw.Draw(picture)
 
-    def write(place: tuple[float, float], text: str, size: float, color: Any, anchor: str = "ls") -> None:
-        font, edge = ImageFont.load_default(size * unit), max(1, round(2 * unit))
-        if (beyond := font.getlength(text) / (0.78 * picture.width)) > 1.0:  # the map stands in the corner
-            font = ImageFont.load_default(size * unit / beyond)
-        draw.text((place[0] * unit, place[1] * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
+    def write(x: float, y: float, text: str, size: float, color: str, anchor: str = "ls") -> None:
+        excess = ImageFont.load_default(size * unit).getlength(text) / (0.78 * picture.width)  # the map is right
+        font = ImageFont.load_default(size * unit / max(excess, 1.0))
+        edge = max(1, round(2 * unit))
+        draw.text((x * unit, y * unit), text, color, font, anchor, stroke_width=edge, stroke_fill="white")
 
-    write((10, 32), shot.title, 28, "black")
+    write(10, 32, shot.title, 28, "black")
     if shot.beside is None:
-        write((10, 62), f"reached the goal: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
+        write(10, 62, f"reached the goal: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
     else:
-        write((10, 62), f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
+        write(10, 62, f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
     speed = f"  1/{slowness} speed" if slowness > 1 else ""
-    write((width - 10, 528), f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
+    write(picture.width / unit - 10, 528, f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
-        outcome, fallen = shot.recording.outcome[0, shot.episode], shot.recording.fallen[0, shot.episode]
-        words = f"{way_to_end(outcome, bool(fallen))} at {shot.moment:.1f} s"
-        write((10, 528), words, 30, get_ending(outcome).color)
+        outcome = shot.recording.outcome[0, shot.episode]
+        failure = way_to_end(outcome, bool(shot.recording.fallen[0, shot.episode]))
+        write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(outcome).color)
 
 
 def draw_map(shot: Shot, width: int) -> Image.Image:
@@ -184,17 +198,17 @@ def draw_map(shot: Shot, width: int) -> Image.Image:
     colors = np.rint(255.0 * height_colors(recording.heights[0])[::-1]).astype(np.uint8)
     image = Image.fromarray(colors).resize((width, width * colors.shape[0] // colors.shape[1]))
     draw = ImageDraw.Draw(image)
-    for k in [*(k for k in range(recording.num_episodes) if k != shot.episode), shot.episode]:
+    for k in sorted(range(recording.num_episodes), key=lambda k: k == shot.episode):
         path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
         shown = k == shot.episode
-        draw.line(_on_map(image, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
-    draw.circle(_on_map(image, np.array([CrossingCfg.goal]))[0], width / 60, "#009e73", "white")
+        draw.line(_locate(image, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
+    draw.circle(_locate(image, np.array([CrossingCfg.goal]))[0], width / 60, "#009e73", "white")
     return image
 
 
-def _on_map(image: Image.Image, places: NDArray[np.floating]) -> list[tuple[float, float]]:
-    """Pixels of places [m], shape (count, 2), on a map."""
-    pixels = image.width / LENGTH * places.astype(np.float64)
+def _locate(image: Image.Image, positions: NDArray[np.floating]) -> list[tuple[float, float]]:
+    """Pixels of positions [m], shape (count, 2), on a map."""
+    pixels = image.width / LENGTH * positions.astype(np.float64)
     return [(x, image.height - y) for x, y in pixels.tolist()]
 
 
@@ -211,25 +225,28 @@ def film(
     beside: tuple[str, Recording] | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> None:
-    """Films an episode of a recording of one terrain, by its number, as the MP4 or GIF that ``out`` is by its name.
+    """Films an episode of a recording of one terrain as the MP4 or GIF that ``out`` is by its name.
 
-    ``scales`` of penalties find the typical episode, which is filmed if none is named: its seconds about the failure,
-    or the ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is another with its
-    recording from the same starts. ``progress`` is called with the share that is done.
+    Without an ``episode`` it is the typical one, by the ``scales`` of penalties: the seconds around the failure, or the
+    ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is another with its recording
+    from the same starts. ``progress`` is called with the share that is done.
     """
-    episode, gif = find_typical_episode(recording, scales) if episode is None else episode, out.suffix == ".gif"
+    if episode is None:
+        episode = find_typical_episode(recording, scales)
     shot = Shot(recording=recording, episode=episode, title=make_title(recording, by), beside=beside)
-    fps, size = (GIF_FPS, GIF_SIZE) if gif else (FPS, SIZE)
-    pictures = render_pictures(shot, robot, shot.times(fps, whole=whole), size, shadows=shadows, progress=progress)
+    gif = out.suffix == ".gif"
+    size = GIF_SIZE if gif else SIZE
+    times = shot.times(GIF_FPS if gif else FPS, whole=whole)
+    pictures = render_pictures(shot, robot, times, size, shadows=shadows, progress=progress)
     save(out, as_gif([*pictures]) if gif else as_mp4(pictures, size, FPS), "Film")
 
 
 def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> bytes:
     """Pictures whose sides, width and height [pixels], are even as an MP4 (H.264) that plays everywhere."""
-    how: dict[str, Any] = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    options: Any = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "film.mp4"
-        writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **how)
+        writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **options)
         writer.send(None)
         try:
             for picture in pictures:
@@ -239,17 +256,18 @@ def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> byte
         return draft.read_bytes()
 
 
-def as_gif(pictures: Sequence[Picture], most_bytes: int = MOST_BYTES) -> bytes:
+def as_gif(pictures: Sequence[Picture], max_bytes: int = MAX_GIF_BYTES) -> bytes:
     """Pictures of one shape as a GIF that repeats, with as many colours, and then pictures, as its size allows."""
     sample = Image.fromarray(np.concatenate(pictures[:: max(1, len(pictures) // 8)]))
     for step, colors in itertools.product((1, 2, 4), _COLORS):
-        palette, content = sample.quantize(colors, Image.Quantize.FASTOCTREE), io.BytesIO()
+        palette = sample.quantize(colors, Image.Quantize.FASTOCTREE)
         images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-        kept: dict[str, Any] = {"append_images": images[step::step], "duration": round(1000 * step / GIF_FPS)}
-        images[0].save(content, "GIF", save_all=True, loop=0, optimize=False, **kept)
-        if content.tell() <= most_bytes:
+        options: Any = {"append_images": images[step::step], "duration": round(1000 * step / GIF_FPS)}
+        content = io.BytesIO()
+        images[0].save(content, "GIF", save_all=True, loop=0, optimize=False, **options)
+        if content.tell() <= max_bytes:
             return content.getvalue()
-    raise ValueError(f"{len(pictures)} pictures must fit into a GIF of {most_bytes} bytes, got more: write an MP4")
+    raise ValueError(f"{len(pictures)} pictures must fit into a GIF of {max_bytes} bytes, got more: write an MP4")
 
 
 def film_source(
@@ -267,7 +285,6 @@ def film_source(
     ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file;
     ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
     """
-    robot, run = source.robot, source.opened_run
     if not gif and out is not None and out.suffix == ".gif":
         raise ValueError(f"{out} is a GIF by its name: give --gif too")
     files = source.files(".gif" if gif else ".mp4", out)
@@ -275,23 +292,37 @@ def film_source(
     if episode is not None and episode >= replicas:
         raise ValueError(f"episode must be one of 0..{replicas - 1}, got {episode}")
     open_context(64, 64).free()
-    others: list[tuple[str, Recording] | None] = [None] * len(files)
-    if beside is not None:
-        others_known = controllers_in(robot.panel) | (run.certifiers() if run else {})
-        policy = others_known.get(beside, resolve_policy(beside, robot))
-        try:
-            check_policy(policy, robot, device)
-        except ValueError as error:
-            names, remedy = ", ".join([*others_known, SHIPPED]), ""
-            if run and beside in controllers_in(run.folder / CERTIFIERS_FOLDER) and beside not in others_known:
-                judge = run.command("judge")
-                remedy = f"; {beside} is in certifiers/ of the run, and judging again makes its name known: `{judge}`"
-            raise ValueError(f"beside must be {names} or a controller as --policy takes it: {error}{remedy}") from error
+    ghost_policy = None if beside is None else find_ghost(source, beside, device)
     recordings = source.record(device)
+    ghosts: list[tuple[str, Recording] | None] = [None] * len(files)
     if beside is not None:
-        others = [(label_suffix(beside)[1:], other) for other in source.record(device, policy)]
-    for recording, other, file in zip(recordings, others, files, strict=True):
+        ghosts = [(label_suffix(beside)[1:], ghost) for ghost in source.record(device, ghost_policy)]
+    for recording, ghost, file in zip(recordings, ghosts, files, strict=True):
         with Bar(f"filming {recording.labels[0]}") as bar:
-            about: Any = {"episode": episode, "by": source.by, "beside": other, "progress": bar.move_to}
-            film(recording, robot, source.scales, file, **about, **look)
+            options: Any = {"episode": episode, "by": source.by, "beside": ghost, "progress": bar.move_to, **look}
+            film(recording, source.robot, source.scales, file, **options)
     return files
+
+
+def find_ghost(source: ReplaySource, name: str, device: str) -> str:
+    """The controller of a name of the robot's panel or of a certifier of the run, or of a file or code; checked."""
+    robot = source.robot
+    run = source.opened_run
+    known = controllers_in(robot.panel) | (run.certifiers() if run else {})
+    policy = known.get(name, resolve_policy(name, robot))
+    try:
+        check_policy(policy, robot, device)
+    except ValueError as error:
+        remedy = ""
+        if run is not None and name not in known:
+            judge = f"judging again makes its name known: `{run.command('judge')}`"
+            if name in controllers_in(run.folder / CERTIFIERS_FOLDER):
+                remedy = f"; {name} is in certifiers/ of the run, and {judge}"
+            elif name == SPECIALIST:
+                train = command_line("finetune", robot=robot.spec, specialist=run.path)
+                remedy = f"; the run has no specialist: `{train}` trains one, and {judge}"
+        reason = f"got '{name}'" if remedy else str(error)
+        raise ValueError(
+            f"beside must be {', '.join([*known, SHIPPED])} or a controller as --policy takes it: {reason}{remedy}"
+        ) from error
+    return policy

@@ -210,18 +210,25 @@ def test_mistakes_are_refused_before_anything_is_crossed(run, capsys, flags, nam
     assert not list(run.glob("*.mp4"))
 
 
-def test_a_certifier_that_came_after_the_judging_is_known_once_the_run_is_judged_again(run, capsys):
+def test_a_ghost_that_is_not_there_is_refused_with_its_remedy(run, capsys):
     try:
         open_context(16, 16).free()
     except ValueError as error:
         pytest.skip(str(error))
-    certifier = run / "certifiers" / "specialist.pt"
-    certifier.parent.mkdir()
-    certifier.touch()
-    for name, is_there in (("specialist", True), ("nobody", False)):
+    remedies = ("faultline finetune --robot anymal --specialist", f"`faultline judge --robot anymal --run {run}`")
+
+    def name_remedies(name):
         assert film("--beside", name) == 2
         error = capsys.readouterr().err
-        assert "no such file" in error and (f"`faultline judge --robot anymal --run {run}`" in error) == is_there
+        assert "C-G, S, shipped" in error
+        return [remedy in error for remedy in remedies]
+
+    assert name_remedies("specialist") == [True, True]
+    certifier = run / "certifiers" / "specialist.pt"
+    certifier.parent.mkdir()
+    certifier.touch()  # it came after the judging
+    assert name_remedies("specialist") == [False, True]
+    assert name_remedies("nobody") == [False, False]
 
 
 def test_without_opengl_nothing_is_crossed(run, capsys, monkeypatch):
