@@ -21,9 +21,9 @@ from sim.terrains.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_
 
 
 class Ending(NamedTuple):
-    """A way to end, in words and in looks that the colour-blind tell apart."""
+    """How an episode ended, with a label and looks that the colour-blind tell apart."""
 
-    words: str
+    label: str
     color: str = "#5a5a5a"
     """As ``#rrggbb`` (Okabe and Ito's)."""
     marker: str = ""
@@ -39,8 +39,8 @@ ENDINGS = {
     Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
 }
 """How a valid episode may end, the good way first."""
-ARRIVED, *FAILED = (ending.words for ending in ENDINGS.values())
-"""The good way in words, and the others."""
+ARRIVED, *FAILED = (ending.label for ending in ENDINGS.values())
+"""Labels of the good way, and of the others."""
 
 
 def get_ending(outcome: int) -> Ending:
@@ -59,19 +59,20 @@ class Rate(NamedTuple):
 
     @property
     def limits(self) -> str:
-        """The 95 % Wilson interval in words: ``0 to 16 %``; anything possible without an episode."""
+        """The 95 % Wilson interval: ``0 to 16 %``; 0 to 100 % without an episode."""
         return "{:.0f} to {:.0f} %".format(*(100.0 * limit for limit in wilson_interval(self.hits, self.count)))
 
 
 def count_rates(recording: Recording) -> dict[str, Rate]:
-    """How often valid episodes of one terrain ended in each way, by the words of :data:`ENDINGS`, and ``fallen``."""
-    outcome, valid = recording.outcome[0], recording.outcome[0] != Outcome.INVALID
-    hits = {ending.words: outcome == end for end, ending in ENDINGS.items()}
+    """How often valid episodes of one terrain ended in each way, by the labels of :data:`ENDINGS`, and ``fallen``."""
+    outcome = recording.outcome[0]
+    valid = outcome != Outcome.INVALID
+    hits = {ending.label: outcome == end for end, ending in ENDINGS.items()}
     hits["fallen"] = recording.fallen[0] & valid
     return {label: Rate(int(hit.sum()), int(valid.sum())) for label, hit in hits.items()}
 
 
-_STUCK = 0.3  # a robot that gets stuck is stuck once it is so near to where it ends [m]
+_STUCK = 0.3  # a robot is stuck once it is so near to where it ends [m]
 
 
 def leans(recording: Recording, episode: int) -> NDArray[np.bool_]:
@@ -88,20 +89,21 @@ def find_failure_time(recording: Recording, episode: int) -> float:
     other episode it is the end. A fall is the one from which the robot did not rise.
     """
     last = max(int(recording.num_frames[0, episode]) - 1, 0)
-    outcome, frame = recording.outcome[0, episode], last
+    outcome = recording.outcome[0, episode]
+    frame = last
     if outcome in (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT):
         upright = np.flatnonzero(~leans(recording, episode))
         fall = int(upright[-1]) + 1 if len(upright) else 0
         if fall <= last:
             frame = fall
         elif outcome == Outcome.TIME_OUT:
-            place = recording.base_position[0, episode, : last + 1, :2].astype(np.float64)
-            frame = int(np.argmax(np.linalg.norm(place - place[-1], axis=1) <= _STUCK))
+            position = recording.base_position[0, episode, : last + 1, :2].astype(np.float64)
+            frame = int(np.argmax(np.linalg.norm(position - position[-1], axis=1) <= _STUCK))
     return frame * recording.dt
 
 
 def find_typical_episode(recording: Recording, scales: dict[str, float], ending: int | None = None) -> int:
-    """The episode to show: of those with the typical outcome, or a given one, that of middle cost."""
+    """The episode of median cost among those with the typical outcome, or with a given one."""
     outcome = recording.outcome[0]
     candidates = np.flatnonzero(outcome == (typical_outcome(outcome) if ending is None else ending))
     last = np.maximum(recording.num_frames[0, candidates] - 1, 0)
@@ -113,24 +115,24 @@ def find_typical_episode(recording: Recording, scales: dict[str, float], ending:
 
 
 def find_ghost_episode(recording: Recording, episode: int, scales: dict[str, float]) -> int:
-    """The episode of another controller to show beside one: that from the same start, else a typical one that arrives.
-
-    If it arrives in none, it is that from the same start.
-    """
+    """The episode of another controller to show beside one: the same start, or if only others arrive a typical one."""
     arrived = recording.outcome[0] == Outcome.GOAL
     return episode if arrived[episode] or not arrived.any() else find_typical_episode(recording, scales, Outcome.GOAL)
 
 
 def make_title(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
-    who = robot_label(recording.robot) + (f" with {controller}" if controller else "")
-    outcome, most = recording.outcome[0], int(typical_outcome(recording.outcome[0]))
-    valid, ended, fallen = outcome != Outcome.INVALID, outcome == most, recording.fallen[0]
+    head = robot_label(recording.robot) + (f" with {controller}" if controller else "") + f", {recording.labels[0]}"
+    outcome = recording.outcome[0]
+    valid = outcome != Outcome.INVALID
     if not valid.any():
-        return f"{who}, {recording.labels[0]}: no valid episode"
-    fall = most != Outcome.GOAL and fallen[ended].mean() > 0.5
-    count = (fallen & valid if fall else ended).sum()
-    return f"{who}, {recording.labels[0]}: {way_to_end(most, fall)}, {count} of {valid.sum()}"
+        return f"{head}: no valid episode"
+    typical = int(typical_outcome(outcome))
+    hits = outcome == typical
+    fallen = recording.fallen[0]
+    falls = typical != Outcome.GOAL and fallen[hits].mean() > 0.5
+    count = (fallen & valid if falls else hits).sum()
+    return f"{head}: {way_to_end(typical, falls)}, {count} of {valid.sum()}"
 
 
 def draw_crossing(recording: Recording, title: str) -> Figure:
@@ -152,19 +154,20 @@ def draw_crossing(recording: Recording, title: str) -> Figure:
 
 
 def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
-    """Every path, its end marked by how it ended; returns handles of the ends there are, and how many."""
-    handles, xs = list[Any](), [0.0, LENGTH]
-    for outcome, end in ENDINGS.items():
+    """Draws every path and how it ended; returns a handle with a count for each ending."""
+    handles: list[Any] = []
+    xs = [0.0, LENGTH]
+    for outcome, ending in ENDINGS.items():
         paths = [recording.qpos(0, k)[:, :2] for k in np.flatnonzero(recording.outcome[0] == outcome).tolist()]
         if not paths:
             continue
         for path in paths:
-            axes.plot(*path.T, color=end.color, linestyle=end.line, linewidth=0.9, alpha=0.7)
-        mark: dict[str, Any] = {"color": end.color, "marker": end.marker}
+            axes.plot(*path.T, color=ending.color, linestyle=ending.line, linewidth=0.9, alpha=0.7)
+        mark: dict[str, Any] = {"color": ending.color, "marker": ending.marker}
         ends = np.stack([path[-1] for path in paths], axis=1)
         axes.scatter(*ends, s=55, edgecolors="white", zorder=3, **mark)
-        mark |= {"linestyle": end.line, "markeredgecolor": "white", "markersize": 9}
-        handles.append(Line2D([], [], **mark, label=f"{end.words} ({len(paths)})"))
+        mark |= {"linestyle": ending.line, "markeredgecolor": "white", "markersize": 9}
+        handles.append(Line2D([], [], **mark, label=f"{ending.label} ({len(paths)})"))
         xs += ends[0].tolist()
     axes.set_xlim(min(xs), max(xs))  # robots may leave the terrain
     return handles

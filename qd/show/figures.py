@@ -1,4 +1,4 @@
-"""What a search leaves to look at: its curves, its archive, and minimal terrains."""
+"""Figures of a search: its curves, its archive, and minimal terrains."""
 
 import textwrap
 from collections import Counter
@@ -25,10 +25,11 @@ from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
 from sim.terrains.spaces.base import TerrainSpace
 
 _BLUE = "#0072b2"
-_SUN = (-0.45, 0.35)  # where the light of a relief comes from: how much slopes along x and y gain by it
+_SUN = (-0.45, 0.35)  # light that slopes along x and y of a relief gain
 _MARK_M = 0.3  # half side of the marks of start and goal
-_START, _GOAL = (240, 200, 60), (0, 158, 115)
-_SHOWN, _COLUMNS = 12, 3  # minimal terrains that are shown, and how many side by side
+_MARKS = ((CrossingCfg.start, (240, 200, 60)), (CrossingCfg.goal, (0, 158, 115)))
+_MAX_MINIMAL = 12
+_COLUMNS = 3
 
 
 def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> NDArray[np.uint8]:
@@ -42,8 +43,10 @@ def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> N
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
     colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
     pixels = np.clip(255.0 * colors * light[..., None], 0.0, 255.0).astype(np.uint8)
-    for (x, y), color in ((CrossingCfg.start, _START), (CrossingCfg.goal, _GOAL)):
-        row, column, half = round(y / spacing), round(x / spacing), round(_MARK_M / spacing)
+    for (x, y), color in _MARKS:
+        row = round(y / spacing)
+        column = round(x / spacing)
+        half = round(_MARK_M / spacing)
         pixels[row - half : row + half + 1, column - half : column + half + 1] = color
     return pixels
 
@@ -71,16 +74,15 @@ def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
     figure.suptitle(f"{_title(archive)}: {len(archive):,} elites")
     panels = (("qd_score", "QD score"), ("elites", "elites"), ("mean_fitness", "mean fitness"))
     iterations = [row["iteration"] for row in metrics]
-    drawn, percent = figure.subplots(1, len(panels), sharex=True), 100.0 / archive.cells.num_cells
+    percent = 100.0 / archive.cells.num_cells
     as_share = (lambda count: percent * count, lambda share: share / percent)
-    for axes, (key, label) in zip(drawn, panels, strict=True):
+    for axes, (key, label) in zip(figure.subplots(1, len(panels), sharex=True), panels, strict=True):
         axes.plot(iterations, [row[key] for row in metrics], color=_BLUE, marker="." if len(metrics) < 30 else "")
         axes.set_ylabel(label)
         if key != "mean_fitness":
             axes.set_ylim(bottom=0)
         if key == "elites":
             axes.secondary_yaxis("right", functions=as_share).set_ylabel("reachable coverage [%]")
-    for axes in drawn:
         axes.set_xlabel("iteration")
         axes.grid(alpha=0.3)
         axes.xaxis.get_major_locator().set_params(integer=True)
@@ -96,20 +98,22 @@ def draw_archive(archive: Archive) -> Figure:
         f"{_title(archive)}: {len(archive):,} elites, "
         f"{archive.reachable_coverage:.1%} of {archive.cells.num_cells:,} reachable cells"
     )
-    fitness, ratios = archive.fitness, archive.ratios
+    fitness = archive.fitness
+    ratios = archive.ratios
     if (fresh := archive.fresh) is not None:
-        fitness, ratios = fresh.fitness[fresh.valid], fresh.ratios[fresh.valid]
+        fitness = fresh.fitness[fresh.valid]
+        ratios = fresh.ratios[fresh.valid]
         title += f",\ncorrected by {FRESH_EPISODES} fresh episodes each: {fresh.reproduced.sum():,} reproduced"
     axes.set_title(title)
-    places, order = np.arange(count), np.argsort(fitness)  # the fittest on top
-    points = np.stack([np.broadcast_to(places, ratios.shape), ratios], axis=2)[order]
+    order = np.argsort(fitness)  # the fittest on top
+    points = np.stack([np.broadcast_to(np.arange(count), ratios.shape), ratios], axis=2)[order]
     low, high = np.quantile(fitness, (0.02, 0.98)).tolist() if len(fitness) else (0.0, 1.0)
     lines = LineCollection([*points], cmap="viridis", norm=Normalize(low, high), linewidths=0.8, alpha=0.6)
     lines.set_array(fitness[order])
     axes.add_collection(lines)
-    for place in places:
-        axes.axvline(float(place), color="0.25", linewidth=1.0)
-    axes.set_xticks(places, [textwrap.fill(PENALTIES[name].label, 14) for name in archive.penalties])
+    for x in range(count):
+        axes.axvline(x, color="0.25", linewidth=1.0)
+    axes.set_xticks(range(count), [textwrap.fill(PENALTIES[name].label, 14) for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
     axes.set_xlim(-0.15, count - 0.85)
     axes.set_ylim(-0.02, 1.02)
@@ -130,28 +134,28 @@ def draw_minimal(
     """
     entries = numbers["elites"]
     causes = [entry["cause"]["kind"] if entry["cause"] else "unclear" for entry in entries]
-    turns = [causes[:place].count(cause) for place, cause in enumerate(causes)]
-    shown = np.argsort(turns, kind="stable")[:_SHOWN].tolist()
-    rows, counts = -(-len(shown) // _COLUMNS), Counter(causes).most_common()
-    figure = new_figure(13.0, 1.0 + 0.25 * len(counts) + 2.1 * rows)
+    turns = [causes[:k].count(cause) for k, cause in enumerate(causes)]
+    shown = np.argsort(turns, kind="stable")[:_MAX_MINIMAL].tolist()
+    rows = -(-len(shown) // _COLUMNS)
+    counts = dict(Counter(causes).most_common())
+    heights = (1.0 + 0.25 * len(counts), 2.1 * rows)
+    figure = new_figure(13.0, sum(heights))
     figure.suptitle(f"{robot}: {len(entries):,} minimal terrains; start yellow, goal green, blue low, brown high")
-    parts_of_figure: Any = figure.subfigures(2, 1, height_ratios=(1.0 + 0.25 * len(counts), 2.1 * rows))
-    bars, gallery = parts_of_figure
-    axes = bars.subplots()
-    drawn = axes.barh([cause for cause, _ in counts], [count for _, count in counts], color="#d55e00")
-    axes.bar_label(drawn, padding=3)
+    subfigures: Any = figure.subfigures(2, 1, height_ratios=heights)
+    axes = subfigures[0].subplots()
+    axes.bar_label(axes.barh([*counts], [*counts.values()], color="#d55e00"), padding=3)
     axes.invert_yaxis()
     axes.margins(x=0.08)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("terrains by their cause")
-    panels = gallery.subplots(rows, _COLUMNS, squeeze=False).ravel()
-    grids, grounds = terrains_of(np.array([genes[entries[place]["elite"]] for place in shown]), space)
+    panels = subfigures[1].subplots(rows, _COLUMNS, squeeze=False).ravel()
+    grids, grounds = terrains_of(np.array([genes[entries[index]["elite"]] for index in shown]), space)
     for panel in panels[len(shown) :]:
         panel.set_axis_off()
-    for k, (panel, place) in enumerate(zip(panels, shown, strict=False)):
-        ground, entry = None if grounds is None else grounds[k : k + 1], entries[place]
+    for k, (panel, index) in enumerate(zip(panels, shown, strict=False)):
+        entry = entries[index]
+        ground = None if grounds is None else grounds[k : k + 1]
         panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
-        parts = f"{len(entry['bumps'])} of {entry['of']} parts"
-        arrive = format_value(entry["goal_rate"], None, ".0%")
-        panel.set_title(f"elite {entry['elite']}: {causes[place]}, {parts}, {arrive} arrive", fontsize=9)
+        title = f"elite {entry['elite']}: {causes[index]}, {len(entry['bumps'])} of {entry['of']} parts"
+        panel.set_title(f"{title}, {format_value(entry['goal_rate'], None, '.0%')} arrive", fontsize=9)
     return figure

@@ -1,4 +1,4 @@
-"""Tables in data for a page: of an evaluation, and of the rounds of a hardening."""
+"""Tables of an evaluation and of the rounds of a hardening, as data for a page."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,28 +17,27 @@ from sim.robots.find import get_robot
 
 _COUNTS = ("elites", "failing", "confirmed", "certified", "faults")
 MEASURES = {name: labels.MEASURES[name] for name in ("goal", "success", "reward")}
-"""Measures shown, in words; the first two are fractions."""
+"""Labels of the shown measures; the first two are fractions."""
 
 
 def compare_controllers(tables: Mapping[str, Any], *, file: str = "", searched: str | None = None) -> dict[str, Any]:
-    """Tables as ``tables.json`` has them, and their file; ``searched`` is the hash of the controller of the page.
+    """Values of the template, from tables as ``tables.json`` has them.
 
-    What the template takes: episodes a terrain, whether the searched controller is among them or nobody knows, measures
-    in words, each with a table of a row a controller, goal rates on certified terrains alone, if some are known, and
-    what became of terrains from one controller to another.
+    ``searched`` is the hash of the page's controller. Each measure has a table with a row a controller; ``certified``
+    has goal rates on certified terrains alone, ``changes`` the fates of terrains between two controllers.
     """
     hashes = {about["sha256"] for about in tables["controllers"].values()}
     return {
         "file": file,
         "episodes": tables["episodes"],
         "of_searched": searched is None or searched in hashes,
-        "measures": [(words, _measure_table(tables, measure)) for measure, words in MEASURES.items()],
+        "measures": [(label, _measure_table(tables, measure)) for measure, label in MEASURES.items()],
         "certified": _certified_table(tables),
         "changes": _changes_table(tables),
     }
 
 
-def _value(measure: str, value: float | None, limits: Sequence[float] | None) -> str:
+def _format(measure: str, value: float | None, limits: Sequence[float] | None) -> str:
     if measure == "reward":
         return format_value(value, limits, ".1f")
     if value is None:
@@ -52,49 +51,46 @@ def _head(names: Iterable[str], terrains: Mapping[str, int]) -> list[str]:
 
 def _measure_table(tables: Mapping[str, Any], measure: str) -> Table:
     """A row a controller, and the mean over those of one kind that differ in their seed."""
-    values, intervals = tables[measure], tables["intervals"][measure]
+    values = tables[measure]
+    intervals = tables["intervals"][measure]
     rows = [
-        [controller, *(_value(measure, values[name][controller], intervals[name][controller]) for name in values)]
+        [controller, *(_format(measure, values[name][controller], intervals[name][controller]) for name in values)]
         for controller in tables["controllers"]
     ]
     means = tables["over_seeds"].get(measure, {})
     for kind in next(iter(means.values()), {}):
-        of_kind = [means[name][kind] for name in values]
-        rows.append(
-            [f"{kind}, mean of {len(of_kind[0]['values'])}",
-             *(_value(measure, mean["mean"], mean["interval"]) for mean in of_kind)]
-        )  # fmt: skip
+        seeds = [means[name][kind] for name in values]
+        cells = [_format(measure, mean["mean"], mean["interval"]) for mean in seeds]
+        rows.append([f"{kind}, mean of {len(seeds[0]['values'])}", *cells])
     return Table(head=_head(values, tables["terrains"]), rows=rows)
 
 
 def _certified_table(tables: Mapping[str, Any]) -> Table | None:
-    known = {name: about for name, about in (tables.get("certified") or {}).items() if about["terrains"]}
-    if not known:
+    sets = {name: about for name, about in (tables.get("certified") or {}).items() if about["terrains"]}
+    if not sets:
         return None
-    values, intervals = tables["certified_goal"], tables["intervals"]["certified_goal"]
+    values = tables["certified_goal"]
+    intervals = tables["intervals"]["certified_goal"]
     rows = [[controller] for controller in tables["controllers"]]
-    for name, about in known.items():
+    for name, about in sets.items():
         for row in rows:
             role = about["chosen_by"].get(row[0])
-            words = _value("certified_goal", values[name][row[0]], intervals[name][row[0]])
-            row.append(words + (f", {role}" if role else ""))
-    return Table(head=_head(known, {name: about["terrains"] for name, about in known.items()}), rows=rows)
+            rate = _format("certified_goal", values[name][row[0]], intervals[name][row[0]])
+            row.append(rate + (f", {role}" if role else ""))
+    return Table(head=_head(sets, {name: about["terrains"] for name, about in sets.items()}), rows=rows)
 
 
 def _changes_table(tables: Mapping[str, Any]) -> Table:
-    """What became of the terrains, from the first controller to the others before all other pairs."""
+    """Fates of terrains between two controllers; pairs with the first controller stand first."""
     first = next(iter(tables["controllers"]))
-    pairs = [
-        (pair, name, change) for name, pairs in tables["differences"].items()
-        for pair, change in pairs.items() if " -> " in pair  # others are of kinds of controllers
-    ]  # fmt: skip
-    pairs.sort(key=lambda row: not row[0].startswith(f"{first} -> "))
-    rows = [
-        [f"{SETS.get(name, name)}: {pair}", *(f"{change[fate]['count']}" for fate in FATES),
-         f"{change['compared']}"]
-        for pair, name, change in pairs
-    ]  # fmt: skip
-    return Table(head=["terrains", *FATES.values(), "compared"], rows=rows)
+    rows = {False: [], True: []}
+    for name, changes in tables["differences"].items():
+        for pair, change in changes.items():
+            if " -> " in pair:  # others are of kinds of controllers
+                counts = [f"{change[fate]['count']}" for fate in FATES]
+                row = [f"{SETS.get(name, name)}: {pair}", *counts, f"{change['compared']}"]
+                rows[pair.startswith(f"{first} -> ")].append(row)
+    return Table(head=["terrains", *FATES.values(), "compared"], rows=rows[True] + rows[False])
 
 
 def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
@@ -103,10 +99,10 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     out = out or run / "report.html"
     check_page(out)
     rounds = content["rounds"]
-    rows = [
-        [row["controller"], *(format_value(row.get(key), None, ",") for key in ("episodes", *_COUNTS)),
-         ", ".join(row["certifiers"]) or "nobody"] for row in rounds
-    ]  # fmt: skip
+    rows = []
+    for row in rounds:
+        counts = [format_value(row.get(key), None, ",") for key in ("episodes", *_COUNTS)]
+        rows.append([row["controller"], *counts, ", ".join(row["certifiers"]) or "nobody"])
     return publish_page(
         out,
         "rounds.html",
@@ -115,7 +111,7 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
         rounds=rounds,
         counts=Table(head=["controller searched", "episodes", *_COUNTS, "crossed by"], rows=rows),
         goals={
-            SETS.get(name, f"{name}, held out"): {who: 100.0 * rate for who, rate in rates.items() if rate is not None}
+            SETS.get(name, f"{name}, held out"): {key: 100.0 * rate for key, rate in rates.items() if rate is not None}
             for name, rates in content["tables"]["goal"].items()
         },
         compared=compare_controllers(content["tables"]),
@@ -138,6 +134,6 @@ def _read_rounds(run: Path, robot: str | None) -> dict[str, Any]:
         raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
     if robot is not None and get_robot(robot).name != content["robot"]:
         raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
-    for row in content["rounds"]:  # without a specialist the faults are those that the panel shows
+    for row in content["rounds"]:  # without a specialist faults are by the panel
         row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
     return content

@@ -158,7 +158,6 @@ class CrossingPanel:
             nothing = (np.zeros(2),) * (1 + len(names))
             self._curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, compute_first_view)}, post)
-        _add_buttons(gui, "Share", {"copy command": (tab.copy_command,)}, post)
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
@@ -168,12 +167,15 @@ class CrossingPanel:
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
-    def show_elite(self, head: str, details: str, *, has_minimal: bool, minimal: bool) -> None:
-        """Show an elite: its head in HTML, its details in Markdown, and which of its terrains is shown."""
+    def show_elite(self, head: str, *, has_minimal: bool, minimal: bool) -> None:
+        """Show an elite's head, in HTML, and which of its terrains is shown."""
         self.head.content = f'<div style="padding:0 0.6em 0.4em">{head}</div>'
-        self.details.content = details
         self.terrain.visible = has_minimal
         self.terrain.value = _TERRAINS[minimal]
+
+    def show_details(self, text: str) -> None:
+        """Show facts of an elite, in Markdown."""
+        self.details.content = text
 
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""
@@ -224,6 +226,6 @@ def _render_legend() -> str:
     }  # fmt: skip
     return TEMPLATES.get_template("legend.html").render(
         ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
-        endings=[(ending.words, ending.color) for ending in ENDINGS.values()],
+        endings=[(ending.label, ending.color) for ending in ENDINGS.values()],
         **{name: to_hex(color) for name, color in colors.items()},
     )

@@ -51,13 +51,6 @@ class PlayerBar:
         """Change the browser's address without loading a page; a new one is an entry in its history."""
         self._run(f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
 
-    def copy(self, text: str) -> None:
-        """Have the browser copy a text; a browser that forbids it shows the text."""
-        self._run(
-            f"const text = {json.dumps(text)}, ask = () => window.prompt('Copy this', text);"
-            "navigator.clipboard ? navigator.clipboard.writeText(text).catch(ask) : ask();"
-        )
-
     def _run(self, script: str) -> None:
         """Run a script in the browser; viser does so for its plots, and has no public name for it."""
         self._client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))

@@ -61,14 +61,15 @@ def trace_crossing(
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
         return None
-    qpos, duration_s = recording.qpos(0, replica), float(recording.duration_s[0, replica])
+    qpos = recording.qpos(0, replica)
+    duration_s = float(recording.duration_s[0, replica])
     positions, quaternions = skeleton.body_poses(qpos)
     newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
     size = np.linalg.norm(newtons, axis=-1)
     arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
     shapes = [skeleton.model.geom(name) for name in recording.foot_names]
-    bodies, centres = [foot.bodyid[0] - 1 for foot in shapes], np.stack([foot.pos for foot in shapes])
-    feet = positions[:, bodies] + rotated(quaternions[:, bodies], centres)
+    bodies = [foot.bodyid[0] - 1 for foot in shapes]
+    feet = positions[:, bodies] + rotated(quaternions[:, bodies], np.stack([foot.pos for foot in shapes]))
     command = recording.command[0, replica, :frames].astype(np.float64)
     columns = [recording.penalty_names.index(name) for name in penalties]
     return Crossing(
@@ -89,7 +90,7 @@ def trace_crossing(
 def describe_ending(recording: Recording, replica: int, after: str = "") -> str:
     """How an episode of one terrain ended, and whether the robot had fallen then."""
     fallen = " · fallen" if recording.fallen[0, replica] else ""
-    return get_ending(recording.outcome[0, replica]).words + after + fallen
+    return get_ending(recording.outcome[0, replica]).label + after + fallen
 
 
 def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
@@ -104,10 +105,10 @@ def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], .
         "first collision": _collides(recording, replica),
         "fall": leans(recording, replica),
     }
-    marks = [(recording.dt * int(np.argmax(when)), words) for words, when in events.items() if when.any()]
+    marks = [(recording.dt * int(np.argmax(when)), label) for label, when in events.items() if when.any()]
     if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
         marks.append((find_failure_time(recording, replica), "stuck"))
-    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording.outcome[0, replica]).words}"))
+    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording.outcome[0, replica]).label}"))
     return tuple(sorted(marks, key=lambda mark: mark[0]))
 
 
@@ -128,12 +129,12 @@ def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
     return np.asarray(touching.any(axis=0))
 
 
-def episodes_by_ending(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
+def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
     """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
     endings = list(map(get_ending, recording.outcome[0].tolist()))
     return [
         (
-            f"{count} of {len(endings)}: {ending.words}",
+            f"{count} of {len(endings)}: {ending.label}",
             [
                 (k + 1, f"episode {k + 1}: {describe_ending(recording, k)}")
                 for k, other in enumerate(endings)
@@ -146,9 +147,9 @@ def episodes_by_ending(recording: Recording) -> list[tuple[str, list[tuple[int, 
 
 def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     """Vectors turned by unit quaternions w x y z; leading axes broadcast."""
-    w, axis = quaternions[..., :1], quaternions[..., 1:]
+    axis = quaternions[..., 1:]
     twice = 2.0 * np.cross(axis, vectors)
-    return vectors + w * twice + np.cross(axis, twice)
+    return vectors + quaternions[..., :1] * twice + np.cross(axis, twice)
 
 
 def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -16,18 +16,24 @@ from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
 
-FORCE_COLOR, COMMAND_COLOR = (0.84, 0.10, 0.11), (0.0, 0.62, 0.45)
-"""Of arrows, RGB, 0 to 1."""
-_START_COLOR, _GOAL_COLOR, _WAY_COLOR = (255, 255, 255), (0, 158, 115), (240, 200, 60)
+FORCE_COLOR = (0.84, 0.10, 0.11)
+"""Arrows of contact forces, RGB, 0 to 1."""
+COMMAND_COLOR = (0.0, 0.62, 0.45)
+"""Arrow of the commanded velocity."""
+_START_COLOR = (255, 255, 255)
+_GOAL_COLOR = (0, 158, 115)
+_WAY_COLOR = (240, 200, 60)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
-"""What is behind all, blue above and pale below, as an image of one column."""
+"""Background, blue above and pale below, as an image of one column."""
 _BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
 _PATH_WIDTH = 1.2  # [pixels]
 _WAY_LIFT = 0.03  # over the ground [m]
-_POST_HEIGHT, _POST_RADIUS = 1.0, 0.03
-_START_RADIUS, _DISC_HEIGHT, _DISC_OPACITY = 0.25, 0.02, 0.5
+_POST_HEIGHT = 1.0
+_POST_RADIUS = 0.03
+_START_RADIUS = 0.25
+_DISC: Any = {"height": 0.02, "opacity": 0.5, "cast_shadow": False}
 _GHOST_OPACITY = 0.4
 _GHOST_NAME_HEIGHT = 0.35  # over its base [m]
 
@@ -53,15 +59,17 @@ def compute_first_view(width: int, height: int) -> View:
 
 
 class Scene:
-    """What stands in the 3-D view of a tab: at first the robot, unseen."""
+    """The 3-D view of a tab: at first an invisible robot."""
 
     def __init__(self, client: viser.ClientHandle, parts: Sequence[Part], num_bodies: int, num_feet: int) -> None:
-        self._client, self._parts, self._num_bodies, self._cfg = client, parts, num_bodies, CrossingCfg()
+        self._client = client
+        self._parts = parts
+        self._num_bodies = num_bodies
         scene = client.scene
         self.robot, self.bodies = self._add_bodies("/robot")
         self.parts: list[Any] = []
         self.touched: list[Any] = []
-        """What the parts are while they touch; a part and this one are never seen together."""
+        """Coloured copies of the parts, visible in their place while they touch."""
         for k, part in enumerate(parts):
             name = f"/robot/{part.body}/{k}"
             self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
@@ -79,24 +87,26 @@ class Scene:
         self.follow = False
 
     def _add_bodies(self, name: str) -> tuple[Any, list[Any]]:
-        """A frame that is not visible yet, and a frame in it for each body of the robot."""
+        """An invisible frame, and a frame in it for each body of the robot."""
         add = self._client.scene.add_frame
         whole = add(name, show_axes=False, visible=False)
         return whole, [add(f"{name}/{k}", show_axes=False) for k in range(self._num_bodies)]
 
     def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
         """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), and friction and softness."""
-        start, goal, scene = self._cfg.start, self._cfg.goal, self._client.scene
+        start = CrossingCfg.start
+        goal = CrossingCfg.goal
+        scene = self._client.scene
         with self._client.atomic():
             self.hide_crossing()
             mesh = terrain_mesh(heights, ground)
             scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=0.45)
             low, high = surface_heights(heights, *np.array([start, goal]).T).tolist()
-            disc: Any = {"height": _DISC_HEIGHT, "opacity": _DISC_OPACITY, "cast_shadow": False}
-            scene.add_cylinder("/start/disc", _START_RADIUS, color=_START_COLOR, position=(*start, low), **disc)
+            scene.add_cylinder("/start/disc", _START_RADIUS, color=_START_COLOR, position=(*start, low), **_DISC)
             before = (start[0] - _START_RADIUS, start[1], low)
             scene.add_label("/start/label", "start", position=before, anchor="top-center")
-            scene.add_cylinder("/goal/disc", self._cfg.goal_radius, color=_GOAL_COLOR, position=(*goal, high), **disc)
+            radius = CrossingCfg.goal_radius
+            scene.add_cylinder("/goal/disc", radius, color=_GOAL_COLOR, position=(*goal, high), **_DISC)
             middle, top = ((*goal, high + share * _POST_HEIGHT) for share in (0.5, 1.0))
             scene.add_cylinder("/goal/post", _POST_RADIUS, _POST_HEIGHT, _GOAL_COLOR, position=middle)
             scene.add_label("/goal/label", "goal", position=top, anchor="bottom-center")
@@ -104,11 +114,11 @@ class Scene:
 
     def _draw_way(self, heights: Points) -> None:
         """A dashed line from start to goal along the ground."""
-        start, goal = np.array(self._cfg.start), np.array(self._cfg.goal)
-        length = float(np.linalg.norm(goal - start))
-        share = np.linspace(0.0, 1.0, round(length / SPACING) + 1)
-        places = start + share[:, None] * (goal - start)
-        points = np.column_stack([places, surface_heights(heights, *places.T) + _WAY_LIFT])
+        start = np.array(CrossingCfg.start)
+        way = np.array(CrossingCfg.goal) - start
+        share = np.linspace(0.0, 1.0, round(float(np.linalg.norm(way)) / SPACING) + 1)
+        positions = start + share[:, None] * way
+        points = np.column_stack([positions, surface_heights(heights, *positions.T) + _WAY_LIFT])
         segments = np.stack([points[:-1], points[1:]], axis=1)[::2]
         self._client.scene.add_line_segments("/way/line", segments, colors=_WAY_COLOR, thickness=0.02)
 
@@ -122,7 +132,7 @@ class Scene:
         self.set_paths(())
 
     def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], tuple[int, ...]]]) -> None:
-        """Show the way of the base in every episode as points [m] and colour, thin."""
+        """Show the path of the base in every episode: points [m] and a colour."""
         for handle in self.paths:
             handle.remove()
         self.paths = []
@@ -130,11 +140,11 @@ class Scene:
         colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
         if paths:
             look: Any = {"thickness": _PATH_WIDTH, "thickness_units": "screen", "visible": not self.follow}
-            points, light = np.concatenate(ends), in_linear_light(np.concatenate(colors))
-            self.paths = [self._client.scene.add_line_segments("/paths", points, colors=light, **look)]
+            light = in_linear_light(np.concatenate(colors))
+            self.paths = [self._client.scene.add_line_segments("/paths", np.concatenate(ends), colors=light, **look)]
 
     def set_follow(self, follow: bool) -> None:
-        """Go near the robot and along with it from now on, or stay."""
+        """Follow the robot from now on, or stay."""
         self.follow = follow
         for handle in self.paths:
             handle.visible = not follow  # near the robot, paths would hide it
@@ -145,7 +155,7 @@ class Scene:
         """Put the robot where it is at a frame of a crossing, with what touches, its forces and command."""
         with self._client.atomic():
             self.robot.visible = True
-            _place(self.bodies, crossing, frame)
+            _move_bodies(self.bodies, crossing, frame)
             for part, alone, touched in zip(self._parts, self.parts, self.touched, strict=True):
                 touched.visible = bool(crossing.touching[frame, list(part.touches)].any())
                 alone.visible = not touched.visible
@@ -154,28 +164,31 @@ class Scene:
                 _set_arrow(handle, arrow)
         self._go_along(crossing.positions[frame, 0])
 
-    def show_ghost(self, crossing: Crossing, frame: int, name: str = "") -> None:
-        """Put a second, translucent robot where it is at a frame of its own crossing, with a name over it."""
+    def show_ghost(self, crossing: Crossing, frame: int, label: str = "") -> None:
+        """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""
         with self._client.atomic():
             if not self._ghost_parts:
                 for k, part in enumerate(self._parts):
-                    name_of_part, look = f"/ghost/{part.body}/{k}", {"opacity": _GHOST_OPACITY, "visible": True}
-                    self._ghost_parts.append(self._add_mesh(name_of_part, part.mesh, OTHER_CONTROLLER, **look))
+                    name = f"/ghost/{part.body}/{k}"
+                    look = {"opacity": _GHOST_OPACITY, "visible": True}
+                    self._ghost_parts.append(self._add_mesh(name, part.mesh, OTHER_CONTROLLER, **look))
             self.ghost.visible = True
-            _place(self.ghost_bodies, crossing, frame)
-            self._ghost_name.text, self._ghost_name.visible = name, bool(name)
+            _move_bodies(self.ghost_bodies, crossing, frame)
+            self._ghost_name.text = label
+            self._ghost_name.visible = bool(label)
             self._ghost_name.position = tuple(crossing.positions[frame, 0] + np.array([0.0, 0.0, _GHOST_NAME_HEIGHT]))
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:
-        """A shape of one colour, without shadow and not visible yet unless its look is another."""
+        """A shape of one colour; by default invisible and without shadow."""
         look = {"visible": False, "cast_shadow": False, "receive_shadow": False} | look
         return self._client.scene.add_mesh_simple(
             name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, **look
         )
 
     def _go_along(self, base: Points) -> None:
-        """Move the camera as the base has moved, if it is to follow."""
-        before, self._followed = self._followed, base.copy()
+        """Move the camera as the base has moved, if it follows."""
+        before = self._followed
+        self._followed = base.copy()
         if not self.follow:
             return
         if before is None:
@@ -193,10 +206,11 @@ class Scene:
             self._client.camera.position, self._client.camera.look_at = view
 
 
-def _place(bodies: Sequence[Any], crossing: Crossing, frame: int) -> None:
-    """Put the bodies of a robot where they are at a frame."""
+def _move_bodies(bodies: Sequence[Any], crossing: Crossing, frame: int) -> None:
+    """Move the bodies of a robot to their poses at a frame."""
     for handle, position, turn in zip(bodies, crossing.positions[frame], crossing.quaternions[frame], strict=True):
-        handle.position, handle.wxyz = tuple(position), tuple(turn)
+        handle.position = tuple(position)
+        handle.wxyz = tuple(turn)
 
 
 def _set_arrow(handle: Any, arrow: Points) -> None:

@@ -18,7 +18,7 @@ from qd.show.view.address import Address, read_address
 from qd.show.view.listing import count_endings
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
 from qd.show.view.player import PlayerBar
-from qd.show.view.playing import episodes_by_ending, trace_paths
+from qd.show.view.playing import group_episodes, trace_paths
 from qd.show.view.recorder import Progress
 from qd.show.view.scene import Scene, View, compute_first_view, compute_overview
 from qd.show.view.shown import Shared, ShownController
@@ -165,15 +165,6 @@ class Tab:
             before, _ = read_address(self.query)
             self.query = query
             self.bar.show_address(query, is_new=before.elite not in (None, address.elite))
-
-    def copy_command(self) -> None:
-        """Copy the command that replays what the tab shows."""
-        show = self.shared.show
-        policy = show.controllers[self.controller] if self.controller not in (None, SEARCHED) else None
-        terrain = {"minimal" if self.minimal else "elite": self.selection.picked}
-        text = show.opened_run.command("replay", policy=policy, **terrain)
-        self.bar.copy(text)
-        self.client.add_notification("Command copied", text, auto_close_seconds=6.0)
 
     def film(self) -> None:
         """Have the recorder film the shown episode, unless it makes a film already."""
@@ -348,7 +339,6 @@ class Tab:
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         self.panel.show_elite(
             f"<b>{escape(name)}</b><br>{' · '.join(facts)}",
-            show.listing.details(elite),
             has_minimal=minimal_genes is not None,
             minimal=self.minimal,
         )
@@ -411,6 +401,11 @@ class Tab:
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings, or have them recorded."""
+        show = self.shared.show
+        policy = None if self.controller in (None, SEARCHED) else show.controllers[self.controller]
+        terrain = {"minimal" if self.minimal else "elite": self.selection.picked}
+        command = show.opened_run.command("replay", policy=policy, **terrain)
+        self.panel.show_details(f"{show.listing.details(self.selection.picked)}\n\n`{command}`")
         self.scene.hide_crossing()
         self.clock.duration_s = 0.0
         self.panel.show_curves(None)
@@ -420,14 +415,14 @@ class Tab:
         if self.robot.recording is not None:
             self._show_recording(self.robot.recording)
         elif self.robot.wanted is None:
-            self.bar.show({"status": f"No crossing: {escape(self.shared.show.note)}"})
+            self.bar.show({"status": f"No crossing: {escape(show.note)}"})
         else:
             self._show_share("", 0.0)
 
     def _show_recording(self, recording: Recording) -> None:
         if self.replica is None:
             self.replica = find_typical_episode(recording, self._scales)
-        self.bar.show({"share": None, "episodes": episodes_by_ending(recording)})
+        self.bar.show({"share": None, "episodes": group_episodes(recording)})
         self._show_rates()
         self.scene.set_paths(trace_paths(recording))
         self._show_episode()

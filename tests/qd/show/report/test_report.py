@@ -16,7 +16,7 @@ from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.page import percent
 from qd.show.report.pictures import TILE, draw_sheet, find_failure, find_same_moment
-from qd.show.report.search import causes_of
+from qd.show.report.search import count_causes
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -67,11 +67,11 @@ def test_bars_count_terrains_and_faults_by_cause():
     verdict[[0, 6, 7]] = VERDICTS.index("fault")
     causes = ("ridge",) * 6 + ("drop",) * 9 + ("",) * 5
     ranking = dataclasses.replace(ranking, verdict=verdict, causes=causes)
-    drop, ridge = causes_of(ranking)
+    drop, ridge = count_causes(ranking)
     assert drop == {"name": "drop", "failing": 9, "faults": 2, "share": 100 / 9, "tile": 6}
     assert ridge == {"name": "ridge", "failing": 6, "faults": 1, "share": 100 / 9, "tile": 0}
     many = tuple(f"cause {k}" for k in range(15)) + ("",) * 5
-    *_, last = bars = causes_of(dataclasses.replace(ranking, causes=many))
+    *_, last = bars = count_causes(dataclasses.replace(ranking, causes=many))
     assert len(bars) == 10 and (last["name"], last["failing"], last["tile"]) == ("6 other causes", 6, None)
 
 

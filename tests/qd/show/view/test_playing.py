@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.show.view.playing import episodes_by_ending, find_marks, trace_crossing, trace_paths
+from qd.show.view.playing import find_marks, group_episodes, trace_crossing, trace_paths
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
@@ -85,7 +85,7 @@ def test_a_robot_that_gets_stuck_has_a_mark_where_it_stays():
 def test_episodes_are_offered_by_how_they_ended():
     outcomes = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT, Outcome.BASE_COLLISION]
     made = recording_of(outcomes, [6.0] * 4, fallen=[False, False, True, True])
-    assert episodes_by_ending(made) == [
+    assert group_episodes(made) == [
         ("2 of 4: out of time", [(1, "episode 1: out of time"), (3, "episode 3: out of time · fallen")]),
         ("1 of 4: reached the goal", [(2, "episode 2: reached the goal")]),
         ("1 of 4: base collision", [(4, "episode 4: base collision · fallen")]),
