@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.calibrate import calibrate, fitting_height
+from qd.calibrate import calibrate, find_fitting_height
 from qd.evaluate.dose import measure_dose
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
@@ -54,7 +54,7 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
         if not _report_walk(robot, walk(crosser, policy)):
             return False
-        height, share = fitting_height(crosser, policy)
+        height, share = find_fitting_height(crosser, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
     name = crosser_name(robot, policy)
     out = RUNS / f"{name}-check" / "dose.json"

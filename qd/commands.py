@@ -14,7 +14,7 @@ from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
-from sim.robots.find import get_robot, robot_of
+from sim.robots.find import get_robot, resolve_robot
 
 _METHOD_HELP = (
     f"Where new terrains come from: {'; '.join(f'{name}, {method.text}' for name, method in METHODS.items())}. Several "
@@ -311,7 +311,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         if self._makes_tables() or self.space is not None:
             raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
         pack = read_pack(find_pack(name))
-        robot = robot_of(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
+        robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
         policy = self.policy or str(robot.policy_file)
         report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **self._size())
         return int(self.fail_under is not None and not passes(report, self.fail_under))

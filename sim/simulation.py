@@ -22,7 +22,7 @@ from kernels.state import make_zeros
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
 from sim.robots.compiled import robot_spec
-from sim.robots.model import builder_of
+from sim.robots.model import make_builder
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg
@@ -84,7 +84,7 @@ class Simulation:
         self.device = bank.device
         self.num_envs = len(terrain_of_env)
         of_file = robot_spec(robot).compile()
-        builder = builder_of(of_file)
+        builder = make_builder(of_file)
         with wp.ScopedDevice(self.device):
             self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
             self._build_model(builder)

@@ -9,7 +9,7 @@ from qd.search.directory import RunDirectory, check_config, check_space
 from qd.search.settings import SearchCfg, as_settings, find_policy, is_searched
 from qd.workers.compute import check_policy
 from sim.controllers.spec import controller_hash, resolve_policy, weights_file
-from sim.robots.find import robot_of
+from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space, load_space
@@ -45,7 +45,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     cfg = RunDirectory(run).read_cfg()
     if space is not None:
         load_space(space)  # a user's space, which the run's name then finds
-    robot_cfg = robot_of(as_settings(cfg), robot, run)
+    robot_cfg = resolve_robot(as_settings(cfg), robot, run)
     controller = find_policy(run, cfg, robot_cfg) if policy is None else resolve_policy(policy, robot_cfg)
     if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")

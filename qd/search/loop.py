@@ -28,7 +28,7 @@ from qd.workers.shards import join_results
 from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import Interrupted, command_line, say
-from sim.robots.find import get_robot, robot_of, scaled_by_another
+from sim.robots.find import get_robot, resolve_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.base import TerrainSpace
@@ -248,7 +248,7 @@ def say_what_stops_the_robot(
         return
     ranking = rank(
         archive, get_space(archive.space, archive.space_sha256), read_minimal(run, archive), judged=True,
-        half_width=robot_of(archive.named(), robot, run).footprint[1],
+        half_width=resolve_robot(archive.named(), robot, run).footprint[1],
     )  # fmt: skip
     if not len(ranking):
         return

@@ -18,7 +18,7 @@ from qd.search.fitness import FitnessCfg
 from qd.search.settings import SearchCfg, find_policy
 from sim.controllers.spec import SHIPPED, controller_hash, is_same_controller, label_suffix, resolve_policy
 from sim.files.command import choose_elites, command_line
-from sim.robots.find import get_robot, robot_of
+from sim.robots.find import get_robot, resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space
@@ -148,6 +148,6 @@ def open_run(named: str | None, run: Path | None = None, *, space: str | None = 
     """
     run = find_run(get_robot(named or "anymal"), run)
     archive = read_archive(run)
-    robot = robot_of(archive.named(), named, run)
+    robot = resolve_robot(archive.named(), named, run)
     check_space(archive, space)
     return OpenedRun(path=run, archive=archive, robot=robot)

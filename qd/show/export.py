@@ -17,7 +17,7 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.command import choose_elites
 from sim.files.provenance import provenance
 from sim.files.templates import open_templates
-from sim.robots.find import robot_of
+from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import terrains_of
 from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
@@ -83,7 +83,7 @@ def export_pack(
     """Writes terrains of a pack, by their index, as files that other programs read."""
     folder = find_pack(named)
     pack = read_pack(folder)
-    pack_robot = robot_of(pack.content, robot, folder / PACK_FILE, kind="pack")
+    pack_robot = resolve_robot(pack.content, robot, folder / PACK_FILE, kind="pack")
     indices = choose_elites(elite, range(len(pack.terrains)), f"{folder} has no place")
     rows = {pack.terrains[index]["name"]: index for index in indices}
 

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from sim.recording.scene import FOOT_TOUCH, GROUND, OTHER_CONTROLLER, TOUCH, scene_model
 from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
-from sim.robots.skeleton import touches_of
+from sim.robots.skeleton import find_touches
 from sim.terrains.ground import GroundMaps
 
 _MAX_GEOMS = 20_000
@@ -79,7 +79,7 @@ class Renderer:
         self._robot = robot
         self._feet = [self.model.geom(name).id for name in robot.foot_geoms]
         self._first_foot = len(robot.geom_names) - len(robot.foot_geoms)
-        self._touches, self._ground = touches_of(self.model, robot), self.model.geom(GROUND).id
+        self._touches, self._ground = find_touches(self.model, robot), self.model.geom(GROUND).id
         self._data, self._ghost_data = mj.MjData(self.model), mj.MjData(self.model)
         self._scene = mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = shadows

@@ -1,6 +1,6 @@
 """A robot of its file and its settings, and the complaints about settings that do not fit the file."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     what it shows.
     """
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
-    if problems := file_problems(robot, robot_file):
+    if problems := [*file_problems(robot, robot_file)]:
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
     set_drives(robot_file.spec, robot_file.drives, robot)
     for geom in touching_geoms(*robot_file.spec.bodies):
@@ -41,18 +41,11 @@ def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     return robot_file.spec
 
 
-def file_problems(robot: RobotCfg, file: RobotFile, wrong: Collection[str] = ()) -> list[str]:
-    """Complaints about settings that do not fit the robot's file; fields in ``wrong`` are not compared with it."""
-    problems = [] if "joint_names" in wrong else [*_joint_problems(robot, file, wrong)]
-    roles = [role for role in ("base_geoms", "limb_geoms", "foot_geoms") if role not in wrong]
-    names = [name for role in roles for name in getattr(robot, role)]
-    touching = [geom.name for geom in touching_geoms(*file.spec.bodies)]
-    sites = {site.name for site in file.spec.sites} - {*touching}
-    visuals = {geom.name for geom in file.spec.geoms if not geom.contype} - {""}
-    for kind, bad in (("a site", sites), ("a geom that touches nothing", visuals)):
-        if listed := [name for name in names if name in bad]:
-            problems.append(f"{', '.join(listed)} is {kind} in {robot.model_file}: name geoms that touch the ground")
-    return [*problems, *_missing("geom", [name for name in names if name not in sites | visuals], touching, robot)]
+def file_problems(robot: RobotCfg, file: RobotFile) -> Iterator[str]:
+    """Complaints about settings that do not fit the robot's file."""
+    yield from _joint_problems(robot, file)
+    names = [geom.name for geom in touching_geoms(*file.spec.bodies)]
+    yield from _missing("geom that touches the ground is", robot.geom_names, names, robot)
 
 
 def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: RobotCfg) -> Iterator[str]:
@@ -60,17 +53,17 @@ def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: Rob
         yield f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"
 
 
-def _joint_problems(robot: RobotCfg, file: RobotFile, wrong: Collection[str]) -> Iterator[str]:
+def _joint_problems(robot: RobotCfg, file: RobotFile) -> Iterator[str]:
     """Complaints about the joints' names, and about settings with a value for each joint."""
     model, drives, names = file.model, file.drives, robot.joint_names
     if names != joint_names(model):
-        missing = [*_missing("joint", names, joint_names(model), robot)]
+        missing = [*_missing("joint is", names, joint_names(model), robot)]
         yield from missing or [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
         return
-    fine = {"stiffness", "damping"}.isdisjoint(wrong)
+    fine = True
     for field in PER_JOINT:
         values = getattr(robot, field)
-        if field not in wrong and values is not None and len(values) != len(names):
+        if values is not None and len(values) != len(names):
             yield f"{field} needs {len(names)} values, one a joint, got {len(values)}"
             fine = False
     for field in ("armature", "damping", "frictionloss"):
@@ -79,7 +72,7 @@ def _joint_problems(robot: RobotCfg, file: RobotFile, wrong: Collection[str]) ->
             yield f"{field} must be a number, 0 or more, got {', '.join(negative)}"
             fine = False
     pose = robot.default_joint_pos
-    if "default_joint_pos" not in wrong and len(pose) == len(names):
+    if len(pose) == len(names):
         low, high = np.where(model.jnt_limited[1:, None] == 1, model.jnt_range[1:], (-np.inf, np.inf)).T
         beyond = np.flatnonzero(~((low - _SLACK <= pose) & (pose <= high + _SLACK)))
         if len(beyond):

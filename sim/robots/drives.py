@@ -123,18 +123,11 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
         is_limited = np.isfinite(effort)
         stiffness = drives.stiffness[k] if robot.stiffness is None else robot.stiffness[k]
         damping = drives.damping[k] if robot.damping is None else robot.damping[k]
-        spec.add_actuator(
-            name=name,
-            target=name,
-            trntype=_JOINT,
-            gear=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-            gaintype=mj.mjtGain.mjGAIN_FIXED,
-            gainprm=(stiffness, *(0.0,) * 9),
-            dyntype=mj.mjtDyn.mjDYN_NONE,
-            biastype=_AFFINE,
-            biasprm=(0.0, -stiffness, -damping, *(0.0,) * 7),
-            forcelimited=is_limited,
-            forcerange=(-effort, effort) if is_limited else (0.0, 0.0),
-            ctrllimited=not np.isnan(drives.targets[k, 0]),
-            ctrlrange=np.nan_to_num(drives.targets[k]),
-        )
+        actuator = spec.add_actuator(name=name, target=name, trntype=_JOINT)
+        actuator.set_to_position(kp=stiffness, kv=damping)
+        actuator.gear = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        actuator.dyntype = mj.mjtDyn.mjDYN_NONE
+        actuator.forcelimited = is_limited
+        actuator.forcerange = (-effort, effort) if is_limited else (0.0, 0.0)
+        actuator.ctrllimited = not np.isnan(drives.targets[k, 0])
+        actuator.ctrlrange = np.nan_to_num(drives.targets[k])

@@ -11,9 +11,8 @@ from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, read_mesh, rotation_matrix
 from sim.robots.robot import RobotCfg
 
-_GEOM, _TYPE = mj.mjtGeom, newton.GeoType
-_TYPES = {getattr(_GEOM, f"mjGEOM_{name}"): getattr(_TYPE, name)
-          for name in ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "ELLIPSOID", "MESH", "PLANE")}  # fmt: skip
+_SHAPES = ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "ELLIPSOID", "MESH", "PLANE")
+_TYPES = {getattr(mj.mjtGeom, f"mjGEOM_{name}"): getattr(newton.GeoType, name) for name in _SHAPES}
 _FREE_RANGE = 1e10  # limits of a joint that turns freely [rad]
 _NO_EFFORT_LIMIT = 1e6  # [N m]
 _RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
@@ -26,10 +25,10 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
     Visual shapes are left out, bodies that are fixed to each other are one. Collision shapes of a URDF are called as
     their link, with a number from 0 behind where it has several (``LF_SHANK_0``).
     """
-    return builder_of(robot_spec(robot).compile())
+    return make_builder(robot_spec(robot).compile())
 
 
-def builder_of(model: Any) -> newton.ModelBuilder:
+def make_builder(model: Any) -> newton.ModelBuilder:
     """A compiled robot of :func:`sim.robots.compiled.robot_spec` as a Newton builder."""
     builder = newton.ModelBuilder(gravity=wp.vec3(*map(float, model.opt.gravity)))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
@@ -39,8 +38,8 @@ def builder_of(model: Any) -> newton.ModelBuilder:
     for actuator in range(model.nu):
         _set_drive(builder, model, actuator)
     for k in range(model.neq):
-        follower, leader = (joints[int(of[k])] for of in (model.eq_obj1id, model.eq_obj2id))
-        builder.set_joint_mimic(follower, leader, coeffs=_vec2(*model.eq_data[k, :2]))
+        follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        builder.set_joint_mimic(joints[follower], joints[leader], coeffs=_vec2(*model.eq_data[k, :2]))
     for geom in np.flatnonzero(model.geom_contype):
         _add_geom(builder, model, int(geom))
     return builder
@@ -55,16 +54,18 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     """Adds a body with its joint, whose number it returns."""
     axes = rotation_matrix(model.body_iquat[body])
     inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
-    place, joint = _transform(model.body_pos[body], model.body_quat[body]), int(model.body_jntadr[body])
+    pose = _transform(model.body_pos[body], model.body_quat[body])
     link = builder.add_link(
-        xform=place,
+        xform=pose,
         com=wp.vec3(*map(float, model.body_ipos[body])),
         inertia=wp.mat33(*map(float, inertia.ravel())),
         mass=float(model.body_mass[body]),
         label=model.body(body).name,
         lock_inertia=True,
     )
-    name, dof = model.joint(joint).name, int(model.jnt_dofadr[joint])
+    joint = int(model.body_jntadr[body])
+    dof = int(model.jnt_dofadr[joint])
+    name = model.joint(joint).name
     if body == 1:
         base = builder.add_joint_free(child=link, label=name)
         builder.joint_armature[:6] = map(float, model.dof_armature[:6])
@@ -73,13 +74,13 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
         return base
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
-    turns = model.jnt_type[joint] == mj.mjtJoint.mjJNT_HINGE
-    add = builder.add_joint_revolute if turns else builder.add_joint_prismatic
+    is_hinge = model.jnt_type[joint] == mj.mjtJoint.mjJNT_HINGE
+    add_joint = builder.add_joint_revolute if is_hinge else builder.add_joint_prismatic
     effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _NO_EFFORT_LIMIT
-    return add(
+    return add_joint(
         parent=int(model.body_parentid[body]) - 1,
         child=link,
-        parent_xform=place * anchor,
+        parent_xform=pose * anchor,
         child_xform=anchor,
         axis=wp.vec3(*map(float, model.jnt_axis[joint])),
         target_ke=0.0,
@@ -128,10 +129,12 @@ def _set_drive(builder: newton.ModelBuilder, model: Any, actuator: int) -> None:
 
 def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
     """Adds a shape that touches the ground."""
-    kind, source, scale = _GEOM(int(model.geom_type[geom])), None, model.geom_size[geom]
-    if kind == _GEOM.mjGEOM_MESH:
+    kind = mj.mjtGeom(int(model.geom_type[geom]))
+    source, scale = None, model.geom_size[geom]
+    if kind == mj.mjtGeom.mjGEOM_MESH:
         vertices, faces = read_mesh(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)
+    sliding, torsional, rolling = map(float, model.geom_friction[geom])
     builder.add_shape(
         body=int(model.geom_bodyid[geom]) - 1,
         type=_TYPES[kind],
@@ -140,8 +143,12 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
         src=source,
         label=model.geom(geom).name,
         cfg=newton.ModelBuilder.ShapeConfig(
-            density=0.0, gap=0.0, collision_group=0,  # a robot does not touch itself
-            **dict(zip(("mu", "mu_torsional", "mu_rolling"), map(float, model.geom_friction[geom]), strict=True)),
+            density=0.0,
+            gap=0.0,
+            collision_group=0,  # a robot does not touch itself
+            mu=sliding,
+            mu_torsional=torsional,
+            mu_rolling=rolling,
         ),
         custom_attributes={
             "mujoco:condim": int(model.geom_condim[geom]),
@@ -151,4 +158,4 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
             "mujoco:solref": _vec2(*model.geom_solref[geom]),
             "mujoco:solref_mode": _RAW_SOLREF,
         },
-    )  # fmt: skip
+    )

@@ -16,7 +16,7 @@ class ModelFiles:
     """A model file, read but not built."""
 
     root: ET.Element
-    """Of the XML; in a URDF the meshes' file names are absolute."""
+    """Root of the XML; in a URDF the meshes' file names are absolute."""
     files: tuple[Path, ...]
     """The model file, included and attached files, meshes and textures."""
 
@@ -29,8 +29,7 @@ class ModelFiles:
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
     """Reads an MJCF or URDF and looks for the files that it names.
 
-    With ``visuals`` a URDF keeps what it shows of a link, where that is a primitive or a mesh that is there and can be
-    read; the simulation needs none of it.
+    With ``visuals`` a URDF keeps the visuals of its links that are primitives or existing meshes of a known format.
     """
     root = _parse(model_file, visuals=visuals)
     if root.tag not in ("mujoco", "robot"):
@@ -64,10 +63,10 @@ def _refuse_xacro(root: ET.Element, file: Path) -> None:
 
 
 def _urdf_problems(root: ET.Element) -> Iterator[str]:
-    """What MuJoCo takes of a URDF's joints, or calls by no name."""
+    """Complaints about joints that MuJoCo accepts, or refuses without their name."""
     links = [link.get("name") for link in root.findall("link")]
     for joint in root.findall("joint"):
-        name, kind = f"joint {joint.get('name', 'without a name')}", joint.get("type", "")
+        name = f"joint {joint.get('name', 'without a name')}"
         for end in (*joint.findall("parent"), *joint.findall("child")):
             if end.get("link") not in links:
                 yield f"{name}: no link named {end.get('link')}, the file has {', '.join(map(str, links))}"
@@ -77,7 +76,7 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
         limit = joint.find("limit")
         ends = [key for key in ("lower", "upper") if limit is not None and limit.get(key) is None]
         missing = "<limit>" if limit is None else ends[0] if len(ends) == 1 else ""  # without both it moves freely
-        if missing and kind in ("revolute", "prismatic"):
+        if missing and joint.get("type") in ("revolute", "prismatic"):
             yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
         if limit is not None and limit.get("effort", "").strip().startswith("-"):
             yield f"{name} must have an effort above 0, got {limit.get('effort')}"
@@ -107,7 +106,7 @@ def _can_be_shown(visual: ET.Element, model_file: Path) -> bool:
 
 
 def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
-    """Where a URDF's mesh is to be."""
+    """Path of a URDF's mesh, whether or not it exists."""
     name = mesh.get("filename", "").removeprefix("file://")
     path = model_file.parent / name
     if name.startswith(_PACKAGE):
@@ -135,7 +134,7 @@ def _mjcf_files(model_file: Path) -> list[Path]:
     folders = [file.parent for file in named if file.suffix in (".xml", ".mjcf")]
     files = [model_file]
     for file in named:
-        places = [file, *(folder / os.path.relpath(file, home) for folder in folders)]
-        places += [folder / file.name for folder in file.parents]  # by strippath
-        files.append(next((place for place in places if place.is_file()), file))
+        paths = [file, *(folder / os.path.relpath(file, home) for folder in folders)]
+        paths += [folder / file.name for folder in file.parents]  # by strippath
+        files.append(next((path for path in paths if path.is_file()), file))
     return files

@@ -65,7 +65,7 @@ class _Hull:
         return float((self.offset - self.normal @ middle).min())
 
 
-def _hull_of(vertices: _Array) -> _Hull:
+def _make_hull(vertices: _Array) -> _Hull:
     try:
         hull = ConvexHull(vertices)
     except QhullError:
@@ -87,19 +87,19 @@ def _surface_samples(triangles: _Array, spacing: float) -> _Array:
     return np.unique(np.round(np.concatenate(samples), 7), axis=0).astype(np.float64)
 
 
-def _ball_at(point: _Array, hull: _Hull, radii: _Array, most: float) -> tuple[_Array, float]:
-    """The largest inscribed ball of one of the falling ``radii`` that comes as near to a surface point as ``most``."""
+def _inscribe_ball(point: _Array, hull: _Hull, radii: _Array, max_depth: float) -> tuple[_Array, float]:
+    """Centre and radius of the first of the falling ``radii`` whose inscribed ball is so near to a surface point."""
     clearance = hull.offset - hull.normal @ point
-    touching = clearance < 0.25 * most
+    touching = clearance < 0.25 * max_depth
     inward = -hull.normal[touching].sum(axis=0)
     inward /= np.linalg.norm(inward)
-    rate = -hull.normal @ inward  # how fast each plane is left behind, or neared
+    rate = -hull.normal @ inward  # clearance that a plane gains a metre inward
     leaves, nears = rate > 1e-9, rate < -1e-9
-    beside = float(clearance[~leaves & ~nears].min(initial=np.inf))
-    for radius in radii[radii <= beside + 1e-9]:
+    largest = float(clearance[~leaves & ~nears].min(initial=np.inf))
+    for radius in radii[radii <= largest + 1e-9]:
         depth = float(((radius - clearance[leaves]) / rate[leaves]).max())
         limit = float(((radius - clearance[nears]) / rate[nears]).min(initial=np.inf))
-        if depth <= limit and depth - radius <= most:
+        if depth <= limit and depth - radius <= max_depth:
             return point + depth * inward, float(radius)
     return point, 0.0  # a tip sharper than any of the balls
 
@@ -118,11 +118,11 @@ def _cover(hull: _Hull, tolerance: float) -> tuple[_Array, _Array] | None:
     while gap.max() > goal:
         if len(chosen_radii) == MAX_MESH_PROBES:
             return None
-        centre, radius = _ball_at(samples[gap.argmax()], hull, radii, 0.9 * goal)
+        centre, radius = _inscribe_ball(samples[gap.argmax()], hull, radii, 0.9 * goal)
         centres.append(centre)
         chosen_radii.append(radius)
-        apart = np.sqrt(np.maximum(squares - 2.0 * samples @ centre + centre @ centre, 0.0))
-        gap = np.minimum(gap, apart - radius)
+        distance = np.sqrt(np.maximum(squares - 2.0 * samples @ centre + centre @ centre, 0.0))
+        gap = np.minimum(gap, distance - radius)
     return np.array(centres), np.array(chosen_radii)
 
 
@@ -130,7 +130,7 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
     """Balls in rows of one radius along the longest side: contacts are made of a row's ends and its deepest ball."""
     middle = corners.mean(axis=0)
     _, _, axes = np.linalg.svd(corners - middle, full_matrices=False)
-    along, across = (centres - middle) @ axes[0], (centres - middle) @ axes[1]
+    along, across = ((centres - middle) @ axis for axis in axes[:2])
     side = np.sign(across) if np.ptp((corners - middle) @ axes[1]) > _WIDE else np.zeros(len(centres))
     side[side == 0.0] = 1.0
     strips = []
@@ -153,7 +153,7 @@ def _spread(row: _Array) -> float:
 
 @lru_cache(maxsize=64)
 def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
-    hull = _hull_of(np.frombuffer(vertices).reshape(-1, 3))
+    hull = _make_hull(np.frombuffer(vertices).reshape(-1, 3))
     corners = np.unique(hull.triangles.reshape(-1, 3), axis=0)
     tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
     while (balls := _cover(hull, tolerance)) is None:
@@ -178,9 +178,9 @@ _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose ed
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 
 
-def _max_spacing(radius: float, most: float = MAX_SAG) -> float:
+def _max_spacing(radius: float, max_sag: float = MAX_SAG) -> float:
     """Largest distance of neighbouring probes between which a sharp ridge sinks at most so deep [m]."""
-    sag = min(most, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
+    sag = min(max_sag, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
 
 
@@ -207,15 +207,15 @@ def box_strips(*half: float) -> list[Strip]:
     spacing = _max_spacing(radius)
     # Contacts are made of the ends of a strip, so the fewer strips, the fewer contacts of a box that lies.
     order = [*np.argsort(half, kind="stable")]
-    across, beside, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
+    thin, middle, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
     back = np.argsort(order)
     strips = []
-    for i, px in enumerate(across):
-        for j, py in enumerate(beside):
-            rim = i in (0, len(across) - 1) or j in (0, len(beside) - 1)
+    for i, px in enumerate(thin):
+        for j, py in enumerate(middle):
+            is_rim = i in (0, len(thin) - 1) or j in (0, len(middle) - 1)
             # Inside the cross-section only the two end faces have a surface.
-            for part in [along] if rim else [along[:1], along[-1:]]:
-                strips.append(Strip(centres=_along_z(float(px), float(py), part)[:, back], radius=radius))
+            for row in [along] if is_rim else [along[:1], along[-1:]]:
+                strips.append(Strip(centres=_along_z(float(px), float(py), row)[:, back], radius=radius))
     return strips
 
 
@@ -228,9 +228,9 @@ def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
     for ring, ring_radius in enumerate(_line(0.0, radius - probe, spacing)[::-1]):
         count = max(1, int(np.ceil(2.0 * np.pi * ring_radius / spacing)))
         for angle in np.arange(count) * 2.0 * np.pi / count:
-            x, y = ring_radius * np.cos(angle), ring_radius * np.sin(angle)
-            for part in [z] if ring == 0 else [z[:1], z[-1:]]:
-                strips.append(Strip(centres=_along_z(float(x), float(y), part), radius=probe))
+            x, y = (float(ring_radius * f(angle)) for f in (np.cos, np.sin))
+            for row in [z] if ring == 0 else [z[:1], z[-1:]]:
+                strips.append(Strip(centres=_along_z(x, y, row), radius=probe))
     return strips
 
 
@@ -268,23 +268,23 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
-    shape, strips, problems = list[int](), list[Strip](), list[str]()
-    vec3: Any = wp.vec3
+    shape: list[int] = []
+    strips: list[Strip] = []
+    problems: list[str] = []
     for k in range(builder.shape_count):
-        kind, scale = newton.GeoType(builder.shape_type[k]), np.asarray(builder.shape_scale[k])
         try:
-            strips += shape_strips(kind, scale, builder.shape_source[k])
+            scale = np.asarray(builder.shape_scale[k])
+            strips += shape_strips(newton.GeoType(builder.shape_type[k]), scale, builder.shape_source[k])
         except ValueError as error:
             problems.append(f"geom {builder.shape_label[k]}: {error}")
         shape += [k] * (len(strips) - len(shape))
     if problems:
         raise ValueError("; ".join(problems))
-    poses: list[Any] = [builder.shape_transform[k] for k in shape]
-    centres = [[wp.transform_point(pose, vec3(*centre)) for centre in strip.centres]
-               for pose, strip in zip(poses, strips, strict=True)]  # fmt: skip
-    radius, body = [strip.radius for strip in strips], [builder.shape_body[k] for k in shape]
-    bundles = _bundles(body)
-    balls = [_ball_round(centres[a:b], radius[a:b]) for a, b in itertools.pairwise(bundles)]
+    centres = [_transform_points(builder.shape_transform[k], strip) for k, strip in zip(shape, strips, strict=True)]
+    radius = [strip.radius for strip in strips]
+    body = [builder.shape_body[k] for k in shape]
+    bundles = _bundle_strips(body)
+    balls = [_bounding_ball(centres[a:b], radius[a:b]) for a, b in itertools.pairwise(bundles)]
     probes = Probes()
     probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
     probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
@@ -297,7 +297,12 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     return probes
 
 
-def _bundles(body: Sequence[int]) -> list[int]:
+def _transform_points(pose: Any, strip: Strip) -> list[Any]:
+    vec3: Any = wp.vec3
+    return [wp.transform_point(pose, vec3(*centre)) for centre in strip.centres]
+
+
+def _bundle_strips(body: Sequence[int]) -> list[int]:
     """First strip of each bundle and the end: neighbours on one body, few enough that one thread looks at all."""
     starts = [0]
     for k in range(1, len(body)):
@@ -306,8 +311,8 @@ def _bundles(body: Sequence[int]) -> list[int]:
     return [*starts[: len(body)], len(body)]
 
 
-def _ball_round(strips: Sequence[Sequence[Any]], radii: Sequence[float]) -> tuple[float, ...]:
-    """Middle and radius of a ball round strips of spheres [m]."""
+def _bounding_ball(strips: Sequence[Sequence[Any]], radii: Sequence[float]) -> tuple[float, ...]:
+    """Middle and radius of a ball that holds strips of spheres [m]."""
     points = np.array([centre for strip in strips for centre in strip], dtype=np.float64)
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     reach = np.linalg.norm(points - middle, axis=1) + np.repeat(radii, [len(strip) for strip in strips])
@@ -319,12 +324,12 @@ def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
 
     Crossings start with every joint up to a fifth from its default angle.
     """
-    rng, spread = np.random.default_rng(0), CrossingCfg().start_joint_range
-    scale = rng.uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
+    spread = CrossingCfg().start_joint_range
+    scale = np.random.default_rng(0).uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
     scale[0] = 1.0
-    feet = (bottoms[name] for bottoms, _ in measure_extents(builder, scale * robot.default_joint_pos)
-            for name in robot.foot_geoms)  # fmt: skip
-    return float(np.ceil(-1e3 * min(feet) - 1e-3) / 1e3)
+    extents = measure_extents(builder, scale * robot.default_joint_pos)
+    lowest_foot = min(bottoms[name] for bottoms, _ in extents for name in robot.foot_geoms)
+    return float(np.ceil(-1e3 * lowest_foot - 1e-3) / 1e3)
 
 
 def measure_extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[dict[str, float], float]]:
@@ -333,16 +338,16 @@ def measure_extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[
         model, probes = builder.finalize(), make_probes(builder)
         state: Any = model.state()
         counts = np.diff(probes.strip_start.numpy())
-        shape, radius = (np.repeat(getattr(probes, f"strip_{name}").numpy(), counts) for name in ("shape", "radius"))
-        points, names = probes.position.numpy(), np.array(builder.shape_label)[shape]
+        radius = np.repeat(probes.strip_radius.numpy(), counts)
+        shape = np.repeat(probes.strip_shape.numpy(), counts)
+        names = np.array(builder.shape_label)[shape]
         body = np.array(builder.shape_body)[shape]
+        points = probes.position.numpy()
         for pose in poses:
             state.joint_q.assign(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *pose], dtype=np.float32))
             newton.eval_fk(model, state.joint_q, state.joint_qd, state)
-            poses_of_bodies = state.body_q.numpy()[body]
-            at = poses_of_bodies[:, :3] + Rotation.from_quat(poses_of_bodies[:, 3:]).apply(points)
-            bottom = at[:, 2] - radius
-            yield (
-                {name: float(bottom[names == name].min()) for name in dict.fromkeys(names.tolist())},
-                float((np.linalg.norm(at, axis=1) + radius).max()),
-            )
+            body_poses = state.body_q.numpy()[body]
+            centres = body_poses[:, :3] + Rotation.from_quat(body_poses[:, 3:]).apply(points)
+            bottom = centres[:, 2] - radius
+            reach = float((np.linalg.norm(centres, axis=1) + radius).max())
+            yield {name: float(bottom[names == name].min()) for name in dict.fromkeys(names.tolist())}, reach

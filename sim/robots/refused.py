@@ -8,19 +8,8 @@ import numpy as np
 from sim.robots.elements import mj, touching_geoms
 
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
-_NEEDED_FLAGS = [
-    "constraint",
-    "equality",
-    "frictionloss",
-    "limit",
-    "contact",
-    "spring",
-    "damper",
-    "gravity",
-    "clampctrl",
-    "actuation",
-    "refsafe",
-]
+_CONSTRAINT_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "refsafe")
+_FORCE_FLAGS = ("spring", "damper", "gravity", "clampctrl", "actuation")
 _ZERO_OPTIONS = ("density", "viscosity", "wind", "disableactuator")
 _ZERO_ATTRIBUTES = {
     "body": ("gravcomp", "mocap"),
@@ -64,7 +53,7 @@ def refused_elements(spec: Any) -> Iterator[str]:
 
 
 def _refused_options(option: Any) -> Iterator[str]:
-    for flag in _NEEDED_FLAGS:
+    for flag in (*_CONSTRAINT_FLAGS, *_FORCE_FLAGS):
         if option.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'<flag {flag}="disable"> in <option>'
     if option.enableflags & mj.mjtEnableBit.mjENBL_OVERRIDE:

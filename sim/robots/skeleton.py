@@ -15,27 +15,29 @@ from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, read_mesh, touching_geoms
 from sim.robots.robot import RobotCfg
 
-_KIND = mj.mjtGeom
+_SHAPE = mj.mjtGeom
 _SEGMENTS = 20  # round a capsule
 _CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
 LOOK_SUFFIX = ".look.xml"
-"""Of a file beside the model file: an MJCF whose bodies have names of the model's, with the shapes to show of them."""
-_BARE, _, _VISUAL, _HIDDEN = range(4)  # groups, of which MuJoCo shows 0 to 2
-_BASE, _LIMB, _FOOT = (0.27, 0.29, 0.33, 1.0), (0.47, 0.50, 0.55, 1.0), (0.30, 0.32, 0.36, 1.0)
+"""Suffix of an MJCF beside the model file, with shapes to show in place of the model's, by the names of bodies."""
+_BARE, _VISUAL, _HIDDEN = 0, 2, 3  # groups; MuJoCo shows 0 to 2
+_BASE_COLOR = (0.27, 0.29, 0.33, 1.0)
+_LIMB_COLOR = (0.47, 0.50, 0.55, 1.0)
+_FOOT_COLOR = (0.30, 0.32, 0.36, 1.0)
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
 
 
 def shown_spec(robot: RobotCfg) -> Any:
     """An ``MjSpec`` to look at, with the robot's joints in the robot's order behind that of its base.
 
-    Shapes without a name are named as the simulation names them: those of a URDF by their link, those of an MJCF that
-    touch anything ``<body>_geom_<k>``. A body shows the shapes of the file :data:`LOOK_SUFFIX` if there are some, else
-    those of its own that touch nothing, else all it has.
+    Shapes have the names that the simulation gives them: in a URDF that of the link, in an MJCF ``<body>_geom_<k>`` if
+    they have none. A body shows its shapes of the file :data:`LOOK_SUFFIX`, else those of the model that touch nothing,
+    else all of them.
     """
     try:
         spec = robot_spec(robot, visuals=True)
-    except ValueError:  # such as a mesh of too many faces, which only shows
+    except ValueError:  # for example a visual mesh of too many faces
         spec = robot_spec(robot)
     look_file = robot.model_file.with_suffix(LOOK_SUFFIX)
     looks = _read_look(look_file)
@@ -50,27 +52,28 @@ def shown_spec(robot: RobotCfg) -> Any:
 def robot_model(spec: Any, robot: RobotCfg) -> Any:
     """The ``MjModel`` of a specification of the robot, which may have been added to."""
     model = _compiled(spec.compile, robot.model_file)
-    visual = {columns for geom, columns in touches_of(model, robot).items() if model.geom_group[geom] == _VISUAL}
+    visual = {columns for geom, columns in find_touches(model, robot).items() if model.geom_group[geom] == _VISUAL}
     for column, name in enumerate(robot.geom_names):
         if name in robot.foot_geoms and (column,) in visual:
             model.geom(name).group = _HIDDEN
     return model
 
 
-def touches_of(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
-    """What is seen of the robot: geoms by index, with the columns of ``robot.geom_names`` whose touch each shows.
+def find_touches(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
+    """Visible geoms by index, with the columns of ``robot.geom_names`` whose touch each shows.
 
     A shape whose middle is in a foot shows that foot's touch, any other the touch of its body's base and limbs.
     """
-    ids, num_others = [model.geom(name).id for name in robot.geom_names], len(robot.geom_names) - len(robot.foot_geoms)
+    ids = [model.geom(name).id for name in robot.geom_names]
+    num_bodily = len(robot.geom_names) - len(robot.foot_geoms)
     touches = {}
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
         if body > 0 and model.geom_group[geom] < _HIDDEN:
-            same = [column for column, other in enumerate(ids) if model.geom_bodyid[other] == body]
-            away = {column: np.linalg.norm(model.geom_pos[geom] - model.geom_pos[ids[column]]) for column in same}
-            feet = [k for k in same if k >= num_others and away[k] < model.geom_rbound[ids[k]]]
-            touches[geom] = tuple(k for k in feet or same if k < num_others or k in feet)
+            columns = [k for k, touching in enumerate(ids) if model.geom_bodyid[touching] == body]
+            distance = {k: np.linalg.norm(model.geom_pos[geom] - model.geom_pos[ids[k]]) for k in columns}
+            feet = tuple(k for k in columns if k >= num_bodily and distance[k] < model.geom_rbound[ids[k]])
+            touches[geom] = feet or tuple(k for k in columns if k < num_bodily)
             if geom in ids:
                 touches[geom] = (ids.index(geom),)
     return touches
@@ -85,17 +88,17 @@ def _compiled(compile_model: Callable[[], Any], file: Path) -> Any:
 
 
 def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: RobotCfg) -> None:
-    """Says what is seen of a body, and colours what has no colour by its role."""
+    """Hides shapes of a body that others replace, and colours those without a colour by their role."""
     visual = [geom for geom in body.geoms if geom not in touching and geom.group < _HIDDEN]
     for geom in visual:
         geom.group = _HIDDEN if look else _VISUAL
     for shape in look:
         body.add_geom(group=_VISUAL, mass=0.0, contype=0, conaffinity=0, **shape)
     for geom in touching:
-        foot = geom.name in robot.foot_geoms
-        geom.group = _HIDDEN if (visual or look) and not foot else _BARE
+        is_foot = geom.name in robot.foot_geoms
+        geom.group = _HIDDEN if (visual or look) and not is_foot else _BARE
         if not geom.material and tuple(geom.rgba) == _NO_COLOR:
-            geom.rgba = _FOOT if foot else _BASE if geom.name in robot.base_geoms else _LIMB
+            geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if geom.name in robot.base_geoms else _LIMB_COLOR
 
 
 def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
@@ -111,55 +114,58 @@ def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 class Skeleton:
-    """A robot's bodies; the world is none of them."""
+    """A robot's bodies without the world."""
 
     def __init__(self, robot: RobotCfg) -> None:
         self.model: Any = robot_model(shown_spec(robot), robot)
         """The ``MjModel``, whose body 0 is the world."""
-        self.touches = touches_of(self.model, robot)
+        self.touches = find_touches(self.model, robot)
 
     @property
     def num_bodies(self) -> int:
-        """Without the world."""
+        """Number of bodies without the world."""
         return self.model.nbody - 1
 
     def shape(self, geom: int) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
         """A geom in its body's frame [m], and its colour, RGB 0 to 1."""
         model = self.model
-        kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-        if kind == _KIND.mjGEOM_MESH:
+        kind = int(model.geom_type[geom])
+        if kind == _SHAPE.mjGEOM_MESH:
             shape = trimesh.Trimesh(*read_mesh(model, geom), process=False)
         else:
-            shape = trimesh.graph.smooth_shade(_primitive(kind, size), angle=_CREASE)
+            shape = trimesh.graph.smooth_shade(_make_primitive(kind, model.geom_size[geom]), angle=_CREASE)
         transform = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])  # w x y z too
         transform[:3, 3] = model.geom_pos[geom]
-        color, material = model.geom_rgba[geom], model.geom_matid[geom]
-        if material >= 0 and tuple(color) == _NO_COLOR:
-            color = model.mat_rgba[material]
+        color = model.geom_rgba[geom]
+        if model.geom_matid[geom] >= 0 and tuple(color) == _NO_COLOR:
+            color = model.mat_rgba[model.geom_matid[geom]]
         return shape.apply_transform(transform), color[:3].astype(np.float64)
 
     def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where the bodies are: origins in the world [m] and body-to-world quaternions w x y z.
+        """Origins of the bodies in the world [m] and body-to-world quaternions w x y z.
 
         Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
         (num_frames, nq), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
         """
         data = mj.MjData(self.model)
-        positions, quaternions = (np.empty((len(qpos), self.num_bodies, count)) for count in (3, 4))
+        positions = np.empty((len(qpos), self.num_bodies, 3))
+        quaternions = np.empty((len(qpos), self.num_bodies, 4))
         for frame, row in enumerate(qpos):
             data.qpos[:] = row
             mj.mj_kinematics(self.model, data)
-            positions[frame], quaternions[frame] = data.xpos[1:], data.xquat[1:]
+            positions[frame] = data.xpos[1:]
+            quaternions[frame] = data.xquat[1:]
         return positions, quaternions
 
 
-def _primitive(kind: int, size: NDArray[np.float64]) -> trimesh.Trimesh:
+def _make_primitive(kind: int, size: NDArray[np.float64]) -> trimesh.Trimesh:
     """A shape about its own centre, along z."""
-    radius, length = float(size[0]), 2.0 * float(size[1])
-    if kind == _KIND.mjGEOM_CAPSULE:
+    radius = float(size[0])
+    length = 2.0 * float(size[1])
+    if kind == _SHAPE.mjGEOM_CAPSULE:
         return trimesh.creation.capsule(height=length, radius=radius, count=(_SEGMENTS, _SEGMENTS))
-    if kind == _KIND.mjGEOM_CYLINDER:
+    if kind == _SHAPE.mjGEOM_CYLINDER:
         return trimesh.creation.cylinder(radius=radius, height=length, sections=_SEGMENTS)
-    if kind == _KIND.mjGEOM_BOX:
+    if kind == _SHAPE.mjGEOM_BOX:
         return trimesh.creation.box(extents=2.0 * size)
-    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _KIND.mjGEOM_ELLIPSOID else radius)
+    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _SHAPE.mjGEOM_ELLIPSOID else radius)

@@ -1,4 +1,4 @@
-"""What the training of a controller takes of its robot: the rewards, and how its starts and its body are varied."""
+"""Settings of a robot for the training of its controllers: rewards, learning, fine-tuning."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -91,8 +91,8 @@ class LearningCfg(PaceCfg):
 
 Draw = Literal["uniform", "failing", "learnable"]
 """How a fine-tuning draws elites (:class:`train.task.mix.MixCfg`)."""
-MOST_SPREAD = 10.0
-"""How far along the way a training's robots may start [m]. Further along they start within 2 m of the goal."""
+MAX_SPREAD = 10.0
+"""How far along the way a training's robots may start [m]; farther ones would start within 2 m of the goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class TuningCfg:
     tracking_lin_vel: float = 2.0
     """Weight of :attr:`RewardCfg.tracking_lin_vel` in place of the robot's own."""
     draw: Draw = "learnable"
-    start_spread: Annotated[float, Meta(ge=0, le=MOST_SPREAD)] = 8.0
+    start_spread: Annotated[float, Meta(ge=0, le=MAX_SPREAD)] = 8.0
     """Robots start up to so far along the way [m]."""
     entropy: NonNegativeFloat = 0.005
     """Weight of the entropy bonus. It widens the noise of the actions, which a further training begins with."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.calibrate import calibrate, fitting_height, measured
+from qd.calibrate import calibrate, find_fitting_height, measure_scales
 from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
@@ -28,12 +28,13 @@ def crossed(penalties, late, invalid=None):
 def test_scales_are_means_over_failing_episodes_or_over_all_if_under_200_fail():
     # 100 episodes fail with 1, 4 and 100 with 3, 0: means 2 and 2. That 300 reach the goal with 9, 8 changes nothing.
     rows = [[1, 4]] * 100 + [[3, 0]] * 100 + [[9, 8]] * 300
-    numbers = measured(crossed(rows, [True] * 200 + [False] * 300))
+    numbers = measure_scales(crossed(rows, [True] * 200 + [False] * 300))
     assert numbers["scales"] == {"yaw_rate": 2.0, "vel_x": 2.0} and numbers["scaled_by"] == "failing"
     assert numbers["share_of_episodes_with"] == {"yaw_rate": 1.0, "vel_x": 0.5}
     # One of the 200 is invalid: 199 of 1, 4 fail, 199 reach the goal with 3, 8. Means (1 + 3) / 2 and (4 + 8) / 2.
     rows = [[1, 4]] * 199 + [[np.nan, np.nan]] + [[3, 8]] * 199
-    numbers = measured(crossed(rows, [True] * 200 + [False] * 199, invalid=[False] * 199 + [True] + [False] * 199))
+    invalid = [False] * 199 + [True] + [False] * 199
+    numbers = measure_scales(crossed(rows, [True] * 200 + [False] * 199, invalid))
     assert numbers["scales"] == {"yaw_rate": 2.0, "vel_x": 6.0} and numbers["scaled_by"] == "all"
     assert (numbers["episodes"], numbers["invalid_episodes"], numbers["failing_episodes"]) == (399, 1, 199)
 
@@ -98,14 +99,14 @@ def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are
 
 @pytest.mark.parametrize(("crossed_up_to", "expected"), [(0.30, 0.25), (0.11, 0.1), (0.04, 0.04), (0.001, 0.02)])
 def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, expected):
-    asked = []
+    heights = []
 
     class Crosses:
         def cross(self, policy, genes, seeds, *, space, replicas, label):
             height = get_space(space).height
-            asked.append(height)
+            heights.append(height)
             return failing(0.0 if height <= crossed_up_to else 0.5)(stand_in.evaluate(genes, seeds, replicas))
 
-    height, share = fitting_height(Crosses(), "policy.pt")
+    height, share = find_fitting_height(Crosses(), "policy.pt")
     assert height == expected and (share >= 0.8) == (height <= crossed_up_to)
-    assert asked[0] == 0.25 and len(asked) <= 5
+    assert heights[0] == 0.25 and len(heights) <= 5

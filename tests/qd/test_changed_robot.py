@@ -7,7 +7,7 @@ import pytest
 
 from sim.controllers.loaders import load_policy
 from sim.controllers.spec import controller_identity
-from sim.robots.find import get_robot, robot_of
+from sim.robots.find import get_robot, resolve_robot
 from sim.robots.identity import robot_digest, robot_identity
 from sim.robots.shipped import ROBOTS
 from tests.builders import rsl_rl_actor, save_checkpoint
@@ -18,7 +18,7 @@ def test_a_controller_trained_with_the_robot_before_is_told_so_and_what_was_made
     dog = write_dog(tmp_path)
     robot = get_robot(str(dog))
     record = {"robot": "dog", **robot_identity(robot)}
-    assert robot_of(record, str(dog), tmp_path) == robot
+    assert resolve_robot(record, str(dog), tmp_path) == robot
     policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
     policy.with_suffix(".train.json").write_text(json.dumps({"settings": {"robot_sha256": robot_digest(robot)}}))
     load_policy(policy, dataclasses.replace(robot, physics_dt=0.001, decimation=20), "cpu")  # finer, not another
@@ -26,7 +26,7 @@ def test_a_controller_trained_with_the_robot_before_is_told_so_and_what_was_made
     dog.write_text(dog.read_text().replace("contact_force_limit=150.0", "contact_force_limit=15.0"))
     changed = get_robot(str(dog))
     with pytest.raises(ValueError, match=record["robot_sha256"][:12]):
-        robot_of(record, str(dog), tmp_path)
+        resolve_robot(record, str(dog), tmp_path)
     load_policy(policy, changed, "cpu")
     load_policy(policy, changed, "cpu")
     assert capsys.readouterr().err.count("warning") == 1

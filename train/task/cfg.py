@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from sim.files.settings import Interval, NonNegativeFloat, NonNegativeInt, PositiveFloat, problems
 from sim.robots.robot import RobotCfg
-from sim.robots.training import MOST_SPREAD, NoiseCfg, TrainingCfg
+from sim.robots.training import MAX_SPREAD, NoiseCfg, TrainingCfg
 from sim.terrains.hand_crafted import NUM_LEVELS
 
 
@@ -37,7 +37,7 @@ class TaskCfg(TrainingCfg):
     crosses: bool = False
     """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
     velocities and headings from its middle."""
-    start_spread: Annotated[float, Meta(ge=0, le=MOST_SPREAD)] = 0.0
+    start_spread: Annotated[float, Meta(ge=0, le=MAX_SPREAD)] = 0.0
     """Where robots cross, they start up to so far along the way, uniformly [m]; the goal stays where it is."""
     episode_s: PositiveFloat = 20.0
     command_interval_s: PositiveFloat = 10.0

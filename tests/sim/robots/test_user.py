@@ -156,6 +156,7 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("py", "ROBOT =", "DOG =", "ROBOT"),
     ("py", "ROBOT =", "1 / 0; ROBOT =", "dog.py"),
     ("py", "dog.xml", "cat.xml", "cat.xml"),
+    ("py", "150.0", "-1", "contact_force_limit"),
     ("py", MORE, f"{MORE} training=TrainingCfg(soft_joint_limit=2.0),", "training.soft_joint_limit"),
     ("py", MORE, f'{MORE} training=TrainingCfg(steady_joints=("tail",)),', "steady_joints"),
     ("py", 'base_geoms=("trunk",)', 'base_geoms=("FL_foot",)', "FL_foot"),
@@ -182,8 +183,8 @@ MISTAKES = [  # a row a rule: the file it is in, what is replaced there by what,
     ("xml", FIRST_DRIVE, FIRST_DRIVE.replace("kp", 'gear="2" kp'), "gear"),
     ("xml", FIRST_DRIVE, FIRST_DRIVE.replace("kp", 'timeconst="0.1" kp'), "timeconst"),
     ("xml", "</actuator>", '<velocity joint="FL_hip" kv="9"/></actuator>', "wheels, on FL_hip"),
-    ("xml", '<geom name="trunk"', '<site name="trunk"/><geom name="body"', "trunk is a site"),
-    ("xml", '<geom name="trunk"', '<geom contype="0" name="trunk"', "trunk is a geom that touches nothing"),
+    ("xml", '<geom name="trunk"', '<site name="trunk"/><geom name="body"', "trunk"),
+    ("xml", '<geom name="trunk"', '<geom contype="0" name="trunk"', "touches the ground is named trunk"),
     ("xml", FIRST_DRIVE, '<general joint="FL_hip" biastype="affine" gainprm="60" biasprm="1 -60"/>', "<position>"),
     ("xml", "0.03 0.2 0.2", "1e-12 1e-12 1e-12", "a point"),
     ("xml", 'friction="0.8"', 'friction="0.8" margin="0.02"', "<geom margin> of trunk (line"),
@@ -222,13 +223,13 @@ def test_a_mistake_in_settings_or_model_is_named(tmp_path, suffix, old, new, par
 
 def test_every_mistake_of_settings_and_model_is_named_at_once(tmp_path):
     file = write_dog(tmp_path)
-    wrong = {"150.0": "-1", "* 4": "* 3", '"shank"': '"shin"', 'base_geoms=("trunk",)': "base_geoms=()"}
+    wrong = {"* 4": "* 3", '"shank"': '"shin"', 'base_geoms=("trunk",)': "base_geoms=()"}
     for old, new in wrong.items():
         replace_once(file, old, new)
     replace_once(file.with_suffix(".xml"), HIP, f'{HIP} armature="-1"')
     with pytest.raises(ValueError, match=r"dog\.py") as raised:
         get_robot(str(file))
-    for part in ("contact_force_limit", "default_joint_pos", "FL_shin", "base_geoms", "armature"):
+    for part in ("default_joint_pos", "FL_shin", "base_geoms", "armature"):
         assert part in str(raised.value)
 
 
