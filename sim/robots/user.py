@@ -4,8 +4,8 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +15,19 @@ import warp as wp
 from kernels.penalties import PENALTIES
 from sim.controllers.spec import run_file
 from sim.device import host_device
-from sim.files.settings import from_builtins, problems, read_toml, to_toml
+from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
 from sim.robots.compiled import PER_JOINT, file_problems
 from sim.robots.elements import joint_names, mj
-from sim.robots.model import builder_of
+from sim.robots.model import make_builder
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.robots.robot_file import RobotFile, read_robot_file
 from sim.robots.shipped import ROBOTS
 
-_NAMES = ("base_geoms", "foot_geoms", "limb_geoms", "joint_names", "penalties")
-INFERRED = ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "limb_geoms", "footprint", "scan_x",
-            "scan_y", "contact_force_limit", "penalties", "collision_bit", "default_base_height")  # fmt: skip
-"""Settings that a robot.toml may leave out though there is no default."""
-_NOT_IN_TOML = ("label", "paper", "settings_file")  # settings
+_ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
+_NAMES = (*_ROLES, "joint_names", "penalties")
+_NOT_IN_TOML = ("label", "paper", "settings_file")
 NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
 """What a robot may be called, since files and folders are called after it."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
@@ -43,54 +41,49 @@ def is_new_name(name: str) -> bool:
 def load_robot(path: Path) -> RobotCfg:
     """Reads a settings file, or runs one that is Python, and checks the robot that it sets against its model."""
     file = path.resolve()  # of a link, the model lies beside what it points to
-    robot, of_file = (
-        _read_toml(path, file) if path.suffix == ".toml" else (getattr(run_file(path), "ROBOT", None), None)
-    )
+    robot = _read_toml(path, file) if path.suffix == ".toml" else getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
-    if isinstance(robot.model_file, str):
-        robot = replace(robot, model_file=Path(robot.model_file))
-    mistakes = settings_problems(robot)
-    wrong = {line.split(" ", 1)[0] for line in mistakes}
-    if "model_file" not in wrong:
+    try:
         robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
+        check_settings(robot)
+        robot_file = read_robot_file(robot.model_file)
+        builder = make_builder(robot_file.model)
+        mistakes = [*settings_problems(robot), *file_problems(robot, robot_file)]
         try:
-            of_file = of_file or read_robot_file(robot.model_file)
-            mistakes += file_problems(robot, of_file, wrong)
             with wp.ScopedDevice(host_device()):
-                builder = builder_of(of_file.model)
                 make_probes(builder)
-                if not mistakes and not robot.default_base_height:
-                    robot = replace(robot, default_base_height=start_height(robot, builder))
         except ValueError as error:
             mistakes.append(str(error))
-    if mistakes:
-        raise ValueError(f"{path}: {'; '.join(mistakes)}")
-    return robot
+        if mistakes:
+            raise ValueError("; ".join(mistakes))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    return robot if robot.default_base_height else replace(robot, default_base_height=start_height(robot, builder))
 
 
-def _read_toml(path: Path, file: Path) -> tuple[RobotCfg, RobotFile]:
-    """The robot of a robot.toml, and its model, from which is inferred what it leaves out."""
-    given = read_toml(path)
-    known = [field.name for field in fields(RobotCfg) if field.name not in _NOT_IN_TOML]
-    if unknown := [name for name in given if name not in known]:
-        raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(known)}")
-    if no_list := [name for name in _NAMES if not isinstance(given.get(name, []), list)]:
+def _read_toml(path: Path, file: Path) -> RobotCfg:
+    """The robot of a robot.toml; what it leaves out is inferred from its model."""
+    settings = read_toml(path)
+    names = [field.name for field in fields(RobotCfg) if field.name not in _NOT_IN_TOML]
+    if unknown := [name for name in settings if name not in names]:
+        raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(names)}")
+    if no_list := [name for name in _NAMES if not isinstance(settings.get(name, []), list)]:
         raise ValueError(f"{path}: {', '.join(no_list)} must be a list of names")
-    if not isinstance(given.get("model_file"), str):
+    if not isinstance(settings.get("model_file"), str):
         raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
-    of_file = read_robot_file(file.parent / given["model_file"])
-    joints = joint_names(of_file.model)
-    given |= {name: per_joint(given[name], joints, f"{path}: {name}") for name in PER_JOINT if name in given}
-    return from_builtins(RobotCfg, infer(given, file, of_file), str(path)), of_file
+    robot_file = read_robot_file(file.parent / settings["model_file"])
+    joints = joint_names(robot_file.model)
+    settings |= {name: per_joint(settings[name], joints, f"{path}: {name}") for name in PER_JOINT if name in settings}
+    return from_builtins(RobotCfg, infer_settings(settings, file, robot_file), str(path))
 
 
 def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = False) -> list[Any]:
     """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
 
     A name counts before an expression; every joint must be matched once, and every entry must match. ``partly``: joints
-    without a match have None, entries may be of joints that are not there, but not all.
+    without a match have None; entries may match no joint, but not all of them.
     """
     if isinstance(value, list):
         return value
@@ -101,16 +94,15 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
     except re.error as error:
         raise ValueError(f"{what} must have names or regular expressions, got {error.pattern!r}: {error}") from None
     idle = [key for key in value if not any(key in keys for keys in matches)]
-    if idle and (len(idle) == len(value) if partly and joints else not partly):
+    if idle and (not partly or (len(idle) == len(value) and joints)):
         raise ValueError(f"{what}: {', '.join(idle)} matches no joint of {', '.join(joints)}")
-    wrong = [f"{joint} ({', '.join(keys) or 'by none'})" for joint, keys in zip(joints, matches, strict=True)
-             if len(keys) > 1 or not (keys or partly)]  # fmt: skip
-    if wrong:
-        raise ValueError(f"{what} must match every joint by one entry: got {', '.join(wrong)}")
+    for joint, keys in zip(joints, matches, strict=True):
+        if len(keys) > 1 or not (keys or partly):
+            raise ValueError(f"{what} must match every joint once: got {', '.join(keys) or 'nothing'} for {joint}")
     return [value[keys[0]] if keys else None for keys in matches]
 
 
-def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, Any]:
+def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> dict[str, Any]:
     """Settings of a robot.toml with those that it leaves out, as far as its compiled model says them.
 
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
@@ -119,34 +111,44 @@ def infer(given: dict[str, Any], file: Path, of_file: RobotFile) -> dict[str, An
     ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it. ``given`` has
     one value a joint where a setting is of joints.
     """
-    model = of_file.model
-    low, high = model.jnt_range[1:].T
-    nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, low, high), 0.0).tolist()
-    found: dict[str, Any] = {"name": file.parent.name, "joint_names": list(joint_names(model)), "collision_bit": False}
-    found |= {"default_joint_pos": of_file.home or nearest} | given
-    pose = found["default_joint_pos"]
-    if len(pose) != model.njnt - 1 or not all(
-        isinstance(angle, int | float) and math.isfinite(angle) for angle in pose
-    ):
+    model = robot_file.model
+    nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, *model.jnt_range[1:].T), 0.0).tolist()
+    pose = given.get("default_joint_pos", robot_file.home or nearest)
+    if len(pose) != model.njnt - 1 or not all(isinstance(q, int | float) and math.isfinite(q) for q in pose):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
-    ((bottoms, _),) = measure_extents(builder_of(model), [pose])
-    body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
-    taken = {name for role in ("base_geoms", "foot_geoms", "limb_geoms") for name in given.get(role, ())}
-    free = [name for name in bottoms if name not in taken]
-    low, last = min(bottoms.values()) + _FOOT_RISE, {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
-    found.setdefault("base_geoms", [name for name in free if body[name] == 1])
-    found.setdefault("foot_geoms", [name for name in free if body[name] in last and bottoms[name] <= low])
-    limbs = [name for name in free if name not in {*found["base_geoms"], *found["foot_geoms"]}]
-    found.setdefault("limb_geoms", limbs)
-    usual = [penalty for penalty in PENALTIES.values() if penalty.default]
-    found.setdefault("penalties", [p.name for p in usual if found["limb_geoms"] or not p.needs_limbs])
+    roles = _infer_roles(given, model, pose)
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
-    found.setdefault("contact_force_limit", float(f"{weight:.3g}"))
-    found.setdefault("footprint", _footprint(model, pose, found["foot_geoms"]))
     controller = file.with_name("controller.toml")
     terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
-    scans = [term for term in terms if isinstance(term, dict) and term.get("term") == "scan"]
-    return {f"scan_{axis}": scans[0].get(axis, []) if scans else [] for axis in "xy"} | found
+    scan = next((term for term in terms if isinstance(term, dict) and term.get("term") == "scan"), {})
+    inferred = {
+        "name": file.parent.name,
+        "joint_names": list(joint_names(model)),
+        "collision_bit": False,
+        "default_joint_pos": pose,
+        "penalties": [p.name for p in PENALTIES.values() if p.default and (roles["limb_geoms"] or not p.needs_limbs)],
+        "contact_force_limit": float(f"{weight:.3g}"),
+        "footprint": _footprint(model, pose, roles["foot_geoms"]),
+        "scan_x": scan.get("x", []),
+        "scan_y": scan.get("y", []),
+    }
+    return inferred | roles | given
+
+
+def _infer_roles(given: dict[str, Any], model: Any, pose: Sequence[float]) -> dict[str, list[str]]:
+    """Geoms of each role; those whose role is given have no other."""
+    ((bottoms, _),) = measure_extents(make_builder(model), [pose])
+    body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
+    last_bodies = {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
+    roles = {role: given[role] for role in _ROLES if role in given}
+    lowest = min(bottoms.values())
+    free = [name for name in bottoms if not any(name in names for names in roles.values())]
+    roles.setdefault("base_geoms", [name for name in free if body[name] == 1])
+    is_foot = {name: body[name] in last_bodies and bottoms[name] <= lowest + _FOOT_RISE for name in free}
+    roles.setdefault("foot_geoms", [name for name in free if is_foot[name]])
+    with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
+    roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
+    return roles
 
 
 def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
@@ -164,47 +166,37 @@ def describe_inferred(robot: RobotCfg) -> str:
     file = robot.settings_file
     if file is None or file.suffix != ".toml":
         return ""
-    given = read_toml(file)
-    lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in INFERRED if name not in given]
+    required = [field.name for field in fields(RobotCfg) if field.default is field.default_factory is MISSING]
+    names = [name for name in (*required, "default_base_height") if name not in read_toml(file)]
+    lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
 
 
-def settings_problems(robot: RobotCfg) -> list[str]:
-    """What is wrong with settings by themselves, one line each."""
-    mistakes = problems(robot)
-    wrong = {line.split(" ", 1)[0] for line in mistakes}
-    if "name" not in wrong and not is_new_name(robot.name):
-        mistakes.append(f"name must be {NEW_NAME}, got {robot.name!r}")
-    if wrong.isdisjoint(_NAMES):
-        mistakes += _name_problems(robot)
-    for one, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
-        if (getattr(robot, one) is None) != (getattr(robot, other) is None):
-            mistakes.append(f"{one} and {other} must be given together")
-    if wrong.isdisjoint(("max_duration_s", "physics_dt", "decimation")) and robot.max_duration_s < robot.control_dt:
-        mistakes.append(f"max_duration_s must be a control step or more, {robot.control_dt:g} s")
-    fine = wrong.isdisjoint(("contact_time_constant_s", "physics_dt"))
-    given, step = robot.contact_time_constant_s if fine else None, robot.physics_dt
-    if given is not None and given < 2.0 * step * (1.0 - 1e-9):
-        mistakes.append(f"contact_time_constant_s must be at least twice physics_dt, {2 * step:g} s, got {given:g}")
-    return mistakes
-
-
-def _name_problems(robot: RobotCfg) -> list[str]:
-    names = {field: getattr(robot, field) for field in _NAMES}
-    roles = {role: names[role] for role in ("base_geoms", "limb_geoms", "foot_geoms")}
-    twice = sorted({name for a, b in itertools.combinations(roles.values(), 2) for name in {*a} & {*b}})
-    strange = [name for name in getattr(robot.training, "steady_joints", ()) if name not in robot.joint_names]
-    known = set(robot.penalties) <= set(PENALTIES) and len(robot.penalties) >= 2
-    needed = ("base_geoms", "foot_geoms", "joint_names")
-    repeats = {field: ", ".join(row) for field, row in names.items() if len({*row}) < len(row)}
-    findings = [
-        *((not names[field], f"{field} must name at least one") for field in needed),
-        *((True, f"{field} must hold each name once, got {row}") for field, row in repeats.items()),
-        (twice, f"a geom has one role: {', '.join(twice)} is in two of {', '.join(roles)}"),
-        (not known, f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}"),
-        (strange, f"training.steady_joints: no joint named {', '.join(strange)} in joint_names"),
-    ]
-    return [text for holds, text in findings if holds]
+def settings_problems(robot: RobotCfg) -> Iterator[str]:
+    """Complaints about settings that do not fit each other, one line each; every one has its own type and range."""
+    if not is_new_name(robot.name):
+        yield f"name must be {NEW_NAME}, got {robot.name!r}"
+    for field in _NAMES:
+        names = getattr(robot, field)
+        if not names and field not in ("limb_geoms", "penalties"):
+            yield f"{field} must name at least one"
+        if len({*names}) < len(names):
+            yield f"{field} must hold each name once, got {', '.join(names)}"
+    for role, other in itertools.combinations(_ROLES, 2):
+        if both := {*getattr(robot, role)} & {*getattr(robot, other)}:
+            yield f"a geom has one role: {', '.join(sorted(both))} is in {role} and {other}"
+    if not {*robot.penalties} <= {*PENALTIES} or len(robot.penalties) < 2:
+        yield f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}"
+    if missing := [name for name in robot.training.steady_joints if name not in robot.joint_names]:
+        yield f"training.steady_joints: no joint named {', '.join(missing)} in joint_names"
+    for name, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
+        if (getattr(robot, name) is None) != (getattr(robot, other) is None):
+            yield f"{name} and {other} must be given together"
+    if robot.max_duration_s < robot.control_dt:
+        yield f"max_duration_s must be a control step or more, {robot.control_dt:g} s"
+    constant, least = robot.contact_time_constant_s, 2.0 * robot.physics_dt
+    if constant is not None and constant < least * (1.0 - 1e-9):
+        yield f"contact_time_constant_s must be at least twice physics_dt, {least:g} s, got {constant:g}"
 
 
 @dataclass(frozen=True, kw_only=True)
