@@ -50,7 +50,8 @@ def test_figures_show_its_label(run):
 
 def test_replay_prints_its_label_and_unit(run, capsys):
     flags, folder = run
-    main(["replay", *flags, "--run", str(folder), "--replicas", "1"])
+    with crossing_by(open_here):
+        main(["replay", *flags, "--run", str(folder), "--replicas", "1"])
     assert "roll rate of the trunk [(rad/s)^2 s]" in " ".join(capsys.readouterr().out.split())
 
 
