@@ -9,6 +9,7 @@ import torch
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from kernels.super_gaussian import LOWER, UPPER
 from qd.search.archive import Archive, FreshValues, no_outcomes, write_archive
 from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json
@@ -72,6 +73,12 @@ def make_archive(num_elites: int, *, robot: str = "anymal", seed: int = 0) -> Ar
         fitness=np.linspace(9.0, 1.0, num_elites), end_position=np.full((num_elites, 2), 6.0, np.float32),
         iteration=np.ones(num_elites, np.int64),
     )  # fmt: skip
+
+
+def bump(*, x, sigma_x, height, y=4.0, sigma_y=3.0) -> np.ndarray:
+    """Genes of a bump, by default as broad as can be across the way."""
+    values = np.array([x, y, sigma_x, sigma_y, 4.0, 4.0, 0.0, height])
+    return (2.0 * (values - LOWER) / (UPPER - LOWER) - 1.0).astype(np.float32)
 
 
 def fresh_values(archive: Archive) -> FreshValues:

@@ -17,7 +17,7 @@ from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.faults.numbers import VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
 from qd.faults.searches import check_certifiers, find_certifiers, find_search
 from qd.faults.stages import STAGES
-from qd.faults.stages.base import Judging, Stage
+from qd.faults.stages.base import Judging
 from qd.faults.stages.fresh import with_families
 from qd.search.archive import ARCHIVE_FILE, Archive, write_archive
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
@@ -55,13 +55,14 @@ def judge(
     search = find_search(run, robot=robot, policy=policy, space=space)
     check_policy(search.policy, search.robot, compute.device)
     certifiers = find_certifiers(search) if certifiers is None else certifiers
-    if any(stage.with_certifiers for stage in chosen):
+    if any(stage.calls[1] for stage in chosen):
         check_certifiers(certifiers, search, compute.device)
-    calls = sum(stage.count_crossings(certifiers) for stage in chosen)
+    calls = sum(stage.calls[0] + stage.calls[1] * len(certifiers) for stage in chosen)
     with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crosser:
         archive = search.read_archive()
         judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
-        _check_stages(chosen, archive, judging)
+        for index, stage in enumerate(chosen):
+            stage.check(archive, judging, stages[:index])
         if archive.fresh is not None and archive.family is None:
             archive = with_families(archive, search)
         for stage in chosen:
@@ -71,32 +72,19 @@ def judge(
     return archive
 
 
-def _check_stages(stages: Sequence[Stage], archive: Archive, judging: Judging) -> None:
-    """Refuses stages, before anything is crossed, without those that they need; a stage undoes those that need it."""
-    done = {name for name, stage in STAGES.items() if stage.is_done(archive)}
-    before: list[str] = []
-    for stage in stages:
-        if missing := [name for name in stage.needs if name not in done]:
-            raise ValueError(
-                f"stages must begin with {', '.join(missing)}, got {', '.join(other.name for other in stages)}: "
-                f"{judging.search.run} has nothing by which {stage.name} could judge"
-            )
-        stage.check(archive, judging, before)
-        before.append(stage.name)
-        done = {name for name in done if stage.name not in STAGES[name].needs} | {stage.name}
-
-
 def find_seen(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
     """Whether each certifier of a judged archive has trained on kin of each elite, shape (N, C).
 
     None if the training record of one of them is not at hand.
     """
-    marks, columns = np.array(hash_elites(archive.genes)), []
+    marks = np.array(hash_elites(archive.genes))
+    columns = []
     for name in archive.certifiers:
         if (policy := certifiers.get(name)) is None:
             return None
-        trained_on, files = read_trained_on(policy), ControllerSpec.parse(policy).files
-        if not trained_on and not any(file.with_suffix(".train.json").is_file() for file in files):
+        trained_on = read_trained_on(policy)
+        records = [file.with_suffix(".train.json") for file in ControllerSpec.parse(policy).files]
+        if not trained_on and not any(record.is_file() for record in records):
             return None
         columns.append(np.isin(families, families[np.isin(marks, [*trained_on])]))
     return np.stack(columns, axis=1) if columns else None

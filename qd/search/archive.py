@@ -47,7 +47,8 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
     NaN where nothing was crossed, or too many episodes are invalid.
     """
-    episodes, invalid = counts.sum(axis=-1), counts[..., OUTCOMES.index("invalid")]
+    episodes = counts.sum(axis=-1)
+    invalid = counts[..., OUTCOMES.index("invalid")]
     is_known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
     return np.where(is_known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
 
@@ -187,18 +188,16 @@ class Archive(Evaluation):
         """Whether another archive found the same elites with the same values, in whatever order."""
         if len(self) != len(other):
             return False
-        order, other_order = np.argsort(self.cell), np.argsort(other.cell)
-        return all(np.array_equal(getattr(self, name)[order], getattr(other, name)[other_order]) for name in _FOUND)
+        tables = (self.rows(np.argsort(self.cell)), other.rows(np.argsort(other.cell)))
+        return all(np.array_equal(*(getattr(table, name) for table in tables)) for name in _FOUND)
 
     def rows(self, chosen: NDArray[np.int64]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        fresh = self.fresh
-        if fresh is not None:
-            fresh = FreshValues(**{name: values[chosen] for name, values in vars(fresh).items()})
-        return replace(
-            self, fresh=fresh, **{name: values[chosen] for name, values in columns.items() if values is not None}
-        )
+        columns: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
+        columns = {name: values[chosen] for name, values in columns.items() if values is not None}
+        if self.fresh is not None:
+            columns["fresh"] = FreshValues(**{name: values[chosen] for name, values in vars(self.fresh).items()})
+        return replace(self, **columns)
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with fresh values, by descending corrected fitness, the invalid elites last."""

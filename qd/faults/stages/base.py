@@ -20,23 +20,19 @@ from sim.terrains.terrains import Terrains
 
 @dataclass(frozen=True, kw_only=True)
 class Judging:
-    """A search whose elites are judged, by whom, and the service that lets controllers cross terrains."""
+    """A search whose elites are judged, other controllers by name, and the service that crosses terrains."""
 
     search: Search
     certifiers: Mapping[str, str]
-    """Other controllers by name."""
     crosser: Crosser
 
     def cross(
-        self, archive: Archive, rows: NDArray[np.int64], policy: str, *, stream: Stream, label: str,
-        engine: Engine = "search",
-    ) -> NDArray[np.int64]:  # fmt: skip
+        self, archive: Archive, rows: NDArray[np.int64], policy: str, engine: Engine, *, stream: Stream, label: str
+    ) -> NDArray[np.int64]:
         """Outcomes of 20 episodes of a controller on some elites, shape (len(rows), 4)."""
         seeds = elite_seeds(archive, self.search.cfg.seed, stream=stream)[rows]
         terrains = Terrains(genes=archive.genes[rows], seeds=seeds, space=self.search.space)
-        result = self.crosser.cross(
-            policy, terrains, replicas=EPISODES, engine=engine, label=label, invalid_ok=True
-        )
+        result = self.crosser.cross(policy, terrains, replicas=EPISODES, engine=engine, label=label, invalid_ok=True)
         return count_outcomes(result)
 
 
@@ -44,25 +40,17 @@ class Stage(ABC):
     """A step of judging: it crosses elites, and fills a group of the archive's columns."""
 
     name: ClassVar[str]
-    needs: ClassVar[tuple[str, ...]] = ()
-    """Stages that come before. To do one of them again undoes this one."""
-    with_certifiers: ClassVar[bool] = False
-    """Whether other controllers cross."""
+    calls: ClassVar[tuple[int, int]] = (1, 0)
+    """How often the controller that was searched crosses a set of terrains, and each certifier."""
 
-    @abstractmethod
-    def is_done(self, archive: Archive) -> bool:
-        """Whether the columns of an archive are filled."""
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses, before anything is crossed, what cannot be judged; ``before`` are the stages that come first."""
+        if archive.fresh is None and "fresh" not in before:
+            raise ValueError(f"stages must begin with fresh, got none: {judging.search.run} has no fresh episodes")
 
     @abstractmethod
     def run(self, archive: Archive, judging: Judging) -> Archive:
-        """The archive with the columns filled anew."""
-
-    def count_crossings(self, certifiers: Mapping[str, str]) -> int:
-        """How many times a controller crosses a set of terrains."""
-        return 1
-
-    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:  # noqa: B027 - most need none
-        """Refuses, before anything is crossed, what cannot be judged; ``before`` are the stages that come first."""
+        """The archive with the stage's columns filled anew."""
 
 
 def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
@@ -77,14 +65,6 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
 
 def count_outcomes(result: RolloutResult) -> NDArray[np.int64]:
     """Episodes of each terrain by :data:`qd.search.archive.OUTCOMES`, shape (num_terrains, 4)."""
-    goal, collided, invalid = (
-        flags.sum(axis=1) for flags in (result.reached_goal, result.base_collision, result.invalid)
-    )
+    flags = (result.reached_goal, result.base_collision, result.invalid)
+    goal, collided, invalid = (flag.sum(axis=1) for flag in flags)
     return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
-
-
-def put_rows(counts: NDArray[np.int64], rows: NDArray[np.int64], values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Counts with other values in some rows."""
-    counts = counts.copy()
-    counts[rows] = values
-    return counts

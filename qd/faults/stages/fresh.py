@@ -1,5 +1,6 @@
 """Fresh episodes on every elite: does the controller fail it, to which family does it belong, what stops the robot."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -20,9 +21,8 @@ class Fresh(Stage):
 
     name = "fresh"
 
-    def is_done(self, archive: Archive) -> bool:
-        """Whether there are fresh values."""
-        return archive.fresh is not None
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Any search can be judged."""
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with fresh values, families and causes, by descending corrected fitness."""

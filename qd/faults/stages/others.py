@@ -1,6 +1,5 @@
 """Other controllers: does one of them cross what the controller fails."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,26 +22,17 @@ class Others(Stage):
     """
 
     name = "others"
-    needs = ("fresh",)
-    with_certifiers = True
-
-    def is_done(self, archive: Archive) -> bool:
-        """Whether there are outcomes of any."""
-        return archive.is_judged
-
-    def count_crossings(self, certifiers: Mapping[str, str]) -> int:
-        """Two each."""
-        return 2 * len(certifiers)
+    calls = (0, 2)
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with outcomes of each certifier."""
         rows = np.flatnonzero(archive.failing)
         for name, policy in judging.certifiers.items():
-            outcomes = judging.cross(archive, rows, policy, stream=Stream.OTHERS, label=name)
+            outcomes = judging.cross(archive, rows, policy, "search", stream=Stream.OTHERS, label=name)
             crossed = goal_rates(outcomes) >= FAILING_GOAL_RATE
             resolved = np.zeros_like(outcomes)
             resolved[crossed] = judging.cross(
-                archive, rows[crossed], policy, engine="resolved", stream=Stream.OTHERS_RESOLVED,
+                archive, rows[crossed], policy, "resolved", stream=Stream.OTHERS_RESOLVED,
                 label=f"{name}, contact resolved",
             )  # fmt: skip
             archive = _add_outcomes(archive, name, policy, rows, outcomes, resolved)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from qd.faults.stages.base import Judging, Stage, put_rows
+from qd.faults.stages.base import Judging, Stage
 from qd.search.archive import Archive
 from qd.workers.seeds import Stream
 
@@ -13,16 +13,13 @@ class Resolved(Stage):
     """Crosses the failing elites in 20 episodes with contact resolved."""
 
     name = "resolved"
-    needs = ("fresh",)
-
-    def is_done(self, archive: Archive) -> bool:
-        """Whether anything was crossed so."""
-        return bool(archive.resolved_outcomes.any())
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with outcomes of the controller that was searched."""
         rows = np.flatnonzero(archive.failing)
-        outcomes = judging.cross(
-            archive, rows, judging.search.policy, engine="resolved", stream=Stream.RESOLVED, label="contact resolved"
+        policy = judging.search.policy
+        outcomes = archive.resolved_outcomes.copy()
+        outcomes[rows] = judging.cross(
+            archive, rows, policy, "resolved", stream=Stream.RESOLVED, label="contact resolved"
         )
-        return replace(archive, resolved_outcomes=put_rows(archive.resolved_outcomes, rows, outcomes))
+        return replace(archive, resolved_outcomes=outcomes)

@@ -1,6 +1,6 @@
 """Varied conditions: is a fault one under other loads, motors, delays, noise and friction, too."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.faults.numbers import EPISODES
-from qd.faults.stages.base import Judging, Stage, count_outcomes, elite_seeds, put_rows
+from qd.faults.stages.base import Judging, Stage, count_outcomes, elite_seeds
 from qd.search.archive import OUTCOMES, Archive
 from qd.workers.compute import Compute
 from qd.workers.pipeline import PipelineCfg, build_simulator
@@ -23,19 +23,13 @@ class Varied(Stage):
     """Crosses each fault under 20 draws of conditions, an episode each, by its controller and those that certify it."""
 
     name = "varied"
-    needs = ("fresh", "others")
-    with_certifiers = True
-
-    def is_done(self, archive: Archive) -> bool:
-        """Whether anything was crossed so."""
-        return archive.varied_outcomes is not None
-
-    def count_crossings(self, certifiers: Mapping[str, str]) -> int:
-        """One by the controller that was searched, one each by the others."""
-        return 1 + len(certifiers)
+    calls = (1, 1)
 
     def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
-        """Refuses a search that cannot have conditions, and faults whose certifier is not at hand."""
+        """Refuses a search without faults or that cannot have conditions, and certifiers that are not at hand."""
+        super().check(archive, judging, before)
+        if "others" not in before and ("fresh" in before or not archive.is_judged):
+            raise ValueError(f"stages must have others before varied: {judging.search.run} has no faults to cross")
         _check_certifiers(archive, judging, renewed="others" in before)
         if before:  # else the stage itself finds out at once
             search, compute = judging.search, judging.crosser.compute
@@ -59,17 +53,14 @@ class Varied(Stage):
             result = judging.crosser.cross(policy, terrains, replicas=1, label=label, invalid_ok=True)
             return count_outcomes(result).reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
 
-        searched = cross(search.policy, np.ones(len(rows), bool), "searched")
+        outcomes = np.zeros_like(archive.resolved_outcomes)
+        outcomes[rows] = cross(search.policy, np.ones(len(rows), bool), "searched")
         others = np.zeros_like(archive.certifier_outcomes)
         for column, name in enumerate(archive.certifiers):
             certified = archive.certificates[rows, column]
             if certified.any():
                 others[rows[certified], column] = cross(judging.certifiers[name], certified, name)
-        archive = replace(
-            archive,
-            varied_outcomes=put_rows(np.zeros_like(archive.resolved_outcomes), rows, searched),
-            certifier_varied_outcomes=others,
-        )
+        archive = replace(archive, varied_outcomes=outcomes, certifier_varied_outcomes=others)
         num_robust = archive.robust.sum()
         print(f"{num_robust} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
         return archive

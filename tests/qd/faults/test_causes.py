@@ -1,12 +1,26 @@
 """Shapes of parts of terrains as a robot meets them, from surfaces whose slopes are known."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from qd.faults.causes import find_effects, largest_height, measure_shape
+from qd.faults.causes import (
+    OFF_THE_WAY,
+    SHAPES,
+    describe_cause,
+    describe_commonest,
+    find_causes,
+    find_effects,
+    largest_height,
+    list_kinds,
+    measure_shape,
+)
 from sim.terrains.bank import heights_of
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import bump
 
 Y, X = np.meshgrid(SPACING * np.arange(NUM_ROWS), SPACING * np.arange(NUM_COLS), indexing="ij")
 HALF_WIDTH = 0.4
@@ -26,31 +40,52 @@ def test_a_ramp_by_hand():
     assert shape.slope_deg == shape.along_deg == pytest.approx(np.rad2deg(np.arctan(0.4)), abs=1e-3)
     assert shape.length_m == pytest.approx(5.5, abs=0.06)  # from half way up to half way down
     assert (shape.left_m, shape.right_m) == pytest.approx((4.05, 4.05))  # to beyond the edge of the grid
+    assert describe_cause(dataclasses.asdict(shape)) == "rise, 0.20 m high, 22 degrees steep"
 
 
-@pytest.mark.parametrize(
-    ("field", "kind"),
-    [
-        (plateau(6.0, 12.0, -0.2), "drop"),
-        (np.where(X < 12, -0.2 * np.clip((X - 4) / 4, 0, 1), 0).astype(np.float32), "rise"),  # down gently, up a wall
-        (plateau(7.0, 7.6, 0.2, run=0.2), "ridge"),
-        (plateau(7.0, 7.6, -0.2, run=0.2), "ditch"),
-        (plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.8), "ridge end"),
-        (plateau(7.0, 7.6, -0.2, run=0.05, y_to=4.1), "ditch end"),
-        (plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.7, y_to=4.3), "knob"),
-        (plateau(7.0, 7.6, -0.2, run=0.05, y_from=3.7, y_to=4.3), "hole"),
-        (plateau(6.0, 12.0, 0.2, turn=0.75), "oblique rise"),
-        (plateau(6.0, 12.0, -0.2, turn=-0.75), "oblique drop"),
-        (plateau(7.9, 12.0, 0.2, turn=1.4), "side slope"),
-        (plateau(7.7, 8.0, 0.2, run=0.1, turn=0.7), "oblique ridge"),
-        (plateau(6.0, 12.0, 0.2, y_from=6.0), "beside the way"),
-        (plateau(6.0, 12.0, 0.02), "beside the way"),
-        (plateau(5.0, 12.0, 0.2, run=3.0), "gentle hill"),
-        (plateau(5.0, 12.0, -0.2, run=3.0), "gentle hollow"),
-    ],
-)
-def test_kinds(field, kind):
-    assert measure_shape(field, HALF_WIDTH).kind == kind
+DIP_BEFORE_A_WALL = np.where(X < 12, -0.2 * np.clip((X - 4) / 4, 0, 1), 0).astype(np.float32)
+CASES = [
+    (plateau(6.0, 12.0, 0.2), "rise", "high"),
+    (plateau(6.0, 12.0, -0.2), "drop", "deep"),
+    (DIP_BEFORE_A_WALL, "rise", "high"),
+    (plateau(7.0, 7.6, 0.2, run=0.2), "ridge", "high"),
+    (plateau(7.0, 7.6, -0.2, run=0.2), "ditch", "deep"),
+    (plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.8), "ridge end", "high"),
+    (plateau(7.0, 7.6, -0.2, run=0.05, y_to=4.1), "ditch end", "deep"),
+    (plateau(7.0, 7.6, 0.2, run=0.05, y_from=3.7, y_to=4.3), "knob", "high"),
+    (plateau(7.0, 7.6, -0.2, run=0.05, y_from=3.7, y_to=4.3), "hole", "deep"),
+    (plateau(6.0, 12.0, 0.2, turn=0.75), "oblique rise", "high"),
+    (plateau(6.0, 12.0, -0.2, turn=-0.75), "oblique drop", "deep"),
+    (plateau(7.9, 12.0, 0.2, turn=1.4), "side slope", "high"),
+    (plateau(7.9, 12.0, -0.2, turn=1.4), "side slope", "deep"),
+    (plateau(7.7, 8.0, 0.2, run=0.1, turn=0.7), "oblique ridge", "high"),
+    (plateau(7.7, 8.0, -0.2, run=0.1, turn=0.7), "oblique ditch", "deep"),
+    (plateau(6.0, 12.0, 0.2, y_from=6.0), OFF_THE_WAY, None),
+    (plateau(6.0, 12.0, 0.02), OFF_THE_WAY, "high"),
+    (plateau(5.0, 12.0, 0.2, run=3.0), "gentle hill", "high"),
+    (plateau(5.0, 12.0, -0.2, run=3.0), "gentle hollow", "deep"),
+]
+
+
+@pytest.mark.parametrize(("field", "kind", "size"), CASES)
+def test_kinds_and_whether_they_are_high_or_deep(field, kind, size):
+    shape = measure_shape(field, HALF_WIDTH)
+    assert shape.kind == kind
+    size = f", {abs(shape.height_m):.2f} m {size}, {shape.slope_deg:.0f} degrees steep" if size else ""
+    assert describe_cause(dataclasses.asdict(shape)) == kind + size
+
+
+def test_every_kind_is_measured_described_and_documented():
+    assert {kind for _, kind, _ in CASES} == {*SHAPES}
+    page = (Path(__file__).parents[3] / "docs" / "faults.md").read_text()
+    for kind in list_kinds():
+        assert kind.removeprefix("oblique ") in page
+        commonest = describe_commonest(kind)
+        is_shape = kind in SHAPES and kind != OFF_THE_WAY
+        assert commonest.startswith(kind) and commonest.endswith(f"{'are' if is_shape else 'is'} the commonest cause")
+        if kind not in SHAPES:
+            assert describe_cause({"kind": kind, "height_m": 0.0, "slope_deg": 0.0}) == kind
+    assert describe_cause(None) == "unclear" and describe_commonest("ditch") == "ditches are the commonest cause"
 
 
 def test_the_angle_to_the_way_and_the_reach_to_either_side():
@@ -62,9 +97,17 @@ def test_the_angle_to_the_way_and_the_reach_to_either_side():
         assert (shape.left_m, shape.right_m) == pytest.approx(reach)
 
 
-def test_parts_are_told_from_the_rest():
+def test_effects_of_parts_add_up():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
     fields = find_effects(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
-    others = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
-    np.testing.assert_allclose(fields.sum(axis=0), others, atol=1e-6)
+    rest = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
+    np.testing.assert_allclose(fields.sum(axis=0), rest, atol=1e-6)
     assert largest_height(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
+
+
+@pytest.mark.parametrize(("half_width", "cause"), [(0.1, "unclear"), (0.6, "ridge end")])
+def test_causes_depend_on_the_width_of_the_robot(half_width, cause):
+    # It begins half a metre left of the way, where a narrow robot does not step.
+    beside = bump(x=8.0, y=4.9, sigma_x=0.5, sigma_y=0.5, height=0.25)
+    genes = np.concatenate([beside, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 7])[None]
+    assert find_causes(genes, np.array([[8.0, 4.0]]), SUPER_GAUSSIAN, half_width) == [cause]

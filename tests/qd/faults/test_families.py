@@ -4,23 +4,16 @@ import dataclasses
 
 import numpy as np
 
-from kernels.super_gaussian import LOWER, UPPER
 from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.search.archive import no_outcomes
 from sim.terrains.bank import heights_of
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import fresh_values, judged_archive, small_archive
+from tests.builders import bump, fresh_values, judged_archive, small_archive
 
 
 def ranked(archive, minima=None, **chosen):
     return rank(archive, SUPER_GAUSSIAN, minima, half_width=0.4, **chosen)
-
-
-def bump(*, x, sigma_x, height, y=4.0):
-    """Genes of a bump as broad as can be across the way."""
-    values = np.array([x, y, sigma_x, 3.0, 4.0, 4.0, 0.0, height])
-    return (2.0 * (values - LOWER) / (UPPER - LOWER) - 1.0).astype(np.float32)
 
 
 def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid():

@@ -15,6 +15,7 @@ from qd.faults.stages.fresh import fresh_values
 from qd.search.archive import read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
+from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
@@ -64,10 +65,11 @@ def test_seeds_follow_from_what_names_an_elite():
     archive = small_archive(4)
     seeds = elite_seeds(archive, 3, stream=5)
     assert np.array_equal(elite_seeds(archive.rows(np.array([2, 0])), 3, stream=5), seeds[[2, 0]])
-    others = [elite_seeds(archive, 4, stream=5), elite_seeds(archive, 3, 2, stream=6)]
-    assert len({*seeds.tolist(), *np.concatenate(others).tolist()}) == 16
+    different = [elite_seeds(archive, 4, stream=5), elite_seeds(archive, 3, 2, stream=6)]
+    assert len({*seeds.tolist(), *np.concatenate(different).tolist()}) == 16
     # Stored crossings and published numbers are of these.
-    assert elite_seeds(archive, 3, stream=1)[0] == np.random.SeedSequence([3, 1, 0], spawn_key=(1,)).generate_state(1)
+    first = np.random.SeedSequence([3, 1, 0], spawn_key=(1,))  # iteration 1, cell 0
+    assert elite_seeds(archive, 3, stream=Stream.FRESH)[0] == first.generate_state(1)
 
 
 def test_outcomes_are_counted_by_hand():
@@ -157,18 +159,26 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     assert (path / "archive.npz").read_bytes() == content
 
 
-def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
-    before, crossed = judged(path), {SHIPPED: [], OTHER["C-G"]: []}
-    rows = np.flatnonzero(before.is_fault)
-    fragile = before.genes[rows[0]]  # the controller crosses it under most conditions
+VARIED_SPACE = get_space("super_gaussian+payload+motors+delay+noise+grip")
+WEAK = str(ROBOTS["anymal"].panel / "S.pt")
+
+
+def vary(path, before, crossed):
+    """The archive after varied conditions, under which robots cross the first fault unless their motors are weak."""
+    fragile = before.genes[np.flatnonzero(before.is_fault)[0]]
 
     def rule(cfg, genes, seeds):
-        crossed[cfg.policy] += [*genes]
-        weak = space.condition_rows(genes)[:, condition_column("strength")] < 0.92
+        crossed.append((cfg, genes, seeds))
+        weak = VARIED_SPACE.condition_rows(genes)[:, condition_column("strength")] < 0.92
         return (weak | (genes[:, :64] != fragile).any(axis=1)) & (cfg.policy == SHIPPED)
 
-    space, robots = get_space("super_gaussian+payload+motors+delay+noise+grip"), Robots(rule)
-    archive = judged(path, robots, stages=("varied",))
+    return judged(path, Robots(rule), stages=("varied",))
+
+
+def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
+    before = judged(path)
+    rows = np.flatnonzero(before.is_fault)
+    archive = vary(path, before, [])
     assert archive.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
     assert 0 < archive.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
     assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
@@ -177,32 +187,48 @@ def test_a_fault_is_robust_if_it_is_one_under_varied_conditions_too(path):
     half = archive.varied_outcomes.copy()
     half[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
     assert not dataclasses.replace(archive, varied_outcomes=half).robust[rows[-1]]
-    # Both controllers cross the same: each fault under 20 conditions, each from a start of its own.
-    assert np.array_equal(*map(np.array, crossed.values())) and {cfg.space for cfg, _ in robots.crossed} == {space.name}
-    assert len(np.unique(crossed[SHIPPED], axis=0)) == len(set(robots.seeds)) == 20 * len(rows)
-    # Whoever certified is asked, and nobody else.
-    for wrong in ({}, {"C-G": str(ROBOTS["anymal"].panel / "S.pt")}):
-        with pytest.raises(ValueError, match="got none or another file for C-G"):
-            judged(path, Robots(result_of, stop_after=0), stages=("varied",), certifiers=wrong)
-    # With other certificates nobody knows any more.
-    weak = str(ROBOTS["anymal"].panel / "S.pt")
-    assert not judged(path, stages=("others",), certifiers={"C-G": weak}).robust.any()
+
+
+def test_all_controllers_cross_a_fault_under_the_same_20_conditions(path):
+    before, crossed = judged(path), []
+    vary(path, before, crossed)
+    by_policy = {SHIPPED: [], OTHER["C-G"]: []}
+    for cfg, genes, _ in crossed:
+        assert cfg.space == VARIED_SPACE.name
+        by_policy[cfg.policy] += [*genes]
+    assert np.array_equal(*map(np.array, by_policy.values()))
+    starts = np.concatenate([seeds for *_, seeds in crossed])
+    assert len(np.unique(by_policy[SHIPPED], axis=0)) == len({*starts.tolist()}) == 20 * before.is_fault.sum()
+
+
+def test_only_the_certifiers_of_faults_can_cross_them_under_varied_conditions(path):
+    vary(path, judged(path), [])
+    nobody = Robots(result_of, stop_after=0)
+    for stages in (("varied",), ("others", "varied")):
+        with pytest.raises(ValueError, match=r"certifiers .*C-G"):
+            judged(path, nobody, stages=stages, certifiers={})
+    with pytest.raises(ValueError, match=r"certifiers .*C-G"):
+        judged(path, nobody, stages=("varied",), certifiers={"C-G": WEAK})
+    # Another controller of the name has other certificates, so nobody knows any more which faults are robust.
+    assert not judged(path, stages=("others",), certifiers={"C-G": WEAK}).robust.any()
     assert not {"robust", "crossed_varied"} & numbers_in(path).keys()
 
 
 def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):
     monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
-    nobody = Robots(result_of, stop_after=0)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
-        judged(path, nobody, stages=("fresh", "resolved", "others", "varied"))
-    for stages in (("varied",), ("others", "fresh", "varied"), ("fresh", "soon")):
-        with pytest.raises(ValueError, match="stages"):
-            judged(path, nobody, stages=stages)
+        judged(path, Robots(result_of, stop_after=0), stages=("fresh", "resolved", "others", "varied"))
+
+
+@pytest.mark.parametrize("stages", [("varied",), ("fresh", "varied"), ("resolved", "soon")])
+def test_stages_that_lack_what_they_need_are_refused_before_anything_is_crossed(path, stages):
+    with pytest.raises(ValueError, match="stages"):
+        judged(path, Robots(result_of, stop_after=0), stages=stages)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
     first = judged(path)
-    copy, weak = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt"), str(ROBOTS["anymal"].panel / "S.pt")
+    copy = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt")
     both = judged(path, stages=("others",), certifiers={"specialist": str(copy)})
     assert both.certifiers == ("C-G", "specialist")
     for column in (0, 1):
@@ -216,9 +242,9 @@ def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_re
         path / "archive.npz",
         dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=goal_rate)),
     )
-    last = judged(path, stages=("others",), certifiers={"specialist": weak})
+    last = judged(path, stages=("others",), certifiers={"specialist": WEAK})
     assert last.certifiers == ("C-G", "specialist")
-    assert last.certifier_sha256[1] == controller_hash(weak)
+    assert last.certifier_sha256[1] == controller_hash(WEAK)
     assert not last.certificates[:, 1].any() and last.certificates[:, 0].any()
     rows = np.flatnonzero(last.certifier_outcomes[:, 1].any(axis=1))
     assert rows.tolist() == np.flatnonzero(archive.failing)[:1].tolist()
