@@ -163,8 +163,8 @@ class JudgeCommand(_RunFlags):
     same command goes on after Ctrl-C.
     """
 
-    stages: tuple[Literal["fresh", "resolved", "others", "varied"], ...] = ("fresh", "resolved", "others")
-    """What to do, in this order."""
+    stages: tuple[str, ...] = ("fresh", "resolved", "others")
+    """Some of fresh, resolved, others, varied, in the order in which to do them."""
 
     def execute(self) -> None:
         """Judges the run."""
