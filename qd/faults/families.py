@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from kernels.episode import Outcome
 from qd.faults.causes import UNCLEAR, describe_commonest, find_causes
 from qd.faults.minimise.results import MinimalTerrains
-from qd.faults.numbers import count_faults
+from qd.faults.numbers import TEMPLATES, count_faults
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
@@ -255,22 +255,9 @@ def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDA
 def summarise(ranking: Ranking, archive: Archive) -> str:
     """What a search says of the controller, in one plain sentence."""
     failing = int(ranking.failing.sum())
-    if len(ranking) == 1:
-        phrases = ["The only terrain stops the robot" if failing else "The robot crosses the only terrain"]
-    elif not failing:
-        phrases = [f"The robot crosses all {len(ranking):,} terrains"]
-    else:
-        phrases = [f"{failing:,} of {len(ranking):,} terrains {'stops' if failing == 1 else 'stop'} the robot"]
     commonest = next(iter(ranking.by_cause()), UNCLEAR)
-    if commonest != UNCLEAR:
-        phrases.append(describe_commonest(commonest) if failing > 1 else f"cause: {commonest}")
-    if failing and archive.certifiers:
-        faults = count_faults(archive)
-        crosses = "another controller of this robot crosses"
-        if faults is None:
-            phrases.append(f"{crosses} {archive.certified.sum() or 'none'} of them")
-        elif faults == 0:
-            phrases.append("none is known to be a fault")
-        else:
-            phrases.append(f"1 is a fault: {crosses} it" if faults == 1 else f"{faults:,} are faults: {crosses} them")
-    return "; ".join(phrases)
+    cause = describe_commonest(commonest) if failing > 1 else f"cause: {commonest}"
+    return TEMPLATES.get_template("summary.txt").render(
+        count=len(ranking), failing=failing, cause="" if commonest == UNCLEAR else cause,
+        asked=failing and archive.certifiers, faults=count_faults(archive), certified=archive.certified.sum(),
+    )  # fmt: skip

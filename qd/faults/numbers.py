@@ -8,6 +8,7 @@ certificate is not known to be passable. A fault is robust if it is one under va
 
 from collections.abc import Container, Mapping, Sequence
 from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
 from sim.files.intervals import bootstrap_interval, format_rate, wilson_interval
+from sim.files.templates import open_templates
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
@@ -24,6 +26,8 @@ EPISODES = 20
 SPECIALIST = "specialist"
 """Name of the certifier that was trained for one search, on its failing elites; all others form the panel."""
 
+TEMPLATES = open_templates(Path(__file__).parent / "templates")
+"""Texts about elites."""
 _INVALID = OUTCOMES.index("invalid")
 VARIED_NUMBERS = ("crossed_varied", "robust")
 """Numbers of :func:`fault_numbers` that an archive has only if it was judged under varied conditions."""
@@ -145,22 +149,15 @@ def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
 
 def describe_elite(archive: Archive, number: int) -> list[str]:
     """What is known of an elite, in sentences; none where nobody crossed it under other conditions."""
-    rates = further_rates(archive, number)
-    sentences = [f"{label}: {format_rate(*rate)} reach the goal." for label, rate in rates.items()]
-    if not sentences:
+    rates = {label: format_rate(*rate) for label, rate in further_rates(archive, number).items()}
+    if not rates:
         return []
-    crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
-    if not archive.failing[number]:
-        sentences.append("It does not fail by its fresh episodes.")
-    elif crossers:
-        robust = "a robust" if archive.robust[number] else "a"
-        kind = f"{robust} fault" if archive.confirmed[number] else "certified but not confirmed"
-        crosses = f"{' and '.join(crossers)} cross{'es' * (len(crossers) == 1)}"
-        sentences.append(f"It is {kind}: a terrain that {crosses} and this controller does not.")
-    else:
-        confirmed = "" if archive.confirmed[number] else "not "
-        sentences.append(f"It is {confirmed}confirmed, and not known to be passable.")
-    return sentences
+    text = TEMPLATES.get_template("elite.txt").render(
+        rates=rates, failing=archive.failing[number], confirmed=archive.confirmed[number],
+        robust=archive.robust[number],
+        crossers=[*compress(archive.certifiers, archive.certificates[number].tolist())],
+    )  # fmt: skip
+    return text.splitlines()
 
 
 def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.faults.numbers import TEMPLATES
 from qd.search.archive import Archive
 from sim.files.atomic import read_json
 from sim.files.command import choose_elites
@@ -40,12 +41,7 @@ class MinimalTerrains:
         """What is known of the minimal terrain of an elite, in a sentence."""
         entry = self.entry(number)
         rate = format_value(entry["goal_rate"], entry["goal_interval"], ".0%")
-        phrases = [f"{len(entry['bumps'])} of {entry['of']} parts", f"goal reached {rate} when they were found"]
-        if entry["cause"]:
-            phrases.append(f"cause: {entry['cause']['kind']}")
-        if entry["margin_m"] is not None:
-            phrases.append(f"margin {100 * entry['margin_m']:.1f} cm")
-        return "; ".join(phrases)
+        return TEMPLATES.get_template("minimal.txt").render(entry=entry, rate=rate)
 
 
 def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
