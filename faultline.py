@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from qd.workers.compute import Compute as Compute
     from qd.workers.crosser import cross as cross
     from sim.robots.find import get_robot as get_robot
+    from sim.terrains.terrains import Terrains as Terrains
     from train.cfg import FinetuneCfg as FinetuneCfg
     from train.finetune import finetune as finetune
 

@@ -17,18 +17,18 @@ _PROBE = ".write-test"
 
 @contextlib.contextmanager
 def explain_failed_write(path: Path) -> Iterator[None]:
-    """Has an OSError of writing a file say which file it is and what helps."""
+    """Adds the file and a remedy to an OSError of writing it."""
     try:
         yield
     except OSError as error:
         raise OSError(
-            f"{path} cannot be written: {error.strerror or error}: make room there or give another place; what was "
-            "saved before is whole"
+            f"{path} cannot be written: {error.strerror or error}: make room there or give another place; the file "
+            "of before is whole"
         ) from error
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replaces a file in one step that survives a kill and a power cut; after an OSError the old file is whole."""
+    """Replaces a file in one step that survives a kill and a power cut; an OSError leaves the old file whole."""
     temporary = path.with_name(f".{path.name}{_TEMPORARY}")  # the next write overwrites what a kill leaves behind
     with explain_failed_write(path):
         try:
@@ -49,12 +49,12 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a file is what a killed write leaves behind, to be overwritten by the next one."""
+    """Whether a killed write left this file, which the next write replaces."""
     return path.name == _PROBE or (path.name.startswith(".") and path.name.endswith(_TEMPORARY))
 
 
 def check_writable(folder: Path) -> None:
-    """Raises a ValueError, before long work, if files cannot be made in the folder that its result goes to."""
+    """Raises a ValueError if files cannot be made in a folder: to be called before long work."""
     probe = folder / _PROBE
     try:
         probe.touch()
@@ -64,7 +64,7 @@ def check_writable(folder: Path) -> None:
 
 
 def prepare_output(file: Path) -> None:
-    """Makes the folder of a file; raises a ValueError, before long work, if the file cannot be written."""
+    """Makes the folder of a file; raises a ValueError if it cannot be written: to be called before long work."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -90,9 +90,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_zip(path: Path) -> None:
-    """Compares the parts of a file that torch or NumPy wrote as a zip with their checksums, or raises a ValueError.
+    """Raises a ValueError if a member of a zip, as torch and NumPy write it, does not have its checksum.
 
-    Torch never looks at them when it loads: a flipped bit would be another weight. Other files pass.
+    Torch does not compare them when it loads, so a flipped bit would be another weight. Other files pass.
     """
     if not zipfile.is_zipfile(path):
         return
@@ -102,12 +102,12 @@ def check_zip(path: Path) -> None:
     except Exception as error:  # zipfile and zlib answer damage with a dozen types
         raise ValueError(f"{type(error).__name__}: {error}") from None
     if damaged is not None:
-        raise ValueError(f"its part '{damaged}' does not have its checksum")
+        raise ValueError(f"its member '{damaged}' does not have its checksum")
 
 
 @contextlib.contextmanager
 def locked(folder: Path, busy: str = "") -> Iterator[None]:
-    """Keeps other processes out of a folder; where one is in, raises a ValueError that says ``busy``, or waits."""
+    """Locks a folder; if another process has it, raises a ValueError with the text ``busy``, or waits without one."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))

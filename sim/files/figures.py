@@ -17,19 +17,20 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def as_image(figure: Figure) -> Image.Image:
-    """A figure drawn as fine as print needs; names in it are shown as they are, whatever signs they hold."""
+    """A figure in the resolution of print; texts in it are shown as they are, not as formulas."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
-        text.set_parse_math(False)  # a file may be called $x$.npz, or something that is no formula
-        text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or hold bytes that are no text
+        text.set_parse_math(False)  # a file may be called $x$.npz
+        text.set_text(text.get_text().encode(errors="backslashreplace").decode())  # or have bytes
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=_DPI, pil_kwargs={"compress_level": 1})
     return Image.open(content).convert("RGB")
 
 
 def as_png(figure: Figure) -> bytes:
-    """A figure as PNG, with 256 colours, a quarter of the size, where 256 are enough: not for a coloured map."""
-    image, content = as_image(figure), io.BytesIO()
+    """A figure as PNG. Unless it has a coloured map, 256 colours suffice, which take a quarter of the size."""
+    image = as_image(figure)
+    content = io.BytesIO()
     if not figure.findobj(AxesImage) or image.getcolors(_SHADES) is not None:
         image = image.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
     image.save(content, "PNG", optimize=True, dpi=(_DPI, _DPI))

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-RATES, DIFFERENCES = (0.0, 1.0), (-1.0, 1.0)
-"""Bounds of rates, and of differences of rates."""
+RATES = (0.0, 1.0)
+"""Bounds of rates."""
+DIFFERENCES = (-1.0, 1.0)
+"""Bounds of differences of rates."""
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
 _BOOTSTRAP_DRAWS = 10_000
-_FEW = 10  # families that differ from the others: from so many on, resampling says how far they may
+_MIN_DIFFERING = 10  # with so many families that differ from the others, resampling shows how far the mean may lie
 
 
 def wilson_interval(hits: float, count: int) -> tuple[float, float]:
@@ -24,7 +26,8 @@ def wilson_interval(hits: float, count: int) -> tuple[float, float]:
         raise ValueError(f"a rate needs 0 <= hits <= count, got {hits} of {count}")
     if count == 0:
         return 0.0, 1.0
-    rate, spread = hits / count, _Z * _Z / count
+    rate = hits / count
+    spread = _Z * _Z / count
     centre = (rate + spread / 2) / (1 + spread)
     half = _Z * math.sqrt(rate * (1 - rate) / count + spread / (4 * count)) / (1 + spread)
     # At 0 and 1 the interval begins and ends there exactly, whatever the rounding.
@@ -32,7 +35,7 @@ def wilson_interval(hits: float, count: int) -> tuple[float, float]:
 
 
 def t_interval(values: NDArray[np.floating]) -> list[float] | None:
-    """Interval of the mean of a few independent measurements (Student 1908), one a training or search; None of one."""
+    """Interval of the mean of a few independent measurements (Student 1908); None for a single one."""
     count = len(values)
     if count < 2:
         return None
@@ -61,9 +64,9 @@ def bootstrap_interval(
     Terrains of one family, by their numbers (num_terrains,), are not independent: they are drawn together. The fewer
     families, the farther out are the quantiles (the expanded percentile interval of Hesterberg 2015).
 
-    Where nearly all values are alike, as rates of 1 are, resamples are too: what is rare may not be among the terrains.
-    With ``bounds``, :data:`RATES` or :data:`DIFFERENCES`, the interval then reaches as far as Wilson's of so many
-    families; of a difference the ends are put together as by Newcombe (1998, method 10).
+    If nearly all values are equal, such as rates of 1, the terrains may lack rare values, and so do the resamples. With
+    ``bounds``, :data:`RATES` or :data:`DIFFERENCES`, the interval is then at least as wide as Wilson's for so many
+    families; for differences its ends are combined after Newcombe (1998, method 10).
     """
     family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
     count = int(family.max(initial=-1)) + 1
@@ -74,27 +77,26 @@ def bootstrap_interval(
     tail = ndtr(-stdtrit(count - 1, 0.975) * math.sqrt(count / (count - 1)))
     low, high = np.quantile(means, [tail, 1.0 - tail])
     if bounds is not None:
-        least, most = _where_few_differ(values, family, count, bounds)
-        low, high = min(low, least), max(high, most)
+        widest = _bound_rare(values, family, count, bounds)
+        low = min(low, widest[0])
+        high = max(high, widest[1])
     return [float(low), float(high)]
 
 
-def _where_few_differ(
+def _bound_rare(
     values: NDArray[np.floating], family: NDArray[np.int64], count: int, bounds: tuple[float, float]
 ) -> tuple[float, float]:
-    """How far the mean may lie where few of ``count`` families differ from 0, or 1; the mean itself where many do."""
+    """How far the mean may lie if few of ``count`` families differ from 0, or 1; the mean itself if many do."""
     mean = float(values.mean())
     apart = values - (1.0 if bounds == RATES and mean > 0.5 else 0.0)
-    if len(np.unique(family[apart != 0.0])) >= _FEW:
+    if len(np.unique(family[apart != 0.0])) >= _MIN_DIFFERING:
         return mean, mean
     if bounds == RATES:
         return wilson_interval(mean * count, count)
     more, less = (float(np.maximum(side, 0.0).mean()) for side in (values, -values))
     (more_low, more_high), (less_low, less_high) = (wilson_interval(share * count, count) for share in (more, less))
-    low, high = (
-        mean - math.hypot(more - more_low, less_high - less),
-        mean + math.hypot(more_high - more, less - less_low),
-    )
+    low = mean - math.hypot(more - more_low, less_high - less)
+    high = mean + math.hypot(more_high - more, less - less_low)
     return max(low, bounds[0]), min(high, bounds[1])
 
 
@@ -112,5 +114,5 @@ def format_rate(hits: int, count: int, *, short: bool = False) -> str:
     """A rate with its Wilson interval: ``3 of 4 (75%, 30 to 95%)``, in short ``75% (30 to 95%)``."""
     if not count:
         return "no valid episode"
-    words = format_value(hits / count, wilson_interval(hits, count), ".0%")
-    return words if short else f"{hits} of {count} ({words.replace(' (', ', ')}"
+    rate = format_value(hits / count, wilson_interval(hits, count), ".0%")
+    return rate if short else f"{hits} of {count} ({rate.replace(' (', ', ')}"

@@ -23,22 +23,22 @@ def read_arrays(
 ) -> dict[str, NDArray[Any]]:
     """All arrays of an npz file, or some by name; any Exception if it is damaged, another file, or lacks one.
 
-    None may have more than ``max_bytes``: a packed file of zeros is small at any size.
+    An array of more than ``max_bytes`` is refused, since a packed file of zeros is small at any size.
     """
     with zipfile.ZipFile(path) as members:
-        stored = [name.removesuffix(_ENDING) for name in members.namelist()]
-        names = stored if names is None else names
-        if missing := set(names) - set(stored):
+        available = [name.removesuffix(_ENDING) for name in members.namelist()]
+        names = available if names is None else names
+        if missing := set(names) - set(available):
             raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         large = {name: size for name in names if (size := members.getinfo(name + _ENDING).file_size) > max_bytes}
         if large:
             raise ValueError(f"{', '.join(large)} of {max(large.values()):,} bytes, at most {max_bytes:,} are read")
         data = {name: members.read(name + _ENDING) for name in names}  # np.load would leave some checksums unread
-    return {name: np.lib.format.read_array(io.BytesIO(part), allow_pickle=False) for name, part in data.items()}
+    return {name: np.lib.format.read_array(io.BytesIO(member), allow_pickle=False) for name, member in data.items()}
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequence[int | str]]) -> None:
-    """Raises ValueError for an array, if present, whose shape does not fit; a text stands for one size everywhere."""
+    """Raises a ValueError if the shape of an array does not fit; a text in a shape stands for one size everywhere."""
     sizes: dict[int | str, int] = {}
     for name, shape in shapes.items():
         if name not in arrays:

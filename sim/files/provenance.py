@@ -27,15 +27,17 @@ _SOURCES = (".py", ".cu", ".xml")
 def provenance(device: str, seed: int) -> dict[str, Any]:
     """Command, commit, hash of the sources, device, versions, seed and date of the running program.
 
-    ``dirty`` says whether sources or scripts differ from the commit. Where there is no git, FAULTLINE_COMMIT names the
-    commit, with -dirty behind it if they do.
+    ``dirty`` says whether sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT names
+    the commit where there is no git, and ends in -dirty if they differ.
     """
-    given = os.environ.get("FAULTLINE_COMMIT", "")
-    commit, dirty = given.removesuffix("-dirty") or None, given.endswith("-dirty")
+    variable = os.environ.get("FAULTLINE_COMMIT", "")
+    commit = variable.removesuffix("-dirty") or None
+    dirty: bool | None = variable.endswith("-dirty")
     if commit is None:
-        places = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack/*"]
-        changed = _output(["git", "status", "--porcelain", "--untracked-files=no", "--", *places])
-        commit, dirty = _output(["git", "rev-parse", "HEAD"]), None if changed is None else changed != ""
+        folders = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack/*"]
+        changes = _run(["git", "status", "--porcelain", "--untracked-files=no", "--", *folders])
+        commit = _run(["git", "rev-parse", "HEAD"])
+        dirty = None if changes is None else changes != ""
     return {
         "command": _command(),
         "commit": commit,
@@ -65,26 +67,25 @@ def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
 
 
 def code_fingerprint(rooms: Sequence[str]) -> str:
-    """SHA-256 of the sources of rooms and of all package versions: equal ones compute the same."""
+    """SHA-256 of the sources of rooms and of all package versions; equal ones compute the same."""
     return hashlib.sha256(json.dumps([sources_sha256(rooms), versions()], sort_keys=True).encode()).hexdigest()
 
 
 def _command() -> str:
-    """The running command as a user types it; a path outside the working folder is cut to its name."""
+    """The running command as a user types it, by :func:`without_machine`."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
     program = ["faultline"] if module == "faultline" else ["python", "-m", module]
     return shlex.join([*program, *map(without_machine, sys.argv[1:])])
 
 
-def without_machine(word: str) -> str:
-    """A word of a command line, or a path, without where on this machine it lies: an absolute path's last name."""
-    here = f"{Path.cwd()}{os.sep}"
-    return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", word.replace(here, ""))
+def without_machine(argument: str) -> str:
+    """An argument with paths relative to the working folder, and with the last name alone of paths outside it."""
+    return re.sub(r"(?<![\w.~-])/(?:[^/=:\s]+/)+(?=[^/])", "", argument.replace(f"{Path.cwd()}{os.sep}", ""))
 
 
 def device_name(device: str) -> str:
-    """What a Warp device is, in words; its own name where this machine cannot tell."""
+    """The name of a Warp device's hardware; the device itself if this machine does not have it."""
     if not device.startswith("cuda"):
         return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
     import torch  # takes seconds to load, and is loaded wherever a GPU works
@@ -92,10 +93,9 @@ def device_name(device: str) -> str:
     return torch.cuda.get_device_name(device) if torch.cuda.is_available() else device
 
 
-def _output(command: Sequence[str | Path]) -> str | None:
-    """What a program prints, run in the checkout; None where it is missing or fails."""
+def _run(command: Sequence[str | Path]) -> str | None:
+    """Output of a program that runs in the checkout; None if it is missing or fails."""
     try:
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=True)
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip()
