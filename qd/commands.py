@@ -93,8 +93,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         from qd.faults.judge import judge
         from qd.faults.searches import find_search
         from qd.search.directory import free_path
-        from qd.search.loop import say_what_stops_the_robot, search
+        from qd.search.loop import search
         from qd.search.settings import preset
+        from qd.search.summary import print_summary
         from sim.terrains.spaces.registry import at_height, load_space, space_at
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
@@ -123,7 +124,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         if cfg.preset != "small":
             archive = judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
-        say_what_stops_the_robot(path, archive, robot=self.robot, policy=self.policy, space=self.space)
+        print_summary(path, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +170,11 @@ class JudgeCommand(_RunFlags):
     def execute(self) -> None:
         """Judges the run."""
         from qd.faults.judge import judge
-        from qd.search.loop import say_what_stops_the_robot
+        from qd.search.summary import print_summary
 
         run, named = self.named()
         archive = judge(run, stages=self.stages, **named)
-        say_what_stops_the_robot(run, archive, robot=self.robot, policy=self.policy, space=self.space)
+        print_summary(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from qd.search import loop as searching
+from qd.search import results
 from qd.search.archive import Archive
 from qd.search.fitness import FitnessCfg
 from qd.search.loop import search
@@ -45,7 +45,7 @@ def run(path: Path, *, opener=open_stand_in, until=None, **changes) -> Archive:
 
 def without_figures(patch: pytest.MonkeyPatch) -> None:
     """Figures take longer to draw than a search over the stand-in takes."""
-    for module in (figures, searching):
+    for module in (figures, results):
         patch.setattr(module, "write_figures", lambda folder, archive, metrics: [])
 
 

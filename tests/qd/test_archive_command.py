@@ -15,8 +15,8 @@ from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
 from qd.search import settings
 from qd.search.archive import read_archive
-from qd.search.loop import say_what_stops_the_robot
 from qd.search.methods.registry import METHODS
+from qd.search.summary import print_summary
 from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
@@ -163,7 +163,7 @@ def test_a_controller_may_move_but_not_change(capsys):
     assert archive("--resume", "a", *MORE, "3") == 0
 
 
-def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(capsys):
+def test_the_last_lines_print_summary_and_which_commands_come_next(capsys):
     fine = f"{__name__}:fine_policy"
     assert archive(*TINY, "--policy", fine, "--run-dir", "a b") == 0
     *_, summary, worst, following, judging = capsys.readouterr().out.splitlines()
@@ -179,7 +179,7 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
         f"faultline replay {run} --elite {number} --policy {fine}"
     )
     assert judging.startswith(f"faultline judge {run} --policy {fine} ")
-    say_what_stops_the_robot(Path("a b"), replace(found, fresh=fresh_values(found)), policy=fine)
+    print_summary(Path("a b"), replace(found, fresh=fresh_values(found)), policy=fine)
     assert f"faultline finetune --specialist 'a b' --policy {fine} trains" in capsys.readouterr().out
 
 

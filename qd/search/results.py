@@ -1,0 +1,106 @@
+"""What a search leaves: rows of metrics, the archive, numbers and figures."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from qd.faults.numbers import fault_numbers, found_numbers
+from qd.search.archive import Archive, no_outcomes, read_archive
+from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory
+from qd.search.fitness import Evaluation, join_evaluations
+from qd.search.pool import chance_to_stay
+from qd.search.progress import clock
+from qd.search.scheduler import Scheduler
+from qd.search.settings import SearchCfg
+from qd.show.figures import write_figures
+from qd.workers.invalid import invalid_iterations, invalid_reasons
+from qd.workers.shards import join_results
+from sim.files.atomic import to_json, write_atomically
+from sim.files.command import say
+from sim.rollout import RolloutResult
+
+_SETTINGS = (
+    "robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
+    "collision_bit",
+)  # fmt: skip
+_FRESH_NUMBERS = (
+    "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
+    "corrected_elites", "mean_fitness_corrected", "mean_std", "mean_std_interval",
+)  # fmt: skip
+
+
+def build_archive(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
+    """What a search has found after a number of iterations."""
+    elites: dict[str, Any] = scheduler.elites()
+    return Archive(
+        **{name: getattr(cfg, name) for name in _SETTINGS},
+        penalties=cfg.fitness.penalties,
+        scales=cfg.fitness.scales,
+        iterations=iterations,
+        **elites,
+        **no_outcomes(len(elites["cell"])),
+    )
+
+
+def describe_metrics(
+    archive: Archive, results: Sequence[RolloutResult], evaluations: Sequence[Evaluation]
+) -> dict[str, Any]:
+    """The metrics of the archive's last iteration without the search's times, by what its groups crossed."""
+    result, evaluation = join_results(results, join=1), join_evaluations(evaluations)
+    return {
+        "iteration": archive.iterations,
+        "elites": len(archive),
+        **{name: getattr(archive, name) for name in ("reachable_coverage", "qd_score", "mean_fitness")},
+        "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
+        "episodes": int(evaluation.episodes.sum()),
+        "invalid_episodes": int(evaluation.invalid_episodes.sum()),
+        "invalid_terrains": int((~evaluation.valid).sum()),
+        **{
+            f"batch_{name}": float(getattr(evaluation, name).mean())
+            for name in ("fitness", "collision_rate", "goal_rate")
+        },
+        "invalid_reasons": invalid_reasons(result),
+        "physics_steps": int(result.physics_steps),
+        "robot_steps": int(result.robot_steps),
+        "idle_share": result.idle_share,
+        "rollout_s": float(result.wall_s),
+        "mean_duration_s": float(result.duration_s.mean()),
+    }
+
+
+def read_written(run: RunDirectory, archive: Archive) -> Archive | None:
+    """The archive of a run's file if it has the same elites, judged or not, and its numbers lie beside it."""
+    try:
+        stored = read_archive(run.path)
+    except (OSError, ValueError):
+        return None  # it is made again
+    is_whole = stored.has_same_elites(archive) and run.read_summary().get("iterations") == archive.iterations
+    return stored if is_whole else None
+
+
+def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
+    """Writes archive, figures and numbers of a search, and prints what it found."""
+    config = run.read_config()
+    origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+    run.write_derived(metrics, archive)
+    figures = write_figures(run.path, archive, metrics)
+    numbers = {
+        **origin,
+        **archive.named(),
+        "space": archive.space,
+        "space_sha256": archive.space_sha256,
+        **found_numbers(archive, metrics),
+        **dict.fromkeys(_FRESH_NUMBERS),
+        **fault_numbers(archive),
+        "gpus": 0 if origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
+    }
+    write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
+    say(
+        f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
+        f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
+        f"in {clock(numbers['wall_s'])}"
+    )
+    if (share := metrics[-1]["last_tenth"]) is not None:
+        print(f"Its last tenth brought {share:.0%} of the elites that can be expected to stay.")
+    print(f"Figures: {', '.join(map(str, figures))}")
+    if invalid := invalid_iterations(metrics):
+        print(f"Warning: {invalid}")
