@@ -12,7 +12,7 @@ from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
 from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elites
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.faults.searches import CERTIFIERS_FOLDER
-from qd.search.directory import RunDirectory, directory_of, find_run
+from qd.search.directory import RunDirectory, find_directory, find_run
 from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_actor
 from sim.controllers.spec import SHIPPED, controller_hash
@@ -142,7 +142,7 @@ def select_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
             if archive.fresh is None:
                 named_robot = robot.spec if archive.robot == robot.name and robot.settings_file else None
                 space = archive.space if archive.space_sha256 else None
-                judge = command_line("judge", robot=named_robot, run=directory_of(path), space=space)
+                judge = command_line("judge", robot=named_robot, run=find_directory(path), space=space)
                 raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: run `{judge}`")
             rows = rows[archive.failing[rows]]
         is_free = [elite not in held_out for elite in hash_elites(archive.genes[rows])]

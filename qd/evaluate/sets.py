@@ -21,7 +21,7 @@ from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.evaluate.marks import hash_elites
 from qd.faults.families import find_families, rms_distances
 from qd.search.archive import Archive
-from qd.search.directory import read_archive_of, search_seed
+from qd.search.directory import read_robot_archive, search_seed
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.robots.training import PaperCfg
@@ -146,7 +146,7 @@ def elites_sha256(archive: Archive) -> str:
 
 def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archive:
     """The archive of a search against a robot."""
-    archive = read_archive_of(robot, path, space)
+    archive = read_robot_archive(robot, path, space)
     if archive.robot != robot.name:
         raise ValueError(f"archive {path} must be of robot {robot.name}, got {archive.robot}: give one of that robot")
     return archive

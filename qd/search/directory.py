@@ -57,7 +57,7 @@ def find_run(
     folder = results_folder() / robot.name / "archive"
     runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
     files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
-    newest = next((file.parent for file in files if _robot_of(file) == robot.name), None)
+    newest = next((file.parent for file in files if _read_robot(file) == robot.name), None)
     if newest is not None:
         runs.insert(len(runs) if published == "first" else 0, newest)
     if not runs:
@@ -74,7 +74,7 @@ def _is_published(path: Path) -> bool:
     return results_folder().resolve() in path.resolve().parents
 
 
-def _robot_of(file: Path) -> str | None:
+def _read_robot(file: Path) -> str | None:
     """Robot of an archive; None, with a line, of one that cannot be read."""
     try:
         return read_archive(file).robot
@@ -83,18 +83,18 @@ def _robot_of(file: Path) -> str | None:
         return None
 
 
-def directory_of(run: Path) -> Path:
+def find_directory(run: Path) -> Path:
     """The directory of a run that is given as such or as its archive file."""
     return run if run.is_dir() else run.parent
 
 
 def search_seed(run: Path) -> int | None:
     """Seed of the search that left an archive; None where no config lies beside it."""
-    folder = RunDirectory(directory_of(run))
+    folder = RunDirectory(find_directory(run))
     return folder.read_cfg().seed if folder.exists() else None
 
 
-def read_archive_of(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
+def read_robot_archive(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
     """An archive whose terrains a robot can cross; one of the robot's own must be of the robot as it is now.
 
     ``space`` is the terrain space that the command line names, for one of a user's own.
@@ -127,12 +127,12 @@ def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
         )
 
 
-def folder_for(run: Path, robot: str) -> Path:
+def find_output_folder(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
 
     That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
     """
-    folder = directory_of(run)
+    folder = find_directory(run)
     if not _is_published(folder):
         return folder
     name = folder.resolve().name

@@ -14,7 +14,7 @@ from sim.rates import MAX_INVALID_SHARE, typical_outcome
 from sim.rollout import RolloutResult
 
 FITNESS_FLOOR = -20.0
-"""Fitness an invalid terrain is told with; an elite's is above it, so that every elite adds to the QD score."""
+"""Fitness of an invalid terrain; an elite's is above it, so that every elite adds to the QD score."""
 BIT_EPISODES = 20
 """Episodes over which the collision bit is "any collision", as in the paper; more episodes would bias it."""
 USUAL_SPREAD = 0.4
@@ -51,7 +51,7 @@ class FitnessCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What a search knows of T evaluated terrains; statistics are over valid episodes, penalties are scaled."""
+    """Evaluations of T terrains; statistics are over valid episodes, penalties are scaled."""
 
     fitness: NDArray[np.float64]
     """Shape (T,)."""
@@ -87,14 +87,14 @@ class Evaluation:
 
         One episode of the usual spread is added.
         """
-        few = (USUAL_SPREAD * self.penalty_mean) ** 2 / np.maximum(self.counted, 1)[:, None]
-        return np.sqrt(self.penalty_std**2 + few)
+        added = (USUAL_SPREAD * self.penalty_mean) ** 2 / np.maximum(self.counted, 1)[:, None]
+        return np.sqrt(self.penalty_std**2 + added)
 
     @property
     def collides(self) -> NDArray[np.bool_]:
         """The collision bit, shape (T,): whether 20 episodes sooner have a base collision than not.
 
-        Of up to 29 episodes that were crossed, it is whether any has one.
+        With up to 29 episodes, it says whether any of them has one.
         """
         return self.collision_rate > 1.0 - 0.5 ** (1.0 / BIT_EPISODES)
 
@@ -107,7 +107,9 @@ class Evaluation:
 def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
     names = [field.name for field in fields(Evaluation)]
-    return Evaluation(**{name: np.concatenate([getattr(part, name) for part in evaluations]) for name in names})
+    return Evaluation(
+        **{name: np.concatenate([getattr(evaluation, name) for evaluation in evaluations]) for name in names}
+    )
 
 
 def select_terrains(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
@@ -146,21 +148,21 @@ def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: 
     """The evaluation by all episodes of two evaluations of the same terrains; ends are the second's, if it has any."""
     share = second.counted / np.maximum(first.counted + second.counted, 1)
 
-    def mean_of(values: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-        shares = share if values.ndim == 1 else share[:, None]
-        return (1.0 - shares) * values + shares * others
+    def weigh(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+        shares = share if before.ndim == 1 else share[:, None]
+        return (1.0 - shares) * before + shares * after
 
     def mean(name: str) -> NDArray[np.float64]:
-        return mean_of(getattr(first, name), getattr(second, name))
+        return weigh(getattr(first, name), getattr(second, name))
 
-    apart = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
+    between = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
     ended = np.isfinite(second.end_position)
     return _with_fitness(
         cells,
         cfg,
         ratios=mean("ratios"),
         penalty_mean=mean("penalty_mean"),
-        penalty_std=np.sqrt(mean_of(first.penalty_std**2, second.penalty_std**2) + apart),
+        penalty_std=np.sqrt(weigh(first.penalty_std**2, second.penalty_std**2) + between),
         collision_rate=mean("collision_rate"),
         goal_rate=mean("goal_rate"),
         fallen_rate=mean("fallen_rate"),
@@ -172,28 +174,31 @@ def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: 
 
 def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> Evaluation:
     """Adds what follows from the statistics, fitness and cell."""
-    some = Evaluation(fitness=np.zeros(0), cell=np.zeros(0, np.int64), **statistics)
-    inconsistency = np.where(some.collision_rate > 0.0, 1.0 - some.collision_rate, 0.0)
-    fitness = some.penalty_mean.sum(axis=1) - cfg.alpha * some.penalty_std.sum(axis=1) - cfg.lam * inconsistency
+    evaluation = Evaluation(fitness=np.zeros(0), cell=np.zeros(0, np.int64), **statistics)
+    inconsistency = np.where(evaluation.collision_rate > 0.0, 1.0 - evaluation.collision_rate, 0.0)
+    fitness = (
+        evaluation.penalty_mean.sum(axis=1) - cfg.alpha * evaluation.penalty_std.sum(axis=1) - cfg.lam * inconsistency
+    )
     return replace(
-        some,
-        fitness=np.where(some.valid, fitness, FITNESS_FLOOR),
-        cell=cells.find_cells(some.ratios, some.collides),
+        evaluation,
+        fitness=np.where(evaluation.valid, fitness, FITNESS_FLOOR),
+        cell=cells.find_cells(evaluation.ratios, evaluation.collides),
     )
 
 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Where the typical episode of each terrain ended: the median, by coordinate, of those that ended alike.
+    """Where the typical episode of each terrain ended: the median, by coordinate, over episodes of its typical outcome.
 
-    Those are the episodes at the goal where at least half reach it. Else they are those that ended in the commonest of
-    the other ways, which are a base collision, the end of the time, and leaving the terrain. ``counted`` says which
-    episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
+    That is the goal where at least half reach it. Else it is the commonest other outcome: a base collision, the end of
+    the time, or leaving the terrain. ``counted`` says which episodes count, shape (T, R). World-local x and y [m],
+    shape (T, 2); NaN where none does.
     """
     outcome = np.where(counted, result.outcome, Outcome.INVALID)
     alike = counted & (outcome == typical_outcome(outcome)[:, None])
-    places = np.sort(np.where(alike[..., None], result.final_position[..., :2], np.inf), axis=1)
-    count, rows = alike.sum(axis=1), np.arange(len(alike))
-    ends = (places[rows, np.maximum(count - 1, 0) // 2] + places[rows, count // 2]) / 2
+    positions = np.sort(np.where(alike[..., None], result.final_position[..., :2], np.inf), axis=1)
+    count = alike.sum(axis=1)
+    rows = np.arange(len(alike))
+    ends = (positions[rows, np.maximum(count - 1, 0) // 2] + positions[rows, count // 2]) / 2
     return np.where(count[:, None] > 0, ends, np.nan).astype(np.float32)
 
 

@@ -54,10 +54,9 @@ def describe_metrics(
         "episodes": int(evaluation.episodes.sum()),
         "invalid_episodes": int(evaluation.invalid_episodes.sum()),
         "invalid_terrains": int((~evaluation.valid).sum()),
-        **{
-            f"batch_{name}": float(getattr(evaluation, name).mean())
-            for name in ("fitness", "collision_rate", "goal_rate")
-        },
+        "batch_fitness": float(evaluation.fitness.mean()),
+        "batch_collision_rate": float(evaluation.collision_rate.mean()),
+        "batch_goal_rate": float(evaluation.goal_rate.mean()),
         "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
         "robot_steps": int(result.robot_steps),

@@ -13,7 +13,7 @@ from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
 from qd.faults.numbers import best_certifier
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.archive import Archive, read_archive
-from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, directory_of, find_run
+from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, find_directory, find_run
 from qd.search.fitness import FitnessCfg
 from qd.search.settings import SearchCfg, find_policy
 from sim.controllers.spec import SHIPPED, controller_hash, is_same_controller, label_suffix, resolve_policy
@@ -50,7 +50,7 @@ class OpenedRun:
     @property
     def folder(self) -> Path:
         """The directory."""
-        return directory_of(self.path)
+        return find_directory(self.path)
 
     @property
     def space(self) -> TerrainSpace:

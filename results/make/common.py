@@ -21,7 +21,7 @@ from kernels.episode import Outcome
 from qd.evaluate.measures import valid_interval, valid_mean
 from qd.faults.judge import judge
 from qd.search.archive import Archive
-from qd.search.directory import RunDirectory, read_archive_of
+from qd.search.directory import RunDirectory, read_robot_archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, preset
 from qd.workers.compute import Compute
@@ -117,7 +117,7 @@ class Script:
 
     def read_archive(self, name: str = "archive") -> Archive:
         """A published archive of archive.py."""
-        return read_archive_of(self.robot, self.results / name)
+        return read_robot_archive(self.robot, self.results / name)
 
     def read_dose(self, *, conditions: bool) -> list[dict[str, Any]]:
         """The base's rows of dose.json beside the file, of conditions or of obstacles."""

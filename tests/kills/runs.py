@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 import faultline
-from qd.search import loop as searching
+from qd.search import results
 from qd.search.archive import ARCHIVE_FILE
 from qd.search.checkpoint import load_checkpoint
 from qd.search.directory import CHECKPOINT_FILE, CONFIG_FILE
@@ -47,7 +47,7 @@ def search(path: Path, *, iterations: int, **watched: Any) -> int:
         iterations: Iterations in all.
         watched: As of :class:`tests.kills.faults.Steps`; the folder is watched if there are some.
     """
-    searching.write_figures = lambda folder, archive, metrics: []  # which would take a second
+    results.write_figures = lambda folder, archive, metrics: []  # which would take a second
     words = _SEARCH.split()
     if (path / CONFIG_FILE).exists():
         words = [*words[:5], "--resume", str(path)]

@@ -98,6 +98,7 @@ class Method:
         Cfg: Its settings. They are fields of :class:`qd.search.presets.SchedulerCfg`, and flags of the command.
         text: What it is, for ``--help``.
         emitters: Numbers of its emitters, ascending.
+        sources: What asks for each emitter, by its number, as pyribs' emitters do.
     """
 
     Cfg: ClassVar[type[MethodCfg]] = MethodCfg
@@ -107,6 +108,10 @@ class Method:
         """``cfg`` has all settings of the search, those of :attr:`Cfg` among them."""
         self.batch_size, self.emitters = int(cfg.batch_size), setup.emitters
         self._space = setup.space.name, setup.space.sha256  # a checkpoint holds no code
+        self.sources = {emitter: self._make_source(cfg, setup, stream) for emitter, stream in setup.streams.items()}
+
+    def _make_source(self, cfg: Any, setup: Setup, stream: np.random.SeedSequence) -> Any:
+        """What asks for one emitter; None if the method asks for all of them itself."""
 
     @property
     def space(self) -> "TerrainSpace":
@@ -121,7 +126,7 @@ class Method:
         ``pending`` are clipped genes of new terrains that were asked for and not told yet, shape (U, num_genes).
         Returns unclipped genes, shape (len(emitters) * batch_size, num_genes).
         """
-        raise NotImplementedError
+        return np.concatenate([self.sources[emitter].ask() for emitter in emitters])
 
     def tell(self, told: Told) -> None:
         """Learns from crossed terrains; a method that learns nothing leaves this out."""

@@ -1,6 +1,5 @@
 """CMA-ME: evolution strategies that follow what improves the archive (Fontaine et al. 2020)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -29,21 +28,20 @@ class CmaMe(Method):
     text = "evolution strategies that follow what improves the archive (Fontaine et al. 2020)"
 
     def __init__(self, cfg: Any, setup: Setup) -> None:
+        self.archive = self._make_archive(cfg, setup)
+        super().__init__(cfg, setup)
+
+    def _make_source(self, cfg: Any, setup: Setup, stream: np.random.SeedSequence) -> Any:
         from ribs.emitters import EvolutionStrategyEmitter
 
-        super().__init__(cfg, setup)
-        self.archive = self._make_archive(cfg, setup)
-        self.strategies = {
-            emitter: EvolutionStrategyEmitter(
-                self.archive,
-                x0=np.zeros(setup.space.num_genes),
-                sigma0=setup.space.sigma0 if cfg.sigma0 is None else cfg.sigma0,
-                batch_size=cfg.batch_size,
-                seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
-                **self._rules(cfg),
-            )
-            for emitter, stream in setup.streams.items()
-        }
+        return EvolutionStrategyEmitter(
+            self.archive,
+            x0=np.zeros(setup.space.num_genes),
+            sigma0=setup.space.sigma0 if cfg.sigma0 is None else cfg.sigma0,
+            batch_size=cfg.batch_size,
+            seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
+            **self._rules(cfg),
+        )
 
     def _make_archive(self, cfg: Any, setup: Setup) -> Any:
         """The archive that strategies are judged by."""
@@ -57,18 +55,14 @@ class CmaMe(Method):
         """Status and value of each terrain by the archive that strategies are judged by."""
         return told.added
 
-    def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
-        """The next samples of each strategy."""
-        return np.concatenate([self.strategies[emitter].ask() for emitter in emitters])
-
     def tell(self, told: Told) -> None:
         """Tells each strategy what became of its own terrains."""
         added = self._add(told)
         if self.archive.empty:  # a strategy that restarts now would have no elite to start from
             return
         for emitter, batch in told.batches.items():
-            if emitter in self.strategies:
-                self.strategies[emitter].tell(
+            if emitter in self.sources:
+                self.sources[emitter].tell(
                     **{name: values[batch] for name, values in told.rows.items()},
                     add_info={name: values[batch] for name, values in added.items()},
                 )

@@ -1,10 +1,8 @@
 """MAP-Elites with iso+line variation (Vassiliades and Mouret 2018)."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.search.methods.base import IsoLineCfg, Method, Setup
 
@@ -15,23 +13,16 @@ class MapElites(Method):
     Cfg = IsoLineCfg
     text = "elites varied by iso+line (Vassiliades and Mouret 2018)"
 
-    def __init__(self, cfg: Any, setup: Setup) -> None:
+    def _make_source(self, cfg: Any, setup: Setup, stream: np.random.SeedSequence) -> Any:
         from ribs.emitters import IsoLineEmitter
 
-        super().__init__(cfg, setup)
-        self.variations: dict[int, IsoLineEmitter] = {}
-        for emitter, stream in setup.streams.items():
-            first, later = stream.spawn(2)
-            self.variations[emitter] = IsoLineEmitter(
-                setup.archive,
-                iso_sigma=cfg.iso_sigma,
-                line_sigma=cfg.line_sigma,
-                initial_solutions=setup.space.hard_random(cfg.batch_size, np.random.default_rng(first)),
-                bounds=[(-1.0, 1.0)] * setup.space.num_genes,
-                batch_size=cfg.batch_size,
-                seed=later,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
-            )
-
-    def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
-        """Varied elites."""
-        return np.concatenate([self.variations[emitter].ask() for emitter in emitters])
+        first, later = stream.spawn(2)
+        return IsoLineEmitter(
+            setup.archive,
+            iso_sigma=cfg.iso_sigma,
+            line_sigma=cfg.line_sigma,
+            initial_solutions=setup.space.hard_random(cfg.batch_size, np.random.default_rng(first)),
+            bounds=[(-1.0, 1.0)] * setup.space.num_genes,
+            batch_size=cfg.batch_size,
+            seed=later,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
+        )

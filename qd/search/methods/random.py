@@ -14,13 +14,12 @@ class UniformRandom(Method):
 
     text = "genes drawn uniformly, which learns nothing"
 
-    def __init__(self, cfg: Any, setup: Setup) -> None:
-        super().__init__(cfg, setup)
-        self._rngs = {emitter: np.random.default_rng(stream) for emitter, stream in setup.streams.items()}
+    def _make_source(self, cfg: Any, setup: Setup, stream: np.random.SeedSequence) -> Any:
+        return np.random.default_rng(stream)
 
     def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
         """Random genes."""
-        return np.concatenate([self._draw(self._rngs[emitter]) for emitter in emitters])
+        return np.concatenate([self._draw(self.sources[emitter]) for emitter in emitters])
 
     def _draw(self, rng: np.random.Generator) -> NDArray[np.float32]:
         return self.space.uniform_random(self.batch_size, rng)

@@ -7,9 +7,9 @@ import pytest
 from qd.search.directory import (
     RunDirectory,
     claimed,
+    find_output_folder,
     find_run,
-    folder_for,
-    read_archive_of,
+    read_robot_archive,
     results_folder,
     search_seed,
 )
@@ -95,9 +95,9 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     with pytest.raises(FileNotFoundError, match="anymal"):
         find_run(robot)
     published = make_run(results / "anymal" / "archive")
-    assert find_run(robot) == published and folder_for(published, "anymal") == Path("runs/anymal-published")
+    assert find_run(robot) == published and find_output_folder(published, "anymal") == Path("runs/anymal-published")
     course = published.parent / "spaces" / "course" / "archive.npz"
-    assert folder_for(course, "anymal") == Path("runs/anymal-published-course")
+    assert find_output_folder(course, "anymal") == Path("runs/anymal-published-course")
     with pytest.raises(FileNotFoundError):
         find_run(robot, published="never")
     with pytest.raises(ValueError, match="is published and stays as it is: copy"):
@@ -108,15 +108,15 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     make_run(Path("runs/cassie"), 9, robot="cassie")
     (make_run(Path("runs/damaged"), 10) / "archive.npz").write_bytes(b"no archive")
     assert find_run(robot) == find_run(robot, published="never") == Path("runs/3")
-    assert folder_for(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
+    assert find_output_folder(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
     assert find_run(robot, published="first") == published
     assert find_run(robot, Path("elsewhere")) == Path("elsewhere")
 
 
 def test_an_archive_of_the_robot_as_it_was_is_refused_and_one_of_another_robot_is_not(results):
     robot = get_robot("anymal")
-    assert len(read_archive_of(robot, make_run(Path("now")))) == 3
-    assert len(read_archive_of(robot, make_run(Path("other"), robot="cassie", robot_sha256="0" * 64))) == 3
+    assert len(read_robot_archive(robot, make_run(Path("now")))) == 3
+    assert len(read_robot_archive(robot, make_run(Path("other"), robot="cassie", robot_sha256="0" * 64))) == 3
     for name, changes in (("a", {"robot_sha256": "0" * 64}), ("b", {"penalty_definition": "cubed"})):
         with pytest.raises(ValueError, match=r"anymal|cubed"):
-            read_archive_of(robot, make_run(Path(name), **changes))
+            read_robot_archive(robot, make_run(Path(name), **changes))
