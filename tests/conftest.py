@@ -26,7 +26,6 @@ from sim.robots.find import get_robot
 from sim.robots.shipped import ROBOTS
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
-from tests.toys import penalty  # noqa: F401  it registers itself, before robots are simulated
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
 

@@ -127,7 +127,7 @@ def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
         )
 
 
-def find_output_folder(run: Path, robot: str) -> Path:
+def output_folder(run: Path, robot: str) -> Path:
     """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
 
     That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.

@@ -8,7 +8,7 @@ from qd.evaluate.pack import PACK_FILE, find_pack, read_pack
 from qd.faults.families import VERDICTS, Ranking, rank
 from qd.faults.minimise.results import read_minimal
 from qd.search.archive import Archive
-from qd.search.directory import RUNS, find_output_folder
+from qd.search.directory import RUNS, output_folder
 from qd.search.progress import Bar
 from qd.show.elites import OpenedRun
 from sim.controllers.formats.onnx import export_onnx
@@ -67,7 +67,8 @@ def export_elites(
         "space_sha256": archive.space_sha256,
         **archive.named(),
     }
-    folder = find_output_folder(opened_run.path, opened_run.robot.name) / (_FOLDER if minimal is None else f"minimal-{_FOLDER}")
+    name = _FOLDER if minimal is None else f"minimal-{_FOLDER}"
+    folder = output_folder(opened_run.path, opened_run.robot.name) / name
     return _export(about, build, origin, out or folder, **options)
 
 

@@ -11,7 +11,7 @@ from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from qd.faults.numbers import describe_elite
 from qd.search.descriptors import Cells
-from qd.search.directory import RUNS, find_output_folder
+from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
@@ -98,7 +98,7 @@ def select_elites(
     return ReplaySource(
         robot=opened_run.robot,
         fitness=opened_run.as_searched()[1],
-        folder=find_output_folder(opened_run.path, opened_run.robot.name),
+        folder=output_folder(opened_run.path, opened_run.robot.name),
         stems=[f"{terrain.stem}{suffix}" for terrain in terrains],
         by=suffix[1:],
         about=[{"run": str(opened_run.path), "elite": t.number, "minimal": t.minimal} for t in terrains],

@@ -1,5 +1,5 @@
 """Toys, one file each: entries of the registries that tests search with, dose and show like any other."""
 
-from tests.toys import method
+from tests.toys import method, penalty
 
-__all__ = ["method"]
+__all__ = ["method", "penalty"]

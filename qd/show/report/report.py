@@ -9,7 +9,7 @@ from qd.faults.families import VERDICTS, Ranking, rank
 from qd.faults.minimise.minimise import read_minimal
 from qd.faults.numbers import further_rates
 from qd.search.archive import Archive
-from qd.search.directory import ROUNDS_FILE, find_output_folder
+from qd.search.directory import ROUNDS_FILE, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
@@ -55,7 +55,7 @@ def write_report(
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
     controller = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
     suffix = "" if policy is None else opened_run.suffix(controller)
-    out = out or find_output_folder(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
+    out = out or output_folder(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     check_page(out)
     compared = None
     if tables is not None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import viser
 
-from qd.search.directory import find_output_folder
+from qd.search.directory import output_folder
 from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
 from qd.show.recordings import Wanted
@@ -173,7 +173,7 @@ class Tab:
         opened_run = self.shared.show.opened_run
         by = "" if self.controller in (None, SEARCHED) else str(self.controller)
         stem = f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}{f'-{by}' * bool(by)}"
-        file = find_output_folder(opened_run.path, opened_run.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
+        file = output_folder(opened_run.path, opened_run.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
         ghost = None
         if self.ghost.name is not None and self.ghost.recording is not None:
             ghost = (self.ghost.name, self.ghost.recording)

@@ -7,8 +7,8 @@ import pytest
 from qd.search.directory import (
     RunDirectory,
     claimed,
-    find_output_folder,
     find_run,
+    output_folder,
     read_robot_archive,
     results_folder,
     search_seed,
@@ -95,9 +95,9 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     with pytest.raises(FileNotFoundError, match="anymal"):
         find_run(robot)
     published = make_run(results / "anymal" / "archive")
-    assert find_run(robot) == published and find_output_folder(published, "anymal") == Path("runs/anymal-published")
+    assert find_run(robot) == published and output_folder(published, "anymal") == Path("runs/anymal-published")
     course = published.parent / "spaces" / "course" / "archive.npz"
-    assert find_output_folder(course, "anymal") == Path("runs/anymal-published-course")
+    assert output_folder(course, "anymal") == Path("runs/anymal-published-course")
     with pytest.raises(FileNotFoundError):
         find_run(robot, published="never")
     with pytest.raises(ValueError, match="is published and stays as it is: copy"):
@@ -108,7 +108,7 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     make_run(Path("runs/cassie"), 9, robot="cassie")
     (make_run(Path("runs/damaged"), 10) / "archive.npz").write_bytes(b"no archive")
     assert find_run(robot) == find_run(robot, published="never") == Path("runs/3")
-    assert find_output_folder(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
+    assert output_folder(Path("runs/3/archive.npz"), "anymal") == Path("runs/3")
     assert find_run(robot, published="first") == published
     assert find_run(robot, Path("elsewhere")) == Path("elsewhere")
 
