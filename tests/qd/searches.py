@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from qd.search import results
+from qd.search import loop, results
 from qd.search.archive import Archive
 from qd.search.fitness import FitnessCfg
 from qd.search.loop import search
@@ -54,7 +54,7 @@ def crossing_by(opener) -> Iterator[None]:
     """``faultline archive`` crosses terrains by this meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(crosser, "open_pipeline", opener)
-        patch.setattr(searching, "open_pipeline", opener)
+        patch.setattr(loop, "open_pipeline", opener)
         yield
 
 
