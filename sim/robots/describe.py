@@ -53,9 +53,12 @@ def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
     for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True), start=1):
         low, high = model.jnt_range[k]
         effort = float(model.jnt_actfrcrange[k, 1])
-        kp, kd, text, limits = 0.0, 0.0, "follows", ["-"] * motors.shape[1]
+        kp = kd = 0.0
+        text = "follows"
+        limits = ["-"] * motors.shape[1]
         if (drive := drives.get(k)) is not None:
-            kp, kd = model.actuator_gainprm[drive, 0], 0.0 - model.actuator_biasprm[drive, 2]
+            kp = model.actuator_gainprm[drive, 0]
+            kd = 0.0 - model.actuator_biasprm[drive, 2]
             if model.actuator_forcelimited[drive]:
                 effort = min(effort, model.actuator_forcerange[drive, 1])
             text = f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
@@ -73,7 +76,8 @@ def _geom_rows(robot: RobotCfg, sim: Simulation, builder: newton.ModelBuilder) -
     yield "geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]"
     roles = {name: role for role in ("base", "foot", "limb") for name in getattr(robot, f"{role}_geoms")}
     for k, name in enumerate(builder.shape_label):
-        geom, shape = int(sim.geom_of_shape[k]), newton.GeoType(builder.shape_type[k]).name.lower()
+        geom = int(sim.geom_of_shape[k])
+        shape = newton.GeoType(builder.shape_type[k]).name.lower()
         size = " ".join(f"{length:.3g}" for length in model.geom_size[geom][: _NUM_SIZES.get(shape, 3)])
         contact = f"{model.geom_friction[geom, 0]:g}", f"{model.geom_solref[geom, 0]:g}"
         yield name, roles.get(name, "-"), builder.body_label[builder.shape_body[k]], shape, size, *contact
@@ -99,7 +103,7 @@ def _unit_warnings(robot: RobotCfg, builder: Any) -> Iterator[tuple[str, Any]]:
     angles = zip(robot.joint_names, robot.default_joint_pos, strict=True)
     if turned := [f"{name} ({angle:g})" for name, angle in angles if abs(angle) > _TURN]:
         yield "angles", turned
-    low, high = np.array(builder.joint_limit_lower[6:]), np.array(builder.joint_limit_upper[6:])
+    low, high = (np.array(limits[6:]) for limits in (builder.joint_limit_lower, builder.joint_limit_upper))
     span = high - low
     is_wide = (span > 2.0 * _TURN) & (span < _FREE) & (np.maximum(abs(low), abs(high)) > 2.0 * _TURN)
     if is_wide.any():

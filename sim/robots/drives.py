@@ -33,7 +33,8 @@ class Drives:
 def read_drives(model: Any) -> Drives:
     """Reads the actuators of a compiled file that has no :func:`drive_problems`."""
     count = model.njnt - 1
-    stiffness, damping, effort = np.zeros(count), np.zeros(count), np.full(count, np.inf)
+    stiffness, damping = np.zeros((2, count))
+    effort = np.full(count, np.inf)
     targets = np.full((count, 2), np.nan)
     for joint, _, span, scale in _torque_ranges(model):
         effort[joint] = min(effort[joint], scale * float(span[1]))
@@ -49,21 +50,21 @@ def read_drives(model: Any) -> Drives:
 
 def drive_problems(spec: Any, model: Any) -> Iterator[str]:
     """What no position drive can do, with its line in the file."""
-    places = [f"on {actuator.target} ({actuator.info})" for actuator in spec.actuators]
     driven = set[int]()
-    for k, place in enumerate(places):
+    for k, actuator in enumerate(spec.actuators):
+        line = f"on {actuator.target} ({actuator.info})"
         joint = _driven_joint(model, k)
         kind = _actuator_kind(model, k)
         if joint < 0:
-            yield f"an actuator that moves no joint {place}"
+            yield f"an actuator that moves no joint {line}"
         elif kind not in ("position", "motor"):
-            yield f"{kind} {place}"
+            yield f"{kind} {line}"
         elif joint in driven:
-            yield f"a second actuator {place}"
+            yield f"a second actuator {line}"
         elif joint in _followers(model):
-            yield f"a drive of a joint that follows another {place}"
+            yield f"a drive of a joint that follows another {line}"
         elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
-            yield f"a gear other than 1 on a position actuator {place}"
+            yield f"a gear other than 1 on a position actuator {line}"
         driven.add(joint)
     for joint, name, (low, high), _ in _torque_ranges(model):
         if low != -high:
@@ -98,7 +99,8 @@ def _actuator_kind(model: Any, k: int) -> str:
         return "an actuator of a plugin"
     if model.actuator_dyntype[k]:
         return "an actuator with a timeconst or other dynamics"
-    gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
+    gain = model.actuator_gainprm[k]
+    bias = model.actuator_biasprm[k]
     if model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED:
         if model.actuator_biastype[k] == mj.mjtBias.mjBIAS_NONE and not gain[1:].any():
             return "motor"

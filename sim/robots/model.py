@@ -130,7 +130,8 @@ def _set_drive(builder: newton.ModelBuilder, model: Any, actuator: int) -> None:
 def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
     """Adds a shape that touches the ground."""
     kind = mj.mjtGeom(int(model.geom_type[geom]))
-    source, scale = None, model.geom_size[geom]
+    source = None
+    scale = model.geom_size[geom]
     if kind == mj.mjtGeom.mjGEOM_MESH:
         vertices, faces = read_mesh(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)

@@ -110,6 +110,11 @@ class RobotCfg:
         return len(self.joint_names)
 
     @property
+    def half_width(self) -> float:
+        """Half width of the stance [m]."""
+        return self.footprint[1]
+
+    @property
     def num_scan_points(self) -> int:
         """Number of height-scan points."""
         return len(self.scan_x) * len(self.scan_y)

@@ -11,7 +11,6 @@ from qd.calibrate import calibrate, find_fitting_height, measure_scales
 from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd import stand_in
 from tests.qd.robots import Robots
@@ -90,7 +89,7 @@ def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing()
     np.testing.assert_array_equal(list(content["scales"].values()), means)
 
 
-def test_a_penalty_that_never_occurs_is_refused_and_the_scales_of_the_others_are_kept(scales):
+def test_a_penalty_that_never_occurs_is_refused_once_all_scales_are_written(scales):
     without = robots(lambda result: replace(result, penalties=result.penalties * (np.arange(6) > 0)))
     with pytest.raises(ValueError, match="yaw_rate"):
         calibrated(without, 20)
@@ -102,10 +101,10 @@ def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, e
     heights = []
 
     class Crosses:
-        def cross(self, policy, genes, seeds, *, space, replicas, label):
-            height = get_space(space).height
-            heights.append(height)
-            return failing(0.0 if height <= crossed_up_to else 0.5)(stand_in.evaluate(genes, seeds, replicas))
+        def cross(self, policy, terrains, *, replicas, label):
+            heights.append(terrains.space.height)
+            result = stand_in.evaluate(terrains.genes, terrains.seeds, replicas)
+            return failing(0.0 if heights[-1] <= crossed_up_to else 0.5)(result)
 
     height, share = find_fitting_height(Crosses(), "policy.pt")
     assert height == expected and (share >= 0.8) == (height <= crossed_up_to)

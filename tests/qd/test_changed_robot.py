@@ -14,7 +14,7 @@ from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.dogs import write_dog
 
 
-def test_a_controller_trained_with_the_robot_before_is_told_so_and_what_was_made_with_it_refused(tmp_path, capsys):
+def test_a_changed_robot_is_warned_of_by_its_controller_and_refused_by_its_records(tmp_path, capsys):
     dog = write_dog(tmp_path)
     robot = get_robot(str(dog))
     record = {"robot": "dog", **robot_identity(robot)}

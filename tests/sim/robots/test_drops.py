@@ -33,7 +33,8 @@ def above_ground(robot, grids, rng):
 
 def gaps(sim, grids):
     """Smallest gap between the surface and any probe of each robot (negative: inside) [m]."""
-    probes, poses = sim.probes, sim.body_q.numpy()
+    probes = sim.probes
+    poses = sim.body_q.numpy()
     counts = np.diff(probes.strip_start.numpy())
     body = np.repeat(probes.bundle_body.numpy(), np.diff(probes.strip_start.numpy()[probes.bundle_start.numpy()]))
     radii = np.repeat(probes.strip_radius.numpy(), counts)
@@ -72,14 +73,18 @@ def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
 
 def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, tmp_path):
     # A riser of 0.2 m in the cell from x = 8 to x = 8.05, hit from all sides, at and round its upper edge and its face.
-    radius, speed, height = 0.03, 3.0, 0.2
+    radius = 0.03
+    speed = 3.0
+    height = 0.2
     grid = np.broadcast_to(np.where(NODE_X > 8.02, height, 0.0), (161, 321))
     approach = np.radians([-90, -75, -60, -45, -30, -15, 0, 15])  # downward (-90) to forward and slightly up
     target = np.array([[8.05, 0.2], [8.045, 0.19], [8.03, 0.12], [8.01, 0.05], [8.07, 0.2]])
-    aim, angle = np.repeat(target, len(approach), axis=0), np.tile(approach, len(target))
+    aim = np.repeat(target, len(approach), axis=0)
+    angle = np.tile(approach, len(target))
     direction = np.column_stack([np.cos(angle), np.zeros(len(angle)), np.sin(angle)])
     sim = simulate(free_body(tmp_path, f'type="sphere" size="{radius}"', mass=0.588), [grid] * len(aim), device)
-    q, qd = lying(len(aim), 0, 4, 0), np.zeros((len(aim), 6))
+    q = lying(len(aim), 0, 4, 0)
+    qd = np.zeros((len(aim), 6))
     rng = np.random.default_rng(0)
     start = rng.uniform(0.1, 0.115, len(aim))[:, None]  # a step is 0.015 m: every phase of touching is met
     q[:, [0, 2]] = aim - start * direction[:, [0, 2]]
@@ -99,9 +104,10 @@ def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, tmp_path)
     assert (deepest[outside] > 0).all(), f"centre inside the ground: {deepest[outside].min()}"
 
 
-def test_a_robot_of_many_joints_rests_on_the_ground_by_mujoco_warps_own_step(tmp_path, device):
+def test_a_robot_of_many_joints_rests_on_the_ground_by_mujoco_warps_step(tmp_path, device):
     # One joint follows another, which our step does not know; with more than 32 dofs theirs has a sparse Jacobian.
-    robot, names = free_body(tmp_path, 'type="box" size="0.1 0.1 0.05"', mass=1.0), tuple(f"j{k}" for k in range(30))
+    robot = free_body(tmp_path, 'type="box" size="0.1 0.1 0.05"', mass=1.0)
+    names = tuple(f"j{k}" for k in range(30))
     body = '<body name="{0}"><joint name="{0}" axis="0 0 1"/><geom size="0.01" mass="0.01"/></body>'
     text = robot.model_file.read_text().replace("</body>", f"{''.join(map(body.format, names))}</body>")
     follows = '<equality><joint joint1="j0" joint2="j1"/></equality></mujoco>'

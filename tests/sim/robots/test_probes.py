@@ -48,8 +48,8 @@ def test_probes_cover_a_shape_and_none_sticks_out(kind, size, shape):
     if kind == GeoType.CYLINDER:
         assert (np.linalg.norm(centres[:, :2], axis=1) + radii <= size[0] + 1e-9).all()
     # A needle between four probes, or a corner (rounded by (sqrt 3 - 1) r = 14.6 mm), is the worst case.
-    most = CAPSULE_SAG if kind == GeoType.CAPSULE else 0.0147
-    assert uncovered(shape.sample(4000, seed=0), strips).max() <= most + 1e-9
+    max_gap = CAPSULE_SAG if kind == GeoType.CAPSULE else 0.0147
+    assert uncovered(shape.sample(4000, seed=0), strips).max() <= max_gap + 1e-9
     for strip in strips:  # kernels.contact bounds a strip by its ends and takes first and last as its outermost
         extent = np.ptp(strip.centres, axis=0)
         assert (np.diff(strip.centres[:, extent.argmax()]) > 0).all() and np.sort(extent)[:2].max() < 1e-12
@@ -74,16 +74,14 @@ MESHES = {
 
 @pytest.mark.parametrize("name", MESHES)
 def test_mesh(name):
-    vertices, most = MESHES[name]
+    vertices, max_tolerance = MESHES[name]
     strips, tolerance = hull_probes(vertices)
     centres, radii = spheres(strips)
-    assert tolerance <= most * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
-    assert tolerance == pytest.approx(most) or name == "base"
+    assert tolerance <= max_tolerance * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
+    assert tolerance == pytest.approx(max_tolerance) or name == "base"
     hull = ConvexHull(vertices)
-    faces, edges = (
-        trimesh.convex.convex_hull(vertices).sample(6000, seed=1),
-        hull.points[hull.simplices[:, [0, 1, 2, 0]]],
-    )
+    faces = trimesh.convex.convex_hull(vertices).sample(6000, seed=1)
+    edges = hull.points[hull.simplices[:, [0, 1, 2, 0]]]
     between = np.linspace(edges[:, :3], edges[:, 1:], 9).reshape(-1, 3)
     gap = uncovered(np.vstack([faces, between]), strips)
     assert gap.max() <= tolerance

@@ -35,7 +35,7 @@ def test_published_mass(robot, c_model, builder):
     assert builder.body_count == 13
 
 
-def limits_of(builder):
+def read_limits(builder):
     return np.column_stack([builder.joint_limit_lower[6:], builder.joint_limit_upper[6:]])
 
 
@@ -43,8 +43,8 @@ def test_armature_and_limits_are_the_same_in_newton_and_mujoco(robot, c_model, b
     # Gains and limits of effort, by the torques that they make: test_simulation.
     np.testing.assert_allclose(builder.joint_armature[6:], c_model.dof_armature[6:])
     limited = c_model.jnt_limited[1:] == 1
-    np.testing.assert_allclose(c_model.jnt_range[1:][limited], limits_of(builder)[limited], atol=1e-6)
-    assert (np.abs(limits_of(builder)[~limited]) > 1e6).all()
+    np.testing.assert_allclose(c_model.jnt_range[1:][limited], read_limits(builder)[limited], atol=1e-6)
+    assert (np.abs(read_limits(builder)[~limited]) > 1e6).all()
     assert c_model.opt.timestep == robot.physics_dt
 
 
@@ -53,15 +53,15 @@ def test_anymals_drives_and_hips(robot, c_model, builder):
     np.testing.assert_allclose(c_model.dof_armature[6:], 0.06)  # robot-side inertia of an ANYdrive's rotor [kg m^2]
     # Legs turn in by 0.72 rad and out by 0.49 rad: mirrored on the right.
     abduction = np.array([name.endswith("HAA") for name in robot.joint_names])
-    np.testing.assert_allclose(limits_of(builder)[abduction], [[-0.72, 0.49], [-0.49, 0.72]] * 2, atol=1e-6)
+    np.testing.assert_allclose(read_limits(builder)[abduction], [[-0.72, 0.49], [-0.49, 0.72]] * 2, atol=1e-6)
     np.testing.assert_array_equal(c_model.jnt_limited[1:], abduction)
 
 
 @ONLY_CASSIE
 def test_cassies_published_limits_and_frames(c_model, builder):
-    others = [[-0.3927, 0.3927], [-0.8727, 1.3963], [-2.8623, -0.6458], [0.6458, 2.8623], [-2.4435, -0.5236]]
-    expected = [[-0.2618, 0.3927], *others, [-0.3927, 0.2618], *others]  # abduction: farther out than in
-    np.testing.assert_allclose(limits_of(builder), expected, atol=1e-6)
+    lower_joints = [[-0.3927, 0.3927], [-0.8727, 1.3963], [-2.8623, -0.6458], [0.6458, 2.8623], [-2.4435, -0.5236]]
+    expected = [[-0.2618, 0.3927], *lower_joints, [-0.3927, 0.2618], *lower_joints]  # abduction: farther out than in
+    np.testing.assert_allclose(read_limits(builder), expected, atol=1e-6)
     # Reflected through its gears the motor of a toe adds .01 kg m^2 to what is of the toe itself: .010449 in all.
     np.testing.assert_array_equal(c_model.dof_armature[6:], [0, 0, 0, 0, 0, 0.01] * 2)
     data = mujoco.MjData(c_model)
@@ -76,7 +76,7 @@ def test_cassies_published_limits_and_frames(c_model, builder):
         np.testing.assert_allclose(data.joint(f"{joint}_left").xaxis, axis, atol=1e-6)
 
 
-def test_what_is_asked_of_each_robot(anymal, cassie):
+def test_penalties_and_observations_of_each_robot(anymal, cassie):
     # The paper: six penalties of ANYmal and no bit; five of Cassie and whether the pelvis collides.
     assert anymal.penalties == ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
     assert cassie.penalties == anymal.penalties[:-1]

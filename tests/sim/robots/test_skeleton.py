@@ -14,20 +14,22 @@ from tests.kernels.states import random_states
 from tests.sim.dogs import KINDS, with_mesh, write_dog
 
 
-def matrix_of(quaternion_wxyz):
+def to_matrix(quaternion_wxyz):
     return oracle.rotation_matrix(np.roll(quaternion_wxyz, -1))
 
 
 def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot):
     """No shape that collides is seen; each role shows its touch, feet by what is where they are."""
     skeleton = Skeleton(robot)
-    model, touches = skeleton.model, skeleton.touches
+    model = skeleton.model
+    touches = skeleton.touches
     assert {model.geom_bodyid[geom] - 1 for geom in touches} == set(range(skeleton.num_bodies))
     for column, name in enumerate(robot.geom_names):
-        own, shapes = model.geom(name), [geom for geom, columns in touches.items() if column in columns]
-        assert own.id not in touches and {model.geom_bodyid[geom] for geom in shapes} == set(own.bodyid)
-        away = min(np.linalg.norm(model.geom_pos[geom] - own.pos) for geom in shapes)
-        assert away < (0.01 if name in robot.foot_geoms else 0.12)
+        touching = model.geom(name)
+        shapes = [geom for geom, columns in touches.items() if column in columns]
+        assert touching.id not in touches and {model.geom_bodyid[geom] for geom in shapes} == set(touching.bodyid)
+        distance = min(np.linalg.norm(model.geom_pos[geom] - touching.pos) for geom in shapes)
+        assert distance < (0.01 if name in robot.foot_geoms else 0.12)
     if robot.name == "anymal":  # a shank's touch is not its foot's
         assert all(len(columns) <= 1 for columns in touches.values())
 
@@ -36,7 +38,9 @@ def test_a_shipped_robot_shows_the_look_of_every_body_and_all_its_touches(robot)
 def test_shapes_stand_where_the_simulation_has_them(tmp_path, kind):
     """By their names in the simulation's own model, in poses of every joint."""
     robot = get_robot(str(with_mesh(tmp_path, kind)) if kind in KINDS else kind)
-    skeleton, rows, builder = Skeleton(robot), np.float64(random_states(3, robot.num_joints)[0]), build_robot(robot)
+    skeleton = Skeleton(robot)
+    rows = np.float64(random_states(3, robot.num_joints)[0])
+    builder = build_robot(robot)
     positions, quaternions = skeleton.body_poses(rows)
     names = builder.shape_label
     with wp.ScopedDevice("cpu"):
@@ -49,17 +53,17 @@ def test_shapes_stand_where_the_simulation_has_them(tmp_path, kind):
             shape, geom = names.index(name), skeleton.model.geom(name)
             pose = wp.transform(*state.body_q.numpy()[builder.shape_body[shape]]) * builder.shape_transform[shape]
             body = geom.bodyid[0] - 1
-            turn = matrix_of(quaternion[body])
+            turn = to_matrix(quaternion[body])
             np.testing.assert_allclose(position[body] + turn @ geom.pos, np.array(pose.p), atol=1e-5)
             expected = oracle.rotation_matrix(np.array(pose.q))
-            np.testing.assert_allclose(turn @ matrix_of(geom.quat), expected, atol=1e-5)
+            np.testing.assert_allclose(turn @ to_matrix(geom.quat), expected, atol=1e-5)
 
 
 BOX = '<geom type="box" size=".1 .2 .3" rgba="1 0 0 1"/>'
 LOOK = f'<mujoco><worldbody><body name="{{}}">{BOX}</body></worldbody></mujoco>'
 
 
-def kinds_of(dog, body):
+def seen_shapes(dog, body):
     """Types of what is seen of a body, and what touches they show."""
     shapes = [geom for geom in dog.touches if dog.model.body(dog.model.geom_bodyid[geom]).name == body]
     return [(mujoco.mjtGeom(dog.model.geom_type[geom]).name[7:], dog.touches[geom]) for geom in shapes]
@@ -74,25 +78,25 @@ def test_what_is_seen_of_a_users_robot(tmp_path):
     robot = get_robot(str(file))
     thigh, other, third = ((robot.geom_names.index(f"{leg}_thigh"),) for leg in ("FL", "FR", "HR"))
     dog = Skeleton(robot)
-    assert kinds_of(dog, "FL_thigh") == [("BOX", thigh)] and dog.model.geom("FL_thigh").type == [3]  # still a capsule
-    assert kinds_of(dog, "FR_thigh") == [("CAPSULE", other)]
+    assert seen_shapes(dog, "FL_thigh") == [("BOX", thigh)] and dog.model.geom("FL_thigh").type == [3]  # a capsule
+    assert seen_shapes(dog, "FR_thigh") == [("CAPSULE", other)]
     file.with_suffix(".look.xml").write_text(LOOK.format("HR_thigh"))
     dog = Skeleton(robot)
-    assert kinds_of(dog, "HR_thigh") == [("BOX", third)]
+    assert seen_shapes(dog, "HR_thigh") == [("BOX", third)]
     shape, color = dog.shape(next(geom for geom, columns in dog.touches.items() if columns == third))
     assert color.tolist() == [1.0, 0.0, 0.0] and shape.extents.tolist() == pytest.approx([0.2, 0.4, 0.6])
     file = with_mesh(tmp_path / "more", "mjcf")
     model = file.with_suffix(".xml")
     cover = '<geom type="mesh" mesh="trunk" contype="0" conaffinity="0"/><geom name="trunk" size="0.1"'
     model.write_text(model.read_text().replace('<geom name="trunk" type="mesh" mesh="trunk"', cover, 1))
-    assert kinds_of(Skeleton(get_robot(str(file))), "trunk") == [("MESH", (0,))]
+    assert seen_shapes(Skeleton(get_robot(str(file))), "trunk") == [("MESH", (0,))]
 
 
 def test_a_look_of_no_body_of_the_robot_is_named(tmp_path):
     file = write_dog(tmp_path, **KINDS["mjcf"])
-    for text, words in ((LOOK.format("tail"), "tail"), ("<mujoco><worldbody>", "XML")):
+    for text, reason in ((LOOK.format("tail"), "tail"), ("<mujoco><worldbody>", "XML")):
         file.with_suffix(".look.xml").write_text(text)
-        with pytest.raises(ValueError, match=rf"dog\.look\.xml.*{words}"):
+        with pytest.raises(ValueError, match=rf"dog\.look\.xml.*{reason}"):
             Skeleton(get_robot(str(file)))
 
 
@@ -106,8 +110,9 @@ SHAPES = {  # sizes as MuJoCo has them, and what that is along x, y and z after 
 
 
 @pytest.mark.parametrize("kind", SHAPES)
-def test_a_shape_has_its_size_and_stands_in_its_place(tmp_path, kind):
-    file, (sizes, extents) = write_dog(tmp_path, **KINDS["mjcf"]), SHAPES[kind]
+def test_a_shape_has_its_size_and_stands_where_it_should(tmp_path, kind):
+    file = write_dog(tmp_path, **KINDS["mjcf"])
+    sizes, extents = SHAPES[kind]
     shape = f'type="{kind}" size="{sizes}" pos=".3 -.2 .1" quat=".5 .5 -.5 .5"'  # turns y to x, z to y, x to z
     file.with_suffix(".look.xml").write_text(LOOK.format("trunk").replace('type="box" size=".1 .2 .3"', shape))
     dog = Skeleton(get_robot(str(file)))

@@ -13,7 +13,10 @@ from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, mjcf, urdf, write_dog
 from tests.sim.plain_mujoco import on_plane, to_c
 from tests.sim.scenes import FLAT, put, simulate, standing
 
-OFF, DT, STEPS, HEIGHT = 0.3, 0.005, 80, 5.0
+OFFSET = 0.3  # of the targets from the default pose [rad]
+DT = 0.005
+STEPS = 80
+HEIGHT = 5.0
 PLAIN = mjcf()
 
 
@@ -77,8 +80,8 @@ SPELLINGS = {
 }  # fmt: skip
 
 
-def in_mujoco(robot):
-    """The robot's file in MuJoCo C, as long as :func:`told` is flown: place [m], joint angles [rad]; its mass [kg]."""
+def fly_in_mujoco(robot):
+    """Position [m] and joint angles [rad] of the robot's file after the same flight in MuJoCo C; its mass [kg]."""
     spec = mujoco.MjSpec.from_file(str(robot.model_file))
     option = spec.option
     option.timestep, option.integrator, option.tolerance = DT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1e-8
@@ -87,18 +90,19 @@ def in_mujoco(robot):
     data = mujoco.MjData(model)
     data.qpos[:] = to_c(standing(robot, 1, z=HEIGHT)[0])
     for name, angle in zip(JOINTS, robot.default_joint_pos, strict=True):
-        data.ctrl[model.actuator(name).id] = angle + OFF
+        data.ctrl[model.actuator(name).id] = angle + OFFSET
     for _ in range(STEPS):
         mujoco.mj_step(model, data)
     joints = [int(model.joint(name).qposadr[0]) for name in JOINTS]
     return data.qpos[[0, 1, 2, *joints]], float(model.body_subtreemass[0])
 
 
-def told(robot, device, off):
-    """A simulation of the robot high up, at rest in its default pose, whose joints are told to move so far [rad]."""
-    sim, q = simulate(robot, FLAT[None], device), standing(robot, 1, z=HEIGHT)
+def start_flight(robot, device, offset):
+    """A simulation of the robot high up, at rest, whose targets are so far from its default pose [rad]."""
+    sim = simulate(robot, FLAT[None], device)
+    q = standing(robot, 1, z=HEIGHT)
     put(sim, q)
-    q[0, 7:] += off
+    q[0, 7:] += offset
     sim.targets.assign(np.float32(q))
     return sim
 
@@ -108,8 +112,8 @@ def told(robot, device, off):
 def test_a_file_flies_as_in_mujoco(tmp_path, device, text):
     robot = get_robot(str(write_dog(tmp_path, model=text)))
     assert robot.joint_names == JOINTS
-    expected, mass = in_mujoco(robot)
-    sim = told(robot, device, OFF)
+    expected, mass = fly_in_mujoco(robot)
+    sim = start_flight(robot, device, OFFSET)
     assert sim.model.body_mass.numpy().sum() == pytest.approx(mass, rel=1e-6)
     for _ in range(STEPS):
         sim.physics_step()
@@ -134,7 +138,8 @@ MOTORS = {  # model, torque limit of the settings [N m], what holds
 @pytest.mark.parametrize(("model", "effort", "expected"), MOTORS.values(), ids=MOTORS)
 def test_the_smallest_torque_limit_holds(tmp_path, device, model, effort, expected):
     more = FREE_GAINS if effort is None else GAINS.replace("30.0", str(effort))
-    sim = told(get_robot(str(write_dog(tmp_path, model=model, more=more))), device, 1.1)  # 66 N m by a gain of 60
+    robot = get_robot(str(write_dog(tmp_path, model=model, more=more)))
+    sim = start_flight(robot, device, 1.1)  # 66 N m by a gain of 60
     sim.physics_step()
     np.testing.assert_allclose(sim.joint_torque.numpy()[0, 6:], expected, rtol=1e-5)
 
@@ -155,7 +160,8 @@ CONTACTS = {
 @pytest.mark.parametrize("kind", CONTACTS.values(), ids=CONTACTS)
 def test_a_push_moves_it_on_the_ground_as_in_mujoco(tmp_path, device, kind):
     robot = get_robot(str(write_dog(tmp_path, **kind)))
-    start, speed = standing(robot, 1), np.array([[0.5, 1.0, *[0.0] * 12]])
+    start = standing(robot, 1)
+    speed = np.array([[0.5, 1.0, *[0.0] * 12]])
     model = on_plane(robot)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.ctrl[:] = to_c(start[0]), speed[0], robot.default_joint_pos
@@ -170,11 +176,12 @@ def test_a_push_moves_it_on_the_ground_as_in_mujoco(tmp_path, device, kind):
 
 
 def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
-    text, knee = urdf(), '<joint name="FL_knee" type="revolute">'
-    assert knee in text
-    text = text.replace(knee, f'{knee}<mimic joint="FL_hip" multiplier="-2.0" offset="0.1"/>')
+    knee = '<joint name="FL_knee" type="revolute">'
+    assert knee in urdf()
+    text = urdf().replace(knee, f'{knee}<mimic joint="FL_hip" multiplier="-2.0" offset="0.1"/>')
     robot = get_robot(str(write_dog(tmp_path, **KINDS["urdf"] | {"model": text})))
-    sim, q = simulate(robot, FLAT[None], device), standing(robot, 1, z=HEIGHT)
+    sim = simulate(robot, FLAT[None], device)
+    q = standing(robot, 1, z=HEIGHT)
     q[0, 8] = -2.0 * q[0, 7] + 0.1
     put(sim, q)
     q[0, 7:9] = 0.8, 2.0  # what the follower is told counts for nothing
@@ -185,7 +192,7 @@ def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
     assert hip == pytest.approx(0.8, abs=0.1) and knee == pytest.approx(-2.0 * hip + 0.1, abs=0.03)
 
 
-def of_urdf(folder, text, more=GAINS):
+def compile_urdf(folder, text, more=GAINS):
     """A URDF as simulations have it, compiled."""
     return robot_spec(get_robot(str(write_dog(folder, model=text, suffix="urdf", more=more)))).compile()
 
@@ -201,10 +208,10 @@ URDFS = {
 @pytest.mark.parametrize(("old", "new"), URDFS.values(), ids=URDFS)
 def test_a_link_of_a_urdf_turns_as_in_mujoco(tmp_path, old, new):
     text = re.sub("<visual>.*?</visual>", "", urdf()).replace(old, new, 1)
-    bodies = [m.body("FL_thigh") for m in (of_urdf(tmp_path, text), mujoco.MjModel.from_xml_string(text))]
+    bodies = [m.body("FL_thigh") for m in (compile_urdf(tmp_path, text), mujoco.MjModel.from_xml_string(text))]
     axes = [rotation_matrix(body.iquat) for body in bodies]
-    own, expected = (turn @ np.diag(body.inertia) @ turn.T for turn, body in zip(axes, bodies, strict=True))
-    np.testing.assert_allclose(own, expected, atol=1e-9)
+    actual, expected = (turn @ np.diag(body.inertia) @ turn.T for turn, body in zip(axes, bodies, strict=True))
+    np.testing.assert_allclose(actual, expected, atol=1e-9)
 
 
 def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
@@ -213,13 +220,13 @@ def test_a_base_link_without_mass_is_the_body_it_is_fixed_to(tmp_path):
         '<robot name="dog"><link name="base"/><joint name="mount" type="fixed"><parent link="base"/>'
         '<child link="trunk"/><origin xyz="0 0 0.05" rpy="0 0 1.5707963"/></joint>'
     )
-    model = of_urdf(tmp_path, urdf().replace('<robot name="dog">', mount))
-    base, trunk = model.body("base"), model.geom("trunk")
+    model = compile_urdf(tmp_path, urdf().replace('<robot name="dog">', mount))
+    base = model.body("base")
+    trunk = model.geom("trunk")
     assert model.nbody == 1 + 9 and base.mass[0] == pytest.approx(8.0) and trunk.bodyid == base.id == 1
     axes = rotation_matrix(base.iquat)
     np.testing.assert_allclose(axes @ np.diag(base.inertia) @ axes.T, np.diag([0.2, 0.03, 0.2]), atol=1e-6)
-    for place in (base.ipos, trunk.pos):
-        np.testing.assert_allclose(place, [0, 0, 0.05], atol=1e-6)
+    np.testing.assert_allclose([base.ipos, trunk.pos], [[0, 0, 0.05]] * 2, atol=1e-6)
     np.testing.assert_allclose(rotation_matrix(trunk.quat)[:, 0], [0, 1, 0], atol=1e-6)
 
 
@@ -230,7 +237,7 @@ def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
         'ixz="0" iyz="0"/></inertial></link><joint name="mount" type="fixed"><parent link="trunk"/>'
         '<child link="camera"/><origin xyz="1 0 0"/></joint></robot>'
     )
-    without, with_camera = (of_urdf(tmp_path, text) for text in (urdf(), urdf().replace("</robot>", camera)))
+    without, with_camera = (compile_urdf(tmp_path, text) for text in (urdf(), urdf().replace("</robot>", camera)))
     mass = without.body_mass[1]
     assert with_camera.nbody == without.nbody and with_camera.body_mass[1] == pytest.approx(mass + 0.5)
     assert with_camera.body_ipos[1, 0] == pytest.approx(0.5 / (mass + 0.5))
@@ -240,12 +247,13 @@ def test_what_is_fixed_to_a_link_of_a_urdf_adds_its_mass(tmp_path):
 
 
 def test_a_motors_inertia_in_a_link_of_a_urdf_is_the_joints_armature(tmp_path):
-    text, plain = urdf(), of_urdf(tmp_path, urdf())
-    shank = re.search(r'<link name="FL_shank">.*?<inertia [^>]*/>', text, re.S)[0]
-    own = re.search(r'iyy="([^"]*)"', shank)[1]
-    more = text.replace(shank, shank.replace(f'iyy="{own}"', f'iyy="{float(own) + 0.02}"'))
-    model = of_urdf(tmp_path, more, GAINS.replace("armature=(0.01,) * 8,", ""))
-    dof, body = int(model.joint("FL_knee").dofadr[0]), model.body("FL_shank").id
+    plain = compile_urdf(tmp_path, urdf())
+    shank = re.search(r'<link name="FL_shank">.*?<inertia [^>]*/>', urdf(), re.S)[0]
+    iyy = re.search(r'iyy="([^"]*)"', shank)[1]
+    more = urdf().replace(shank, shank.replace(f'iyy="{iyy}"', f'iyy="{float(iyy) + 0.02}"'))
+    model = compile_urdf(tmp_path, more, GAINS.replace("armature=(0.01,) * 8,", ""))
+    dof = int(model.joint("FL_knee").dofadr[0])
+    body = model.body("FL_shank").id
     turned = [m.body_inertia[body].sum() + m.dof_armature[dof] for m in (plain, model)]
     assert 0.019 < model.dof_armature[dof] < 0.02 + 1e-4
     assert turned[1] == pytest.approx(turned[0] - plain.dof_armature[dof] + 0.02, rel=1e-6)

@@ -292,15 +292,15 @@ PLACES = {  # lines of the file, lines of parts/more.xml, where the mesh is
 }
 
 
-@pytest.mark.parametrize(("own", "more", "mesh"), PLACES.values(), ids=PLACES)
-def test_the_parts_of_an_mjcf_lie_where_mujoco_looks(tmp_path, own, more, mesh):
+@pytest.mark.parametrize(("text", "more", "mesh"), PLACES.values(), ids=PLACES)
+def test_included_files_and_meshes_are_found_where_mujoco_looks(tmp_path, text, more, mesh):
     texts = {"parts/more.xml": f"<mujoco>{more}</mujoco>", "parts/toy.xml": '<mujoco model="toy"><worldbody/></mujoco>'}
     for name, content in ({name: text.encode() for name, text in texts.items()} | {mesh: stl(TRUNK)}).items():
         (tmp_path / "dog" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "dog" / name).write_bytes(content)
     imsave(tmp_path / "dog" / "t.png", np.zeros((2, 2, 3)))
-    text = mjcf(trunk='type="mesh" mesh="trunk"').replace(MESH, f'{own}<include file="parts/more.xml"/>')
-    packed = pack_robot(get_robot(str(write_dog(tmp_path / "dog", model=text))))
+    model = mjcf(trunk='type="mesh" mesh="trunk"').replace(MESH, f'{text}<include file="parts/more.xml"/>')
+    packed = pack_robot(get_robot(str(write_dog(tmp_path / "dog", model=model))))
     assert robot_spec(packed.unpacked(tmp_path / "there")).compile().nmesh == 1
 
 
@@ -319,28 +319,28 @@ def test_a_robot_travels_with_its_files(tmp_path, anymal, kind):
     assert sum(builder.body_mass) == pytest.approx(MASS) and robot_digest(unpacked) == digest
     trunk = builder.shape_label.index("trunk")
     assert builder.shape_type[trunk] == newton.GeoType.MESH
-    positions, radii = probes_of(builder, trunk)
+    positions, radii = read_probes(builder, trunk)
     np.testing.assert_allclose((np.abs(positions) + radii[:, None]).max(axis=0), TRUNK, atol=0.01)
 
 
 def test_a_urdf_is_the_same_robot_as_its_mjcf(tmp_path):
     """Which flies and is pushed as in MuJoCo C (test_spellings)."""
     both = [build_robot(get_robot(str(write_dog(tmp_path / kind, **KINDS[kind])))) for kind in KINDS]
-    one, other = both
-    assert other.body_count == 9  # a trunk and four legs of two parts: feet are of their shanks
-    assert sum(other.body_mass) == pytest.approx(MASS)
-    assert one.joint_label[1:] == other.joint_label[1:] == list(JOINTS)
-    assert {*one.shape_label} == {*other.shape_label}
+    mjcf_robot, urdf_robot = both
+    assert urdf_robot.body_count == 9  # a trunk and four legs of two parts: feet are of their shanks
+    assert sum(urdf_robot.body_mass) == pytest.approx(MASS)
+    assert mjcf_robot.joint_label[1:] == urdf_robot.joint_label[1:] == list(JOINTS)
+    assert {*mjcf_robot.shape_label} == {*urdf_robot.shape_label}
     joints = ("target_ke", "target_kd", "armature", "limit_lower", "limit_upper")
     for name in ("body_mass", "body_com", "body_inertia", *(f"joint_{name}" for name in joints)):
-        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(*(getattr(builder, name) for builder in both), atol=1e-6, err_msg=name)
     for geom in ("trunk", "FL_thigh", "HR_foot"):  # a capsule tag of a URDF has its length without the caps
         for name in ("shape_type", "shape_body", "shape_scale", "shape_transform"):
-            of_one, of_other = (getattr(builder, name)[builder.shape_label.index(geom)] for builder in both)
-            np.testing.assert_allclose(np.array(of_one), np.array(of_other), atol=1e-6, err_msg=f"{geom} {name}")
+            values = [np.array(getattr(builder, name)[builder.shape_label.index(geom)]) for builder in both]
+            np.testing.assert_allclose(*values, atol=1e-6, err_msg=f"{geom} {name}")
 
 
-def probes_of(builder, shape):
+def read_probes(builder, shape):
     """Positions and radii of a shape's probes [m]."""
     probes = make_probes(builder)
     counts = np.diff(probes.strip_start.numpy())
@@ -352,9 +352,9 @@ def test_what_looks_at_a_fixed_body_is_left_out(tmp_path):
     file = write_dog(tmp_path)
     mark = '<body name="mark" pos="0.3 0 0"><geom size="0.01" mass="0.1"/></body><body><geom size="0.01"/></body>'
     replace_once(file.with_suffix(".xml"), FREE, f'{FREE}{mark}<camera mode="targetbody" target="mark"/>')
-    of_file = robot_spec(get_robot(str(file))).compile()
-    assert of_file.body_jntnum[1:].tolist() == [1] * (of_file.nbody - 1) and of_file.nbody == 1 + 1 + 8
-    assert {of_file.geom(k).name for k in range(of_file.ngeom)} >= {"mark_geom_0", "body_3_geom_0"}
+    model = robot_spec(get_robot(str(file))).compile()
+    assert model.body_jntnum[1:].tolist() == [1] * (model.nbody - 1) and model.nbody == 1 + 1 + 8
+    assert {model.geom(k).name for k in range(model.ngeom)} >= {"mark_geom_0", "body_3_geom_0"}
 
 
 def test_a_driving_plugin_and_a_robot_that_touches_nothing_are_refused(tmp_path):
