@@ -85,9 +85,9 @@ def fitting_space(robot: RobotCfg) -> str | None:
 
 
 def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
-    """What to say of a search whose controller is not the one that the scales were measured with; None if it is.
+    """A note on a search whose controller is not that of the robot's scales; None if it is.
 
-    Scales of the robot's own controller make searches against others comparable: this is no mistake.
+    This is no mistake: common scales make searches against different controllers comparable.
     """
     measured = read_json(robot.scales_file) if robot.scales_file.exists() else {}
     if measured.get("policy_sha256") in (None, controller_hash(policy)):

@@ -1,4 +1,4 @@
-"""What a robot's file may hold and no simulation takes: each function yields a complaint a finding."""
+"""Elements of a robot's file that simulations cannot represent: each function yields complaints."""
 
 from collections.abc import Iterator
 from typing import Any

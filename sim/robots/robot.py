@@ -24,7 +24,7 @@ class RobotCfg:
     """
 
     name: str
-    """What files and folders are called after it."""
+    """Name of its files and folders."""
     model_file: Path
     """MJCF, whose first body has the free joint, or URDF; relative to the settings' file."""
     base_geoms: tuple[str, ...]
@@ -62,9 +62,9 @@ class RobotCfg:
     max_duration_s: PositiveFloat = 20.0
     """Time after which a crossing ends [s]; the goal is 12 m away."""
     max_speed: PositiveFloat = 100.0
-    """A state with a velocity beyond is invalid [m/s or rad/s]: what the robot cannot reach, not even when it falls."""
+    """A state with a larger velocity is invalid [m/s or rad/s]: no robot reaches it, not even in a fall."""
     nconmax: PositiveInt = 40
-    """Most contacts of a robot with the ground."""
+    """Largest number of contacts of a robot with the ground."""
     stiffness: tuple[PositiveFloat, ...] | None = None
     """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
     damping: tuple[NonNegativeFloat, ...] | None = None
@@ -78,12 +78,12 @@ class RobotCfg:
 
     The motor is Isaac Lab's ``DCMotor`` since its pull request 2300: at a joint velocity v the torque of the PD gains
     is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
-    may be more or less. So beyond the speed limit a motor brakes, whatever it is told.
+    may be more or less. So beyond the speed limit a motor brakes, whatever its target.
     """
     velocity_limit: tuple[PositiveFloat, ...] | None = None
     """Speed of each joint at which its motor has no torque left [rad/s]."""
     drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
-    """Physics steps after which a joint target counts. Until the first one does, the default pose is held."""
+    """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
     friction: PositiveFloat | None = None
     """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
     .3."""
@@ -101,7 +101,7 @@ class RobotCfg:
 
     @property
     def spec(self) -> str:
-        """What :func:`sim.robots.find.get_robot` knows it by: name or settings file."""
+        """Argument of :func:`sim.robots.find.get_robot` that gives this robot: name or settings file."""
         return self.name if self.settings_file is None else str(self.settings_file)
 
     @property
@@ -138,7 +138,7 @@ class RobotCfg:
 
     @property
     def home(self) -> Path:
-        """Folder of its controller, training record and penalty scales; a user's robot has them beside its settings."""
+        """Folder of its controller, training record and penalty scales: that of the settings of a user's robot."""
         return ROBOTS_DIR if self.settings_file is None else self.settings_file.parent
 
     @property

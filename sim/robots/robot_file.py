@@ -20,10 +20,10 @@ from sim.robots.urdf import read_urdf
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFile:
-    """What a robot's file says, whatever its settings."""
+    """Content of a robot's file, without its settings."""
 
     spec: Any
-    """The ``MjSpec``, with what simulations take of it, under names."""
+    """The ``MjSpec``, stripped to what simulations use; every touching geom has a name."""
     model: Any
     drives: Drives
     home: list[float] | None

@@ -39,13 +39,13 @@ class RewardCfg:
     dof_pos_limits: float = 0.0
     """On the radians beyond the soft joint limits."""
     no_fly: float = 0.0
-    """On one foot alone being on the ground."""
+    """On control steps with exactly one foot on the ground."""
     orientation: float = 0.0
     """On the tilt of the base; Isaac Lab gives -2.5 to Cassie on flat ground, nothing on rough."""
     joint_deviation: float = 0.0
     """On the steady joints' distance from the default pose; Isaac Lab gives -.2 to Cassie's hips."""
     termination: float = 0.0
-    """On a fall, in the control step that it ends the episode with."""
+    """On a fall, in the control step that ends the episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +56,11 @@ class TrainingCfg:
     only_positive: bool = True
     """Clip the reward of a step at 0, so that ending early never pays."""
     min_air_time_s: NonNegativeFloat = 0.5
-    """Feet are to be in the air for longer than this in each step [s]."""
+    """Time in the air of a foot beyond which its steps are rewarded [s]."""
     soft_joint_limit: Annotated[float, Meta(gt=0, le=1)] = 1.0
     """Soft joint limits span this share of the range between the hard ones, about its middle."""
     steady_joints: tuple[str, ...] = ()
-    """Joints that are to keep near their default angle."""
+    """Joints whose distance from the default angle is penalised."""
     added_base_mass: Interval = (0.0, 0.0)
     """Range of the mass added to the bases [kg]; ANYmal's is -5 to 5."""
     push_speed: NonNegativeFloat = 1.0
@@ -97,7 +97,7 @@ MAX_SPREAD = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class TuningCfg:
-    """How the robot's controller is fine-tuned on terrains that break it; the defaults suit a robot of your own."""
+    """How the robot's controller is fine-tuned on terrains that break it; the defaults suit a user's robot."""
 
     termination: float = -200.0
     """Weight of :attr:`RewardCfg.termination` in place of the robot's own."""
