@@ -136,7 +136,7 @@ def find_candidates(archive: Archive, search: Search) -> tuple[list[Entry], list
     verdicts = find_verdicts(archive)
     near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
     families = dict(zip(near.tolist(), find_families(archive.genes[near], space).tolist(), strict=True))
-    causes = rank(archive, space, minima, half_width=search.robot.footprint[1]).causes if len(near) else ()
+    causes = rank(archive, space, minima, half_width=search.robot.half_width).causes if len(near) else ()
     entries: list[Entry] = []
     genes: list[NDArray[np.float32]] = []
     not_passable = 0

@@ -124,7 +124,7 @@ class OpenedRun:
         Without a number it is the worst elite. Labels name what stops the robot, where that is known.
         """
         archive, minima = self.archive, read_minimal(self.folder, self.archive)
-        half_width = self.robot.footprint[1]
+        half_width = self.robot.half_width
         if minimal is not None:
             minima = self.minima()
             numbers = minima.choose(minimal, self.path)

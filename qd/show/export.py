@@ -47,7 +47,7 @@ def export_elites(
     terrains = {terrain.stem: terrain for terrain in opened_run.terrains(elite, minimal)}
     minima = read_minimal(opened_run.folder, archive)
     numbers = [terrain.number for terrain in terrains.values()]
-    ranking = rank(archive, space, minima, half_width=opened_run.robot.footprint[1], numbers=numbers)
+    ranking = rank(archive, space, minima, half_width=opened_run.robot.half_width, numbers=numbers)
 
     def build(name: str) -> ExportedTerrain:
         genes = terrains[name].genes

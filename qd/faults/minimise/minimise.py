@@ -64,7 +64,7 @@ def minimise(
         archive = search.read_archive()
         numbers = _choose_failing(archive, elite, search, max_elites=_MAX_ELITES[device_kind])
         on_gpu = device_kind == "cuda"
-        half_width = search.robot.footprint[1]
+        half_width = search.robot.half_width
         cases = {n: open_case(archive, n, search.space, half_width, how, on_gpu=on_gpu) for n in numbers}
         minima = take_apart(archive, cases, search, crosser)
         elites = _as_elites(archive, minima, search.space)
@@ -166,7 +166,7 @@ def _entry(archive: Archive, number: int, case: Case, minimal: Minimal, search: 
     scales = (1.0, minimal.scale or 1.0)
     genes = [cut_genes(archive.genes[number], Trial(minimal.parts, scale), space) for scale in scales]
     effects = find_effects(genes[0], minimal.parts, space)
-    half_width = search.robot.footprint[1]
+    half_width = search.robot.half_width
     shapes = {part: effects.shape(index, half_width) for index, part in enumerate(minimal.parts)}
     cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
     whole, scaled = heights_of(np.array(genes), space)

@@ -49,5 +49,5 @@ def fresh_values(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -
 def with_families(archive: Archive, search: Search) -> Archive:
     """The archive with the family and the cause of each elite, as its fresh episodes have it."""
     families = find_families(archive.genes, search.space)
-    causes = find_failing_causes(archive, search.space, search.robot.footprint[1])
+    causes = find_failing_causes(archive, search.space, search.robot.half_width)
     return replace(archive, family=families, cause=causes)

@@ -50,7 +50,7 @@ def write_report(
     opened_run = open_run(robot, run, space=space)
     archive = opened_run.archive
     minima = read_minimal(opened_run.folder, archive)
-    ranking = rank(archive, opened_run.space, minima, half_width=opened_run.robot.footprint[1], judged=True)
+    ranking = rank(archive, opened_run.space, minima, half_width=opened_run.robot.half_width, judged=True)
     if not len(ranking):
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
     controller = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)

@@ -41,7 +41,7 @@ class ViewedRun:
         """All elites, and the orders to list them in."""
         return Listing(
             archive=self.opened_run.archive, space=self.opened_run.space, minima=self.minima,
-            half_width=self.robot.footprint[1],
+            half_width=self.robot.half_width,
         )  # fmt: skip
 
     @property
