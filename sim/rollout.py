@@ -100,7 +100,7 @@ class _Lot:
     num_episodes: int
     max_steps: int
     """Control steps by which they have ended if nothing else is under way."""
-    put_at: int
+    start_step: int
     """Control steps made before."""
 
 
@@ -311,7 +311,7 @@ class Rollout:
         self._write_terrains(terrains, slots)
         num_episodes = count * self.replicas
         max_steps = self._max_episode_steps * -(-num_episodes // self.num_envs)
-        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, max_steps=max_steps, put_at=self._step))
+        self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, max_steps=max_steps, start_step=self._step))
         self._next_slot = (first + count) % self.num_terrains
         self._num_unreleased += num_episodes
         if idle:
@@ -375,8 +375,8 @@ class Rollout:
         share = 0.0
         while True:
             ended = self._num_ended(lot)
-            share = max(share, ended / lot.num_episodes, (self._step - lot.put_at) / lot.max_steps)
-            if progress is not None and self._step > lot.put_at:
+            share = max(share, ended / lot.num_episodes, (self._step - lot.start_step) / lot.max_steps)
+            if progress is not None and self._step > lot.start_step:
                 progress(min(1.0, share))
             if ended == lot.num_episodes:
                 break

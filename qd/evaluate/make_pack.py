@@ -37,7 +37,7 @@ from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity, describe_controllers, is_same_controller
 from sim.files.atomic import prepare_output
 from sim.files.command import publish
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
@@ -79,7 +79,7 @@ def make_pack(
         )
     print(f"{len(chosen)} of {len(untrained)} faults and near-faults; {not_passable} more that nobody crosses.")
     chosen_genes = np.array([genes[index] for index in chosen], np.float32)
-    heights = round_heights(heights_of(chosen_genes, search.space))
+    heights = round_heights(make_heights(chosen_genes, search.space))
     out = out or RUNS / f"{robot.name}-pack"
     prepare_output(out / TERRAINS_FILE)
 

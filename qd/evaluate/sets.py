@@ -25,7 +25,7 @@ from qd.search.directory import read_robot_archive, search_seed
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.robots.training import PaperCfg
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space, load_space
@@ -246,7 +246,7 @@ def nearest_distance(
     Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
     """
     maps, training_maps = (
-        heights_of(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
+        make_heights(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
     )
     nearest = np.full(len(maps), np.inf)
     for first in range(0, len(training_maps), _BANK):

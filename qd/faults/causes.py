@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from kernels.ground import FIRM
 from sim.crossing import CrossingCfg
-from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.conditions.base import CONDITIONS, condition_texts
-from sim.terrains.ground import PATCHES, patches_at
+from sim.terrains.ground import PATCHES, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace, WiderSpace
 
@@ -100,8 +100,8 @@ class Effects:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
         patches = self.patches[part]
         x, y = CrossingCfg.start
-        first_row, last_row = patches_at((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
-        first, last = patches_at((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
+        first_row, last_row = patch_index((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
+        first, last = patch_index((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
         changed = patches[first_row : last_row + 1, first : last + 1].any()
         return largest_height(self.heights[part], half_width), bool(changed)
 
@@ -143,7 +143,7 @@ def describe_commonest(kind: str) -> str:
 def find_effects(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> Effects:
     """What some parts of a terrain, of genes of shape (num_genes,), do, each beside all others."""
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
-    heights, ground = terrains_of(np.concatenate(rows), space)
+    heights, ground = make_terrains(np.concatenate(rows), space)
     nothing = np.zeros((len(parts), *PATCHES), bool)
     return Effects(
         heights=heights[0] - heights[1:],
@@ -188,12 +188,12 @@ def _find_cause(genes: NDArray[np.float32], end: NDArray[np.floating], space: Te
     parts = range(len(raised.parts(row[0])))
     alone = [raised.without(row, [other for other in parts if other != part]) for part in parts] or [row]
     every = _COARSE if space.any_spacing else 1
-    maps = heights_of(np.concatenate(alone), raised, every=every)
+    maps = make_heights(np.concatenate(alone), raised, every=every)
     differences = [np.ptp(heights[_around(end, every * SPACING, heights.shape)]) for heights in maps]
     part = int(np.argmax(differences))
     if differences[part] < LEAST_HEIGHT:
         return _find_ground(genes, end, space) if space.ground else UNCLEAR
-    heights = maps[part] if every == 1 else heights_of(alone[part], raised)[0]
+    heights = maps[part] if every == 1 else make_heights(alone[part], raised)[0]
     at_end = np.roll(heights, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
     kinds = (measure_shape(field, half_width).kind for field in (heights, at_end))  # robots may leave the straight way
     return next((kind for kind in kinds if kind != OFF_THE_WAY), UNCLEAR)
@@ -210,11 +210,11 @@ def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -
 
 def _find_ground(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
     """What the ground at a place is like if it is unlike other ground."""
-    _, ground = terrains_of(genes[None], space)
+    _, ground = make_terrains(genes[None], space)
     assert ground is not None
     x, y = end.tolist()
-    row = patches_at(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
-    column = patches_at(x, SPACING * (NUM_COLS - 1), PATCHES[1])
+    row = patch_index(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
+    column = patch_index(x, SPACING * (NUM_COLS - 1), PATCHES[1])
     if ground.friction[0, row, column] < 1.0:
         return SLIPPERY
     return SOFT if ground.time_constant_s[0, row, column] != FIRM else UNCLEAR

@@ -19,7 +19,7 @@ from qd.faults.numbers import TEMPLATES, count_faults
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 
 VERDICTS = ("", "failing", "certified", "confirmed", "fault")
@@ -237,7 +237,7 @@ def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
     """
     if not len(genes):
         return np.zeros(0, np.int64)
-    banks = [heights_of(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
+    banks = [make_heights(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
     maps = np.concatenate([bank.reshape(len(bank), -1).astype(np.float64) for bank in banks])
     _, families = connected_components(rms_distances(maps, maps) < KIN_M, directed=False)
     return families.astype(np.int64)

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.text import Text
 
 from qd.search.settings import SearchCfg
-from qd.workers.invalid import WARNED_SHARE, reason_words
+from qd.workers.invalid import WARNED_SHARE, format_reasons
 from sim.controllers.spec import SHIPPED
 
 _CELLS = 10  # of the bar
@@ -90,7 +90,7 @@ class Bar:
 def describe_iteration(row: dict[str, Any], iterations: int, workers: object = None) -> str:
     """Where a search stands after an iteration, and how its workers fare if there are any."""
     invalid = row["invalid_episodes"] / row["episodes"]
-    why = reason_words(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
+    why = format_reasons(row["invalid_reasons"]) if invalid > WARNED_SHARE else ""
     return (
         f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites "
         f"({row['expected_same_cell']:,.0f} to stay), "

@@ -19,7 +19,7 @@ from sim.files.provenance import provenance
 from sim.files.templates import open_templates
 from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 
 INDEX_FILE = "index.json"
@@ -51,7 +51,7 @@ def export_elites(
 
     def build(name: str) -> ExportedTerrain:
         genes = terrains[name].genes
-        (heights,), ground = terrains_of(genes[None], space)
+        (heights,), ground = make_terrains(genes[None], space)
         timestep = opened_run.robot.physics_dt
         return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=timestep, ground=ground)
 

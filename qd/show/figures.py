@@ -19,7 +19,7 @@ from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import format_value
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.ground import GroundMaps
 from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
 from sim.terrains.spaces.base import TerrainSpace
@@ -149,7 +149,7 @@ def draw_minimal(
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("terrains by their cause")
     panels = subfigures[1].subplots(rows, _COLUMNS, squeeze=False).ravel()
-    grids, grounds = terrains_of(np.array([genes[entries[index]["elite"]] for index in shown]), space)
+    grids, grounds = make_terrains(np.array([genes[entries[index]["elite"]] for index in shown]), space)
     for panel in panels[len(shown) :]:
         panel.set_axis_off()
     for k, (panel, index) in enumerate(zip(panels, shown, strict=False)):

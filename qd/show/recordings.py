@@ -123,7 +123,7 @@ class RecordingCrosser:
             self._robot, first.policy, terrains, result, device=self._device,
             labels=[crossing.label for crossing in wanted], seed=first.seed,
         )  # fmt: skip
-        return [recording.of_terrain(k) for k in range(len(wanted))]
+        return [recording.select_terrain(k) for k in range(len(wanted))]
 
 
 class Recordings:

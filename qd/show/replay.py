@@ -16,7 +16,7 @@ from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
 from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
-from qd.workers.invalid import invalid_reasons, reason_words, refuse_all_invalid
+from qd.workers.invalid import format_reasons, invalid_reasons, refuse_all_invalid
 from sim.controllers.spec import ControllerSpec, crosser_name
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.figures import as_png
@@ -221,7 +221,7 @@ def describe(source: ReplaySource, k: int, recording: Recording) -> str:
     lines = _TEMPLATES.get_template("replay.txt").render(
         units=", ".join(units),
         invalid=sum(reasons.values()),
-        reasons=reason_words(reasons),
+        reasons=format_reasons(reasons),
         **({"run": None} if run is None else _describe_elite(run, source.terrains[k], now)),
         controller=source.by,
     )

@@ -32,32 +32,32 @@ def invalid_reasons(result: RolloutResult) -> dict[str, int]:
     return dict(counts.most_common())
 
 
-def reason_words(reasons: Mapping[str, int]) -> str:
+def format_reasons(reasons: Mapping[str, int]) -> str:
     """Counts by reason in words: ``31 non-finite action, 2 too fast``."""
     return ", ".join(f"{count} {_REASONS[name][0]}" for name, count in reasons.items())
 
 
-def invalid_words(reasons: Mapping[str, int], episodes: int) -> str | None:
+def explain_invalid(reasons: Mapping[str, int], episodes: int) -> str | None:
     """What to say of invalid episodes by reason, the most frequent first; None where they are 5 % or less."""
     count = sum(reasons.values())
     if count <= WARNED_SHARE * episodes:
         return None
-    words = f"{count} of {episodes} episodes are invalid and left out ({count / episodes:.1%}: {reason_words(reasons)})"
-    return f"{words}; {_REASONS[next(iter(reasons))][1]}"
+    share = f"{count / episodes:.1%}: {format_reasons(reasons)}"
+    return f"{count} of {episodes} episodes are invalid and left out ({share}); {_REASONS[next(iter(reasons))][1]}"
 
 
 def invalid_iterations(metrics: Sequence[Mapping[str, Any]]) -> str | None:
     """What to say of the invalid episodes of a search's iterations; None where none had over 5 % of them."""
     bad = [row for row in metrics if row["invalid_episodes"] > WARNED_SHARE * row["episodes"]]
     reasons: Counter[str] = sum((Counter(row["invalid_reasons"]) for row in bad), Counter())
-    words = invalid_words(dict(reasons.most_common()), sum(row["episodes"] for row in bad)) if bad else None
+    words = explain_invalid(dict(reasons.most_common()), sum(row["episodes"] for row in bad)) if bad else None
     return words and f"In {len(bad)} of {len(metrics)} iterations over {WARNED_SHARE:.0%} are invalid: {words}."
 
 
 def refuse_all_invalid(result: RolloutResult) -> None:
     """Raises AllInvalidError if no episode is valid."""
     if result.invalid.size and result.invalid.all():
-        words = invalid_words(invalid_reasons(result), result.invalid.size)
+        words = explain_invalid(invalid_reasons(result), result.invalid.size)
         raise AllInvalidError(f"no episode is valid, expected some: {words}")
 
 
@@ -68,6 +68,6 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
     """
     if not all_ok:
         refuse_all_invalid(result)
-    words = invalid_words(invalid_reasons(result), result.invalid.size)
+    words = explain_invalid(invalid_reasons(result), result.invalid.size)
     if words is not None:
         print(f"{label}: {words}", file=sys.stderr)

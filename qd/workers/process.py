@@ -86,7 +86,8 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
             if lot is None:
                 raise EOFError
             crosser.put(*lot)
-            under_way, wait = under_way + 1, False
+            under_way = under_way + 1
+            wait = False
 
     def report(share: float) -> None:
         put_in(wait=False)

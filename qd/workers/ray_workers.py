@@ -22,7 +22,7 @@ from qd.workers import cluster
 from qd.workers.compute import available_cores, parse_workers
 from qd.workers.pipeline import Build, Pipeline, PipelineCfg, WorkerStatus
 from qd.workers.process import EvaluatorError
-from qd.workers.shards import copied, flaw_of, join_results
+from qd.workers.shards import copied, find_flaw, join_results
 from sim.controllers.spec import ControllerSpec
 from sim.files.command import debugging
 from sim.files.provenance import code_fingerprint
@@ -78,7 +78,11 @@ class RayWorker:
         space: PackedCode | None,
         build: Build,
     ) -> None:
-        self._cfg, self._controller, self._robot, self._space, self._build = cfg, controller, robot, space, build
+        self._cfg = cfg
+        self._controller = controller
+        self._robot = robot
+        self._space = space
+        self._build = build
 
     def prepare(self, num_terrains: int, code: str) -> None:
         """Builds the simulation; refuses to if this machine has other code."""
@@ -86,7 +90,8 @@ class RayWorker:
             raise ValueError(f"{socket.gethostname()} has other code or packages: use the same commit everywhere")
         # The process may be killed at any time, so the folder must not live as long as it does.
         with tempfile.TemporaryDirectory(prefix="faultline-") as name:
-            folder, cfg = Path(name), self._cfg
+            folder = Path(name)
+            cfg = self._cfg
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
             if self._space is not None:
                 code = self._space.unpacked(folder / "space")
@@ -164,7 +169,8 @@ class RayWorkers(Pipeline):
 
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Waits for the lot that was put in first."""
-        lot, self._seen_at = self._lots[0], time.monotonic()
+        lot = self._lots[0]
+        self._seen_at = time.monotonic()
         while (done := sum(shard.result is not None for shard in lot)) < len(lot):
             self._turn()
             if progress is not None:
@@ -173,7 +179,8 @@ class RayWorkers(Pipeline):
             progress(1.0)
         self._lots.popleft()
         now = time.perf_counter()
-        wall_s, self._result_at = now - self._result_at, now
+        wall_s = now - self._result_at
+        self._result_at = now
         return replace(join_results([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
 
     def _shard_size(self) -> int:
@@ -211,19 +218,22 @@ class RayWorkers(Pipeline):
 
     def _deal(self) -> None:
         while self._waiting and self._idle:
-            worker, shard = self._idle.popleft(), self._waiting.popleft()
+            worker = self._idle.popleft()
+            shard = self._waiting.popleft()
             self._tasks[worker.cross.remote(shard.terrains)] = worker, shard
 
     def _finish(self, task: Any, worker: Any, shard: _Shard | None) -> None:
         """Takes a task's result; replaces the worker if it failed."""
         result: Any = None
-        error, flaw = None, None
+        error = None
+        flaw = None
         try:
             result = ray.get(task)
             if shard is not None:
-                flaw = flaw_of(result, len(shard.terrains), self._cfg.replicas)
+                flaw = find_flaw(result, len(shard.terrains), self._cfg.replicas)
         except RayError as raised:
-            error, flaw = raised, _reason_of(raised)
+            error = raised
+            flaw = _find_reason(raised)
         if flaw is None:
             self._idle.append(worker)
             if shard is not None:
@@ -257,7 +267,7 @@ def _is_refusal(error: BaseException | None) -> bool:
     return isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)
 
 
-def _reason_of(error: BaseException) -> str:
+def _find_reason(error: BaseException) -> str:
     """Why a worker failed, in one line: the exception that it raised, or how it died; its traceback for debugging."""
     if isinstance(error, RayTaskError):
         text = f"{type(error.cause).__name__}: {' '.join(str(error.cause).split())}"
@@ -274,6 +284,6 @@ def open_ray_workers(cfg: PipelineCfg, build: Build) -> Iterator[RayWorkers]:
         workers.open()
         yield workers
     except RayError as error:
-        raise EvaluatorError(f"the Ray cluster failed: {_reason_of(error)}") from error
+        raise EvaluatorError(f"the Ray cluster failed: {_find_reason(error)}") from error
     finally:
         workers.close()

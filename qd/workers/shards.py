@@ -15,7 +15,7 @@ _STEPS = ("physics_steps", "robot_steps", "busy_steps")
 
 def copied(result: RolloutResult) -> RolloutResult:
     """A result that can be written to, which what Ray delivers cannot."""
-    return replace(result, **{name: value.copy() for name, value in arrays_of(result).items()})
+    return replace(result, **{name: value.copy() for name, value in result_arrays(result).items()})
 
 
 def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResult:
@@ -23,7 +23,7 @@ def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResul
     if len(results) == 1:
         return results[0]
     changes: dict[str, Any] = {
-        name: np.concatenate([getattr(result, name) for result in results]) for name in arrays_of(results[0])
+        name: np.concatenate([getattr(result, name) for result in results]) for name in result_arrays(results[0])
     }
     if results[0].frames is not None:
         changes["frames"] = Frames.join([result.frames for result in results if result.frames is not None])
@@ -36,10 +36,10 @@ def join_results(results: Sequence[RolloutResult], *, join: int) -> RolloutResul
 def choose_rows(result: RolloutResult, rows: NDArray[np.intp]) -> RolloutResult:
     """A result with some of its terrains alone, in the order given."""
     frames = None if result.frames is None else result.frames[rows]
-    return replace(result, **{name: values[rows] for name, values in arrays_of(result).items()}, frames=frames)
+    return replace(result, **{name: values[rows] for name, values in result_arrays(result).items()}, frames=frames)
 
 
-def flaw_of(result: Any, count: int, replicas: int) -> str | None:
+def find_flaw(result: Any, count: int, replicas: int) -> str | None:
     """Why a result cannot be one of ``count`` terrains, in words; None if it can.
 
     Memory gone bad on another machine must not become a number in an archive: shapes, finite penalties of every valid
@@ -48,10 +48,12 @@ def flaw_of(result: Any, count: int, replicas: int) -> str | None:
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
     shape = (count, replicas)
-    wrong = [f"{name} of shape {value.shape}" for name, value in arrays_of(result).items() if value.shape[:2] != shape]
+    shapes = {name: value.shape for name, value in result_arrays(result).items()}
+    wrong = [f"{name} of shape {got}" for name, got in shapes.items() if got[:2] != shape]
     if wrong:
         return f"{', '.join(wrong)} for {count} terrains of {replicas} episodes"
-    penalties, invalid = result.penalties, result.invalid
+    penalties = result.penalties
+    invalid = result.invalid
     if penalties.shape != (*shape, len(result.penalty_names)):
         return f"penalties of shape {penalties.shape}"
     if not (np.isfinite(penalties[~invalid]) & (penalties[~invalid] >= 0.0)).all():
@@ -65,7 +67,7 @@ def flaw_of(result: Any, count: int, replicas: int) -> str | None:
     return None
 
 
-def arrays_of(result: RolloutResult) -> dict[str, np.ndarray]:
+def result_arrays(result: RolloutResult) -> dict[str, np.ndarray]:
     """The arrays of a result by their names, which lead with (num_terrains, replicas)."""
     values = {field.name: getattr(result, field.name) for field in fields(result)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -35,7 +35,7 @@ from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.bank import TerrainBank, terrains_of
+from sim.terrains.bank import TerrainBank, make_terrains
 from sim.terrains.conditions.base import nominal_row, split_row
 from sim.terrains.ground import GroundMaps
 from sim.terrains.terrains import Terrains
@@ -63,7 +63,9 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     with wp.ScopedDevice(device):
         joint_q = wp.zeros((count, 7 + robot.num_joints), dtype=float)
         joint_qd = wp.zeros((count, 6 + robot.num_joints), dtype=float)
-        episodes, terrain_of_env, sensors = make_episodes(count), wp.zeros(count, dtype=int), Sensors()
+        episodes = make_episodes(count)
+        terrain_of_env = wp.zeros(count, dtype=int)
+        sensors = Sensors()
         sensors.base_com = base_com = wp.vec3(*_base_com(robot))
         sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
         queue = make_queue(count, 1, count, 0, rewarded=False, device=device)
@@ -83,8 +85,10 @@ class EpisodeStates:
 
     def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: Array | None = None) -> None:
         """From ``starts`` on, under a row of ``conditions`` by which the model is changed; nominal ones if None."""
-        self.robot, self.model = robot, model
-        self.strength, self.delay_steps = 1.0, robot.drive_delay_steps
+        self.robot = robot
+        self.model = model
+        self.strength = 1.0
+        self.delay_steps = robot.drive_delay_steps
         self.former_rows = deque[Array]()
         self.rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))
         self._conditions = list(split_row(nominal_row() if conditions is None else conditions))
@@ -93,11 +97,14 @@ class EpisodeStates:
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
         self.data = [mj.MjData(model) for _ in starts.qpos]
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
-            data.qpos[:], data.qvel[:] = qpos, qvel
-        self.qpos, self.qvel = starts.qpos.copy(), starts.qvel.copy()
+            data.qpos[:] = qpos
+            data.qvel[:] = qvel
+        self.qpos = starts.qpos.copy()
+        self.qvel = starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
         self.warned = np.zeros(len(self.data), bool)
-        self._joints, self._effort = model.actuator_trnid[:, 0] - 1, model.actuator_forcerange[:, 1] / self.strength
+        self._joints = model.actuator_trnid[:, 0] - 1
+        self._effort = model.actuator_forcerange[:, 1] / self.strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
@@ -111,12 +118,14 @@ class EpisodeStates:
             data = self.data[k]
             data.ctrl[:] = targets[k]
             if self._motors is not None:
-                (stall, limit), effort = self._motors, self._effort
+                (stall, limit) = self._motors
+                effort = self._effort
                 lost = stall * data.qvel[6 + self._joints] / limit
                 limits = np.clip([-stall - lost, stall - lost], -effort, effort).T
                 self._model.actuator_forcerange[:] = self.strength * limits
             mj.mj_step(self._model, data)
-            self.qpos[k], self.qvel[k] = data.qpos, data.qvel
+            self.qpos[k] = data.qpos
+            self.qvel[k] = data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
 
@@ -134,8 +143,10 @@ class EpisodeStates:
 def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
     """Outcome of each running episode after a physics step, the gravest of several."""
     cfg = CrossingCfg
-    qpos, qvel = episodes.qpos[running], episodes.qvel[running]
-    x, y = qpos[:, 0], qpos[:, 1]
+    qpos = episodes.qpos[running]
+    qvel = episodes.qvel[running]
+    x = qpos[:, 0]
+    y = qpos[:, 1]
     outcome = np.full(len(running), Outcome.RUNNING)
     outside = (x < cfg.lower[0]) | (x > cfg.upper[0]) | (y < cfg.lower[1]) | (y > cfg.upper[1])
     outcome[outside] = Outcome.OUT
@@ -165,11 +176,14 @@ def cross_in_mujoco_c(
     """
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     episodes = EpisodeStates(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
-    count, base = len(starts.qpos), np.array([name in robot.base_geoms for name in robot.geom_names])
+    count = len(starts.qpos)
+    base = np.array([name in robot.base_geoms for name in robot.geom_names])
     feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
-    default, scan = np.array(robot.default_joint_pos), np.stack(robot.scan_points(), axis=1)
+    default = np.array(robot.default_joint_pos)
+    scan = np.stack(robot.scan_points(), axis=1)
     outcome = np.full(count, Outcome.RUNNING)
-    steps, sums = np.zeros(count, int), np.zeros((count, len(PENALTIES)))
+    steps = np.zeros(count, int)
+    sums = np.zeros((count, len(PENALTIES)))
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
@@ -179,7 +193,8 @@ def cross_in_mujoco_c(
         if len(running) == 0:
             break
         if step % robot.decimation == 0:
-            qpos, qvel = episodes.qpos[running], episodes.qvel[running]
+            qpos = episodes.qpos[running]
+            qvel = episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
             rows[running] = observations(
@@ -248,9 +263,10 @@ class MujocoC:
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Cross the lot that was put in first."""
         terrains = self._pending.popleft()
-        heights, ground = terrains.heights, terrains.ground
+        heights = terrains.heights
+        ground = terrains.ground
         if heights is None:
-            heights, ground = terrains_of(terrains.values, terrains.space, device=self._device)
+            heights, ground = make_terrains(terrains.values, terrains.space, device=self._device)
         results = []
         for index, (grid, seed) in enumerate(zip(heights, terrains.seeds, strict=True)):
             starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)

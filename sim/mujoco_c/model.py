@@ -49,7 +49,8 @@ def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[A
     Newton's has shapes (num, 7 + num_joints), quaternion xyzw, and (num, 6 + num_joints), velocity of the base's mass
     centre, which is at ``base_com`` in its frame [m], and angular velocity, world frame.
     """
-    qpos, qvel = joint_q.astype(np.float64), joint_qd.astype(np.float64)
+    qpos = joint_q.astype(np.float64)
+    qvel = joint_qd.astype(np.float64)
     qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
     for k, quaternion in enumerate(qpos[:, 3:7]):
         to_world = rotation_matrix(quaternion)
@@ -78,11 +79,14 @@ def crossing_model(
     spec = robot_spec(robot)
     spec.memory = _MEMORY
     option = spec.option
-    option.timestep, option.iterations, option.ls_iterations = robot.physics_dt, 100, 50
-    option.integrator, option.cone = mj.mjtIntegrator.mjINT_IMPLICITFAST, mj.mjtCone.mjCONE_ELLIPTIC
+    option.timestep = robot.physics_dt
+    option.iterations = 100
+    option.ls_iterations = 50
+    option.integrator = mj.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mj.mjtCone.mjCONE_ELLIPTIC
     option.disableflags = mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     plain = ground is None or ((ground.friction == 1.0).all() and (ground.time_constant_s == FIRM).all())
-    patches = [] if ground is None or plain else _patches_of(ground)
+    patches = [] if ground is None or plain else _read_patches(ground)
     if patches:
         _add_patches(spec, heights, patches)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
@@ -143,9 +147,10 @@ class _Patch:
     time_constant_s: float
 
 
-def _patches_of(ground: GroundMaps) -> list[_Patch]:
+def _read_patches(ground: GroundMaps) -> list[_Patch]:
     """The patches of one terrain; columns of the map in which nothing changes are one."""
-    (num_rows, num_cols), maps = PATCHES, np.stack([ground.friction[0], ground.time_constant_s[0]])
+    (num_rows, num_cols) = PATCHES
+    maps = np.stack([ground.friction[0], ground.time_constant_s[0]])
     changes = 1 + np.flatnonzero((maps[..., 1:] != maps[..., :-1]).any(axis=(0, 1)))
     return [
         _Patch(
@@ -171,7 +176,8 @@ def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
 def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> None:
     """Adds a geom a patch, a box where it is level and else a heightfield."""
     for number, patch in enumerate(patches):
-        part, name = heights[patch.rows, patch.cols], f"{GROUND}-{number}" if number else GROUND
+        part = heights[patch.rows, patch.cols]
+        name = f"{GROUND}-{number}" if number else GROUND
         if np.ptp(part) > 0.0:
             if patch.time_constant_s:
                 raise ValueError(NO_SOFTNESS)
@@ -198,7 +204,8 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     model.geom_friction[geoms] = model.geom_friction[first]
     sliding = max(model.geom_friction[first, 0], GROUND_FRICTION)
     model.geom_friction[geoms, 0] = [sliding * patch.friction for patch in patches]
-    model.geom_solref[geoms], model.geom_solimp[geoms] = model.geom_solref[first], model.geom_solimp[first]
+    model.geom_solref[geoms] = model.geom_solref[first]
+    model.geom_solimp[geoms] = model.geom_solimp[first]
     time_constant = np.array([patch.time_constant_s for patch in patches])
     soft = time_constant > max(model.geom_solref[first, 0], 0.0)
     impedance = model.geom_solimp[first, 1]
@@ -213,14 +220,18 @@ def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
     Each cell is cut from its (low x, high y) to its (high x, low y) corner. Heights [m] have shape (nrow, ncol); beyond
     its edge the edge height continues. Points are x and y [m] of any one shape.
     """
-    limit_row, limit_col = heights.shape[0] - 1, heights.shape[1] - 1
+    limit_row = heights.shape[0] - 1
+    limit_col = heights.shape[1] - 1
     column = np.clip(x / SPACING, 0.0, limit_col)
     row = np.clip(y / SPACING, 0.0, limit_row)
     j = np.minimum(column.astype(int), limit_col - 1)
     i = np.minimum(row.astype(int), limit_row - 1)
-    u, v = column - j, row - i
-    near, far = heights[i, j], heights[i + 1, j + 1]
-    along_x, along_y = heights[i, j + 1], heights[i + 1, j]
+    u = column - j
+    v = row - i
+    near = heights[i, j]
+    far = heights[i + 1, j + 1]
+    along_x = heights[i, j + 1]
+    along_y = heights[i + 1, j]
     lower = near + u * (along_x - near) + v * (along_y - near)
     upper = far + (1 - u) * (along_y - far) + (1 - v) * (along_x - far)
     return np.where(u + v <= 1, lower, upper)

@@ -16,7 +16,7 @@ import numpy as np
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes, read_arrays
 from sim.recording.recorder import FRAME_ARRAYS, Recording
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space, is_own
 
@@ -62,6 +62,6 @@ def _read(path: Path) -> Recording:
     if maps := {name: values.pop(name) for name in _OF_GROUND if name in content}:
         values["ground"] = GroundMaps(**maps)
     if "heights" not in content:
-        values["heights"] = heights_of(content["genes"], get_space(origin["space"]))
+        values["heights"] = make_heights(content["genes"], get_space(origin["space"]))
     values |= {name: content[name].astype(np.float32) for name in FRAME_ARRAYS} | {"dt": float(content["dt"])}
     return Recording(**values)

@@ -84,9 +84,10 @@ class Recording:
         """K."""
         return self.outcome.shape[1]
 
-    def of_terrain(self, terrain: int) -> "Recording":
+    def select_terrain(self, terrain: int) -> "Recording":
         """The recording of the terrain of one index alone."""
-        row, frames = slice(terrain, terrain + 1), int(self.num_frames[terrain].max())
+        row = slice(terrain, terrain + 1)
+        frames = int(self.num_frames[terrain].max())
         cut = {name: getattr(self, name)[row, :, :frames] for name in (*FRAME_ARRAYS, "touching")}
         each = ("labels", "heights", "seeds", "outcome", "invalidity", "fallen", "duration_s", "num_frames")
         given = [name for name in ("genes", "ground") if getattr(self, name) is not None]
@@ -137,7 +138,8 @@ class _Frames:
 
     def after_step(self) -> None:
         """Add the last frame of every episode that ended; where a step broke the state, there is none."""
-        outcome, episode = self._rollout.outcome.numpy(), self._rollout.episode.numpy()
+        outcome = self._rollout.outcome.numpy()
+        episode = self._rollout.episode.numpy()
         ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
         ended = ended[~self._ended[episode[ended]]]
         self._ended[episode[ended]] = True

@@ -23,7 +23,8 @@ _ARROW = 0.8  # length of the arrow of a force at the robot's limit [m]
 _ARROW_WIDTH = 0.012
 _LEAST_FORCE = 5.0  # shown [N]
 _SUN_AWAY = 8.0  # from what one looks at [m]
-_CALM, _ALARMED = np.array([0.95, 0.80, 0.20, 0.9], np.float32), np.array([0.85, 0.10, 0.10, 0.9], np.float32)
+_CALM = np.array([0.95, 0.80, 0.20, 0.9], np.float32)
+_ALARMED = np.array([0.85, 0.10, 0.10, 0.9], np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +85,9 @@ class Renderer:
         self._scene = mj.MjvScene(self.model, maxgeom=_MAX_GEOMS)
         self._scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mj.mjtRndFlag.mjRND_REFLECTION] = False
-        self._options, self._nudge, self._camera = mj.MjvOption(), mj.MjvPerturb(), mj.MjvCamera()
+        self._options = mj.MjvOption()
+        self._nudge = mj.MjvPerturb()
+        self._camera = mj.MjvCamera()
         self._camera.type = mj.mjtCamera.mjCAMERA_FREE
         self._gpu = mj.MjrContext(self.model, mj.mjtFontScale.mjFONTSCALE_100.value)
         mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
@@ -121,7 +124,8 @@ class Renderer:
         self._camera.distance = camera.distance
         # The sun goes with the camera, so that its shadows are sharp where one looks.
         data.light_xpos[-1] = np.array(camera.target) - _SUN_AWAY * data.light_xdir[-1]
-        self._camera.azimuth, self._camera.elevation = camera.azimuth, camera.elevation
+        self._camera.azimuth = camera.azimuth
+        self._camera.elevation = camera.elevation
         everything = mj.mjtCatBit.mjCAT_ALL.value
         mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
@@ -155,22 +159,26 @@ class Renderer:
 
     def _add_ghost(self, qpos: NDArray[np.floating]) -> None:
         self._pose(self._ghost_data, qpos)
-        first, moving = self._scene.ngeom, mj.mjtCatBit.mjCAT_DYNAMIC.value
+        first = self._scene.ngeom
+        moving = mj.mjtCatBit.mjCAT_DYNAMIC.value
         mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
         for geom in self._scene.geoms[first : self._scene.ngeom]:
             geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
-            geom.matid, geom.transparent = -1, 1
+            geom.matid = -1
+            geom.transparent = 1
 
     def _named(self, picture: NDArray[np.uint8], base: NDArray[np.floating], name: str) -> NDArray[np.uint8]:
         """The picture with a name over a robot whose base is there [m]."""
-        image, (height, width, _) = Image.fromarray(picture), picture.shape
+        image = Image.fromarray(picture)
+        (height, width, _) = picture.shape
         camera = self._scene.camera[0]  # that of one eye, at most a few centimetres from the middle of both
         over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
         away = np.asarray(base, np.float64) + np.array(over) - camera.pos
         depth = float(away @ camera.forward)
         if depth > camera.frustum_near:
             pixels = 0.5 * height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
-            right, up = away @ np.cross(camera.forward, camera.up), away @ camera.up
+            right = away @ np.cross(camera.forward, camera.up)
+            up = away @ camera.up
             place = 0.5 * width + pixels * right, 0.5 * height - pixels * up
             color = tuple(round(150.0 * share) for share in OTHER_CONTROLLER)
             font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
@@ -178,11 +186,13 @@ class Renderer:
         return np.array(image)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        size, limit = float(np.linalg.norm(force)), self._robot.contact_force_limit
+        size = float(np.linalg.norm(force))
+        limit = self._robot.contact_force_limit
         if size < _LEAST_FORCE:
             return
         tip = foot + force * (_ARROW / limit * min(1.0, 2.5 * limit / size))
-        geom, kind = self._scene.geoms[self._scene.ngeom], mj.mjtGeom.mjGEOM_ARROW.value
+        geom = self._scene.geoms[self._scene.ngeom]
+        kind = mj.mjtGeom.mjGEOM_ARROW.value
         color = _ALARMED if size > limit else _CALM
         mj.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), color)
         mj.mjv_connector(geom, kind, _ARROW_WIDTH, foot, tip)

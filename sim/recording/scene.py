@@ -20,7 +20,8 @@ from sim.terrains.maps.picture import height_colors, tinted
 
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""
-TOUCH, FOOT_TOUCH = (0.84, 0.09, 0.48), (1.0, 0.84, 0.04)
+TOUCH = (0.84, 0.09, 0.48)
+FOOT_TOUCH = (1.0, 0.84, 0.04)
 """Of base and limbs, and of feet, while they touch."""
 OTHER_CONTROLLER = (0.05, 0.62, 0.55)
 """Of ghosts: another controller's crossing."""
@@ -67,7 +68,8 @@ def scene_model(
     _add_ground(spec, heights, paint.shape)
     _add_goal(spec, heights)
     _add_light(spec)
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.global_.offwidth = width
+    spec.visual.global_.offheight = height
     model = robot_model(spec, robot)
     model.vis.map.shadowclip = _SHADOWED / model.stat.extent
     first = int(model.texture(GROUND).adr[0])
@@ -123,5 +125,8 @@ def _add_light(spec: Any) -> None:
         castshadow=True,
     )
     headlight = spec.visual.headlight
-    headlight.ambient, headlight.diffuse, headlight.specular = [0.42] * 3, [0.22] * 3, [0.0] * 3
-    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 2048, 0
+    headlight.ambient = [0.42] * 3
+    headlight.diffuse = [0.22] * 3
+    headlight.specular = [0.0] * 3
+    spec.visual.quality.shadowsize = 2048
+    spec.visual.quality.offsamples = 0

@@ -12,7 +12,7 @@ from sim.robots.model import build_robot
 from sim.robots.probes import measure_extents, start_height
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
-from sim.terrains.bank import TerrainBank, heights_of
+from sim.terrains.bank import TerrainBank, make_heights
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
@@ -76,7 +76,7 @@ class Standing:
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32) -> Standing:
     """Stands one robot on flat ground for ``seconds`` and drops ``drops`` others in drawn poses on drawn terrains."""
     bank = TerrainBank(1 + _TERRAINS, device=device)
-    rough = heights_of(SUPER_GAUSSIAN.hard_random(_TERRAINS, 0))
+    rough = make_heights(SUPER_GAUSSIAN.hard_random(_TERRAINS, 0))
     heights = np.concatenate([np.zeros_like(rough[:1]), rough])
     bank.set_heights(heights)
     terrains = np.concatenate([[0], 1 + np.arange(drops) % _TERRAINS])

@@ -49,7 +49,8 @@ class TerrainBank:
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
         nominal = np.tile(nominal_row(), (num_terrains, 1))
         self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None
-        self.device, self.num_terrains = device, num_terrains
+        self.device = device
+        self.num_terrains = num_terrains
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
         """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol).
@@ -86,7 +87,8 @@ class TerrainBank:
 
     def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
         """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
-        valid, replaced = space.validate(genes), self.heights[slots]
+        valid = space.validate(genes)
+        replaced = self.heights[slots]
         if len(valid) != len(replaced):
             raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
         self._check_room(ground=bool(space.ground), conditions=bool(space.conditions))
@@ -95,7 +97,8 @@ class TerrainBank:
         max_blocks(replaced, self.terrain.ceilings[slots])
         if self.ground is not None:
             maps = Ground()
-            maps.friction, maps.time_constant = self.ground.friction[slots], self.ground.time_constant[slots]
+            maps.friction = self.ground.friction[slots]
+            maps.time_constant = self.ground.time_constant[slots]
             maps.friction.fill_(1.0)
             maps.time_constant.fill_(FIRM)
             space.lay_ground(on_device, maps)
@@ -112,19 +115,20 @@ class TerrainBank:
         """The maps of all terrains on the host; None of a bank without any."""
         if self.ground is None:
             return None
-        friction, time_constant_s = self.ground.friction.numpy(), self.ground.time_constant.numpy()
+        friction = self.ground.friction.numpy()
+        time_constant_s = self.ground.time_constant.numpy()
         conditions = None if self.conditions is None else self.conditions.numpy().copy()
         return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy(), conditions=conditions)
 
 
-def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
+def make_heights(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
     """Height grids [m] of genes, shape (num_terrains, num_genes), as a simulation has them, on the host.
 
     Float32, shape (num_terrains, NUM_ROWS, NUM_COLS); of rows and columns only ``every`` so many from the first on, a
     divisor of the cells of both.
     """
     if every == 1 or not space.any_spacing:
-        return terrains_of(genes, space)[0][:, ::every, ::every]
+        return make_terrains(genes, space)[0][:, ::every, ::every]
     shape = len(genes), (NUM_ROWS - 1) // every + 1, (NUM_COLS - 1) // every + 1
     with wp.ScopedDevice(host_device()):  # the nodes in between are not worked out
         heights: Any = wp.empty(shape, dtype=float)
@@ -132,7 +136,7 @@ def heights_of(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every
         return np.array(heights.numpy())
 
 
-def terrains_of(
+def make_terrains(
     genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, device: str | None = None
 ) -> tuple[np.ndarray, GroundMaps | None]:
     """Height grids [m] of genes, shape (num_terrains, num_genes), and their ground, if the space has any.

@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
 from sim.terrains.conditions.base import condition_genes
-from sim.terrains.ground import patches_at
+from sim.terrains.ground import patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
 
@@ -55,7 +55,8 @@ def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     everywhere, but where it is of a side: it then grows from minus itself on the right to itself on the left, so that
     mirrored maps are those of mirrored conditions.
     """
-    kinds, across = condition_genes(space.conditions), torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
+    kinds = condition_genes(space.conditions)
+    across = torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
     profiles = [across if gene.mirrored else torch.ones_like(across) for gene in kinds]
     conditions = genes[:, space.num_genes - len(kinds) :, None, None].expand(-1, -1, *SHAPE)
     if kinds:
@@ -74,7 +75,8 @@ def _ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
         "friction": 1.0 - wp.to_torch(ground.friction),
         "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
     }
-    row, col = patches_at(_nodes(Y), NUM_ROWS - 1, ROWS), patches_at(_nodes(X), NUM_COLS - 1, COLS)
+    row = patch_index(_nodes(Y), NUM_ROWS - 1, ROWS)
+    col = patch_index(_nodes(X), NUM_COLS - 1, COLS)
     return torch.stack([maps[kind][:, row][:, :, col] for kind in space.ground], dim=1)
 
 

@@ -72,7 +72,7 @@ class GroundMaps:
         )
 
 
-def patches_at(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
+def patch_index(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
     """Row or column of the patch at each place along an axis, which ``count`` patches divide evenly.
 
     Places and length are in nodes or metres, from the beginning of the axis. Patches at the edge go on beyond it.
@@ -85,7 +85,8 @@ def check_map(kind: str, values: NDArray[np.floating]) -> None:
     if values.ndim != 3 or values.shape[1:] != PATCHES:
         raise ValueError(f"a map of {kind} must have shape (terrains, {PATCHES[0]}, {PATCHES[1]}), got {values.shape}")
     if kind == "friction":
-        allowed, words = (values >= LEAST_FRICTION - 1e-6) & (values <= 1.0), f"{LEAST_FRICTION} to 1"
+        allowed = (values >= LEAST_FRICTION - 1e-6) & (values <= 1.0)
+        words = f"{LEAST_FRICTION} to 1"
     else:
         soft = (values >= LEAST_TIME_CONSTANT_S - 1e-6) & (values <= MOST_TIME_CONSTANT_S + 1e-6)
         allowed = soft | (values == FIRM)
@@ -96,7 +97,9 @@ def check_map(kind: str, values: NDArray[np.floating]) -> None:
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
-    kinds, base, named = (*GROUND_KINDS, *CONDITIONS), name, set[str]()
+    kinds = (*GROUND_KINDS, *CONDITIONS)
+    base = name
+    named = set[str]()
     while (head := base.rpartition("+"))[0] and head[2] in kinds:
         base = head[0]
         named.add(head[2])

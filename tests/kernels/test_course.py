@@ -9,7 +9,7 @@ from sim.terrains.spaces.course import COURSE
 from tests.kernels import course_oracle as oracle
 
 
-def heights_of(genes):
+def make_heights(genes):
     out = wp.zeros((len(genes), 161, 321), dtype=float)
     COURSE.rasterise(wp.array(np.float32(genes)), 0.05, out)
     return out.numpy()
@@ -18,7 +18,7 @@ def heights_of(genes):
 def test_courses_equal_the_builders():
     genes = np.random.default_rng(0).uniform(-1.2, 1.2, (60, 36)).astype(np.float32)
     genes[:4] = np.sign(genes[:4])
-    for row, grid in zip(genes, heights_of(genes), strict=True):
+    for row, grid in zip(genes, make_heights(genes), strict=True):
         np.testing.assert_allclose(grid, oracle.heights(row), atol=5e-6)
     kinds = COURSE.elements(genes)["kind"]
     assert [all_elements()[kind].name for kind in np.unique(kinds)] == list(COURSE.kinds)  # every kind is among them

@@ -10,7 +10,7 @@ from tests.kernels import oracle
 SPACING = 0.05
 
 
-def heights_of(genes, nrow=161, ncol=321, spacing=SPACING):
+def make_heights(genes, nrow=161, ncol=321, spacing=SPACING):
     out = wp.zeros((len(genes), nrow, ncol), dtype=float)
     rasterise(wp.array(np.float32(genes)), spacing, out)
     return out.numpy()
@@ -33,7 +33,7 @@ def test_heights_equal_equation_one(num_terrains, num_bumps, nrow, ncol):
     genes = np.random.default_rng(num_bumps).uniform(-1.3, 1.3, (num_terrains, 8 * num_bumps)).astype(np.float32)
     expected = [oracle.mixture_height(row, *nodes(nrow, ncol, spacing)) for row in genes]
     # A terrain is at most 2 m of bumps; float32 resolves 1e-7 of that, steep flanks (exponent 8) cost two digits.
-    np.testing.assert_allclose(heights_of(genes, nrow, ncol, spacing), expected, atol=1e-5)
+    np.testing.assert_allclose(make_heights(genes, nrow, ncol, spacing), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(

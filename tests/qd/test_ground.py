@@ -12,7 +12,7 @@ from qd.search import settings
 from qd.search.archive import read_archive, write_archive
 from qd.show.commands import ExportCommand
 from sim.files.command import run_command
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.maps.heightmap import read_heightmap
 from sim.terrains.spaces.registry import get_space
 from tests.builders import fresh_values
@@ -44,7 +44,7 @@ def test_a_run_goes_on_with_its_ground_and_exports_it(run):
     assert search(*more) == 0 and read_archive(run).iterations == 2
     ExportCommand(run=run, elite="0", formats=("npz", "xml")).execute()
     exported = read_heightmap(run / "terrains/elite-0.npz")
-    heights, ground = terrains_of(read_archive(run).genes[:1], SPACE)
+    heights, ground = make_terrains(read_archive(run).genes[:1], SPACE)
     np.testing.assert_array_equal(exported.heights, heights[0])
     np.testing.assert_array_equal(exported.ground.friction, ground.friction)
     np.testing.assert_array_equal(exported.ground.time_constant_s, ground.time_constant_s)

@@ -10,7 +10,7 @@ from kernels.episode import Outcome
 from sim.controllers.loaders import load_policy
 from sim.crossing import CrossingCfg
 from sim.rollout import Rollout
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
@@ -21,7 +21,7 @@ REPLICAS = 4
 SEEDS = np.array([5, 6, 7, 8, 9, 2**32 - 1], np.uint32)
 GENES = SUPER_GAUSSIAN.hard_random(2, 0)
 PIT = np.where(np.arange(321) >= 266, np.float32(-3.0), FLAT)  # level up to x = 13.3 m, then three metres down
-BUMPS = heights_of(GENES)
+BUMPS = make_heights(GENES)
 GRIDS = np.stack([FLAT, spike(12.5), crossing_terrain("boxes", 9, 1), PIT, *BUMPS])
 # Begun 1 m before the edge of the goal, a walk of two seconds has every end there is.
 NEAR = CrossingCfg(start=(12.5, 4.0), poll_every_s=0.2)

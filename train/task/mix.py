@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.robots.training import Draw
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import CROSSING_TYPES, NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
@@ -85,7 +85,7 @@ class Mix:
         if self.kind == "generated":
             drawn, ground = self._rasterise_elites()
         else:
-            drawn, ground = terrains_of(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
+            drawn, ground = make_terrains(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
         if ground is not None:
             ground = GroundMaps.plain(self.num_hand_crafted).joined(ground)
         heights = np.concatenate([heights, drawn])
@@ -128,7 +128,7 @@ class Mix:
         for genes, space in zip(self.genes, self.spaces, strict=True):
             (indices,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
             if len(indices):
-                heights[indices], maps = terrains_of(genes[self.rows[indices] - first], space, device=self.device)
+                heights[indices], maps = make_terrains(genes[self.rows[indices] - first], space, device=self.device)
                 if ground is not None and maps is not None:
                     ground.friction[indices] = maps.friction
                     ground.time_constant_s[indices] = maps.time_constant_s

@@ -27,7 +27,7 @@ from sim.controllers.spec import controller_identity
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import choose_elites, command_line
 from sim.files.npz import npz_bytes
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 
 FIGURE_FILE = "minimal.png"
@@ -169,7 +169,7 @@ def _entry(archive: Archive, number: int, case: Case, minimal: Minimal, search: 
     half_width = search.robot.half_width
     shapes = {part: effects.shape(index, half_width) for index, part in enumerate(minimal.parts)}
     cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
-    whole, scaled = heights_of(np.array(genes), space)
+    whole, scaled = make_heights(np.array(genes), space)
     without = {str(part): rate_numbers(counts) for part, counts in minimal.without.items()}
     return {
         "elite": number,

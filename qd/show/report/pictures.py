@@ -16,7 +16,7 @@ from qd.show.report.page import encode_picture
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
-from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.spaces.base import TerrainSpace
 
 TILE = (96, 48)
@@ -38,7 +38,7 @@ def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any
     offsets = [(k % columns * TILE[0], k // columns * TILE[1]) for k in range(len(genes))]
     for first in range(0, len(genes), _LOT):
         lot = genes[first : first + _LOT]
-        grids, grounds = terrains_of(lot, space) if space.ground else (heights_of(lot, space, every=_EVERY), None)
+        grids, grounds = make_terrains(lot, space) if space.ground else (make_heights(lot, space, every=_EVERY), None)
         for k, heights in enumerate(grids):
             pixels = relief(heights, None if grounds is None else grounds[k : k + 1])[::-1]  # y up
             image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + k])

@@ -25,7 +25,7 @@ from qd.show.view.shown import Shared, ShownController
 from qd.show.view.viewed import SEARCHED
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 
 _BAR_S = 0.1  # real time from one update of the bar's time to the next, while playing
 _ADDRESS_S = 1.0  # real time from one update of the address to the next; browsers allow three a second
@@ -342,7 +342,7 @@ class Tab:
             has_minimal=minimal_genes is not None,
             minimal=self.minimal,
         )
-        heights, ground = terrains_of(genes[None], show.opened_run.space)
+        heights, ground = make_terrains(genes[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 

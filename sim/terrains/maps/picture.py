@@ -14,7 +14,7 @@ from sim.terrains.ground import (
     MOST_TIME_CONSTANT_S,
     PATCHES,
     GroundMaps,
-    patches_at,
+    patch_index,
 )
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
@@ -52,7 +52,7 @@ def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -
     each side are not of the terrain.
     """
     patch_row, patch_column = (
-        patches_at(np.arange(count) - margin, nodes - 1, patches)
+        patch_index(np.arange(count) - margin, nodes - 1, patches)
         for count, patches, nodes in zip((rows, columns), PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
     )
     slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)

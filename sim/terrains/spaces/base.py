@@ -39,12 +39,6 @@ class TerrainSpace:
     height_share: float = 1.0
     """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
 
-    def __reduce__(self) -> tuple[Any, tuple[str, str | None]]:
-        """Pickles by name and hash: a process that unpickles a user's own space has loaded its code before."""
-        from sim.terrains.spaces.registry import get_space  # it imports this module
-
-        return get_space, (self.name, self.sha256)
-
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, patches_at
+from sim.terrains.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, patch_index
 from sim.terrains.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
@@ -72,7 +72,7 @@ class OnGround(WiderSpace):
 
     def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
-        first, last = patches_at((begin, end), PATCH * COLS, COLS)
+        first, last = patch_index((begin, end), PATCH * COLS, COLS)
         words = []
         for kind in self.ground:
             values = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]

@@ -19,7 +19,7 @@ from qd.evaluate.sets import (
     split_elites,
 )
 from qd.search.settings import as_settings
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, make_archive, write_run
@@ -127,7 +127,7 @@ def test_the_far_third_is_the_farthest():
     genes = SUPER_GAUSSIAN.hard_random(4, 1)
     genes[2] = training[58]  # trained on: distance 0
     distance = nearest_distance(genes, training)
-    maps, others = (heights_of(some, SUPER_GAUSSIAN).astype(np.float64) for some in (genes, training))
+    maps, others = (make_heights(some, SUPER_GAUSSIAN).astype(np.float64) for some in (genes, training))
     by_hand = [min(np.sqrt(((terrain - other) ** 2).mean()) for other in others) for terrain in maps]
     np.testing.assert_allclose(distance, by_hand, atol=1e-6)
     whole = replace(plain_set("hard_random", 4, 0), numbers=np.arange(100, 104))

@@ -17,7 +17,7 @@ from qd.faults.causes import (
     list_kinds,
     measure_shape,
 )
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import bump
@@ -100,7 +100,7 @@ def test_the_angle_to_the_way_and_the_reach_to_either_side():
 def test_effects_of_parts_add_up():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
     fields = find_effects(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
-    rest = heights_of(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
+    rest = make_heights(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
     np.testing.assert_allclose(fields.sum(axis=0), rest, atol=1e-6)
     assert largest_height(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
 

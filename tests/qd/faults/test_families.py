@@ -7,7 +7,7 @@ import numpy as np
 from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.search.archive import no_outcomes
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import bump, fresh_values, judged_archive, small_archive
 
@@ -149,7 +149,7 @@ def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
     child, grandchild = strangers[1].copy(), strangers[1].copy()
     child[31], grandchild[31] = strangers[1, 31] - 0.5, strangers[1, 31] - 1.0  # the height of a bump
     genes = np.stack([*strangers, child, grandchild])
-    first, second, third = heights_of(genes[[1, 4, 5]])
+    first, second, third = make_heights(genes[[1, 4, 5]])
     near = [float(np.sqrt(((heights - others) ** 2).mean())) for heights, others in ((first, second), (second, third))]
     assert max(near) < KIN_M < np.sqrt(((first - third) ** 2).mean())
     assert find_families(genes[[0, 5, 1, 2, 4, 3]], SUPER_GAUSSIAN).tolist() == [0, 1, 1, 2, 1, 3]

@@ -9,7 +9,7 @@ import pytest
 
 from qd.show.elites import open_run
 from qd.show.export import export_controller, export_elites, export_pack
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.maps.heightmap import as_terrain, read_heightmap
 from tests.builders import fresh_values, small_archive, write_run
 
@@ -34,7 +34,7 @@ def test_elites_are_exported_as_the_simulation_has_them(run):
     expected = [*(f"elite-{k}.{ending}" for k in elites for ending in endings), "README.md", "index.json"]
     assert [path.name for path in files] == expected and sorted(expected) == sorted(p.name for p in folder.iterdir())
     for elite in elites:
-        heights = heights_of(archive.genes[elite : elite + 1])[0]
+        heights = make_heights(archive.genes[elite : elite + 1])[0]
         np.testing.assert_array_equal(as_terrain(read_heightmap(folder / f"elite-{elite}.npz")), heights)
         np.testing.assert_array_equal(np.load(folder / f"elite-{elite}.npz")["genes"], archive.genes[elite])
         about = json.loads((folder / f"elite-{elite}.json").read_text())

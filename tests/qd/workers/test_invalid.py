@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Invalidity
-from qd.workers.invalid import AllInvalidError, invalid_iterations, invalid_words, report_invalid
+from qd.workers.invalid import AllInvalidError, explain_invalid, invalid_iterations, report_invalid
 from tests.qd.stand_in import make_result
 
 FINE, ACTION, SPEED = Invalidity.NONE, Invalidity.ACTION, Invalidity.SPEED
@@ -18,8 +18,8 @@ def result_of(codes):
 
 def test_more_than_one_in_twenty_is_reported_with_the_remedy_of_the_most_frequent_reason():
     # 1 of 20 is 5 %, 2 of 20 are 10 %.
-    assert invalid_words({"speed": 1}, 20) is None
-    words = invalid_words({"speed": 1, "action": 1}, 20)
+    assert explain_invalid({"speed": 1}, 20) is None
+    words = explain_invalid({"speed": 1, "action": 1}, 20)
     assert "2 of 20" in words and "10.0%" in words and "max_speed" in words
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.workers.shards import flaw_of
+from qd.workers.shards import find_flaw
 from tests.qd import stand_in
 
 RESULT = stand_in.evaluate(np.zeros((3, 64), np.float32), np.arange(3), 4)
@@ -27,8 +27,8 @@ CHANGES = [
 
 @pytest.mark.parametrize("changes", CHANGES, ids=lambda changes: next(iter(changes)))
 def test_a_result_that_cannot_be_true_is_known(changes):
-    assert flaw_of(RESULT, 3, 4) is None
-    assert flaw_of(dataclasses.replace(RESULT, **changes), 3, 4) and flaw_of("all went well", 3, 4)
+    assert find_flaw(RESULT, 3, 4) is None
+    assert find_flaw(dataclasses.replace(RESULT, **changes), 3, 4) and find_flaw("all went well", 3, 4)
 
 
 @pytest.mark.parametrize("name", ["{}/model.pt", "{}/mine.py:act", "{}/mine.py:adapt@{}/model.pt", "os.path:join"])

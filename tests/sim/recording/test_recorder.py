@@ -158,7 +158,7 @@ def test_what_is_no_recording_is_refused(recording, tmp_path):
 
 
 def test_the_recording_of_one_terrain(recording):
-    terrain, most = recording.of_terrain(0), int(recording.num_frames[0].max())
+    terrain, most = recording.select_terrain(0), int(recording.num_frames[0].max())
     np.testing.assert_array_equal(terrain.penalties, recording.penalties[:1, :, :most])
     np.testing.assert_array_equal(terrain.touching, recording.touching[:1, :, :most])
     assert terrain.labels == ("spike",) and terrain.seeds.tolist() == [5]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.robots.model import build_robot
 from sim.robots.probes import measure_extents
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import CROSSING_TYPES, SPACING, crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
@@ -49,7 +49,7 @@ def gaps(sim, grids):
 def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
     # Hard-random gene terrains and every hand-crafted kind at its hardest.
     hand_crafted = [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]
-    grids = np.concatenate([heights_of(SUPER_GAUSSIAN.hard_random(4, 21)), hand_crafted])
+    grids = np.concatenate([make_heights(SUPER_GAUSSIAN.hard_random(4, 21)), hand_crafted])
     grids = grids[np.arange(DROPS) % len(grids)]
     sim = simulate(robot, grids, device)
     put(sim, above_ground(robot, grids, np.random.default_rng(23)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.terrains.bank import TerrainBank, heights_of
+from sim.terrains.bank import TerrainBank, make_heights
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
@@ -36,7 +36,7 @@ def test_terrains_are_replaced_in_place(device):
 @pytest.mark.parametrize("space", [SUPER_GAUSSIAN, COURSE], ids=lambda space: space.name)
 def test_every_second_node_is_that_of_the_whole_grid(space):
     genes = space.hard_random(3, 0)
-    np.testing.assert_allclose(heights_of(genes, space, every=2), heights_of(genes, space)[:, ::2, ::2], atol=1e-5)
+    np.testing.assert_allclose(make_heights(genes, space, every=2), make_heights(genes, space)[:, ::2, ::2], atol=1e-5)
 
 
 def test_wrong_genes_and_heights_are_named(device):

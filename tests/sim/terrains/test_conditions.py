@@ -13,7 +13,7 @@ from sim.mujoco_c.model import Starts, crossing_model
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, nominal_row, round_steps
 from sim.terrains.conditions.noise import noise_widths
 from sim.terrains.ground import GroundMaps
@@ -138,7 +138,7 @@ def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts
     by_heights = rollout.evaluate(Terrains(heights=heights, seeds=seeds, ground=ground))
     np.testing.assert_array_equal(by_heights.penalties, by_genes.penalties)
     assert (rollout.evaluate(Terrains(heights=heights, seeds=seeds)).penalties != by_genes.penalties).any()
-    again = terrains_of(row[None], SPACE)[1]
+    again = make_terrains(row[None], SPACE)[1]
     np.testing.assert_array_equal(again.rows, ground.rows)
     assert (again.friction == 1.0).all()  # the factor is a condition, and no patch's
     joined = again.joined(GroundMaps.plain(2))

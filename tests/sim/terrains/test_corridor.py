@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
 from sim.terrains.spaces.registry import get_space
 
@@ -19,7 +19,7 @@ PLACES = ((0, 0), (20, 57), (40, 120), (7, 70), (19, 71))
 def test_heights_and_ground_around_the_way(name, around):
     space = get_space(name)
     genes = space.uniform_random(3, 2)
-    nodes, ground = heights_of(genes, space), terrains_of(genes, space)[1]
+    nodes, ground = make_heights(genes, space), make_terrains(genes, space)[1]
     heights = corridor_heights(torch.from_numpy(genes), space).numpy()
     maps = corridor_maps(torch.from_numpy(genes), space).numpy()
     assert heights.shape == (3, *SHAPE) == (3, 41, 121) and maps.shape == (3, len(space.ground), *SHAPE)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.base import CONDITIONS
 from sim.terrains.doses import FIRST_COL, NUM_STARTS, all_doses, parse_doses
 from sim.terrains.spaces.registry import get_space
@@ -71,7 +71,7 @@ def test_places_are_spread_over_a_metre_and_the_same_for_all_values():
 @pytest.mark.parametrize(("name", "values"), [("friction", (1.0, 0.5, 0.15)), ("softness", (0.02, 0.06))])
 def test_ground_is_level_and_the_same_everywhere(name, values):
     dose = dose_of(name, *values)
-    heights, ground = terrains_of(dose.terrains(2, np.random.default_rng(0)), get_space(dose.space))
+    heights, ground = make_terrains(dose.terrains(2, np.random.default_rng(0)), get_space(dose.space))
     assert not heights.any()
     maps = {"friction": ground.friction, "softness": ground.time_constant_s}
     np.testing.assert_allclose(maps.pop(name), np.tile(values, 2)[:, None, None] * np.ones((4, 8)), atol=1e-6)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.terrains.bank import terrains_of
+from sim.terrains.bank import make_terrains
 from sim.terrains.hand_crafted import CROSSING_TYPES
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space
@@ -32,7 +32,7 @@ def test_half_is_hand_crafted_and_half_are_elites():
     tiles = mix.next()
     assert (tiles.num_levels, tiles.num_columns, tiles.ground) == (1, 6, None)
     assert tiles.type_of_column == (*CROSSING_TYPES[:3], *["generated"] * 3)
-    np.testing.assert_array_equal(tiles.heights[3:], terrains_of(ELITES[mix.rows], SUPER_GAUSSIAN)[0])
+    np.testing.assert_array_equal(tiles.heights[3:], make_terrains(ELITES[mix.rows], SUPER_GAUSSIAN)[0])
     assert len(set(mix.rows)) == 3
     # Robots begin a crossing at x = 2 on flat ground before the feature.
     assert (tiles.heights[:3, :, :80] == 0.0).all() and np.abs(tiles.heights[:3, :, 100:220]).max() > 0.0
@@ -138,7 +138,7 @@ def test_elites_of_several_spaces_are_drawn_together_each_with_its_own_ground():
     mix = make_mix(terrains=18, genes=tuple(genes), spaces=spaces)
     tiles = mix.next()
     assert mix.num_elites == 9 and sorted(mix.rows) == list(range(9)) and tiles.ground is not None
-    whole = [terrains_of(part, space) for part, space in zip(genes[:3], spaces, strict=False)]
+    whole = [make_terrains(part, space) for part, space in zip(genes[:3], spaces, strict=False)]
     np.testing.assert_array_equal(tiles.heights[9:], np.concatenate([heights for heights, _ in whole])[mix.rows])
     assert (tiles.ground.friction[:9] == 1.0).all()  # hand-crafted ones
     slips, sinks = (tiles.ground.friction[9:] < 1).any((1, 2)), (tiles.ground.time_constant_s[9:] > 0).any((1, 2))

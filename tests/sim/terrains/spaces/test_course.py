@@ -3,7 +3,7 @@
 import numpy as np
 
 from kernels.course import GENES_PER_ELEMENT
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.spaces.course import COURSE
 from tests.kernels.course_oracle import course, element
@@ -77,7 +77,7 @@ def test_without_an_element_the_others_stay_where_they_are():
         assert not after["rise"][:, part].any()
         others = [k for k in range(6) if k != part]
         np.testing.assert_array_equal(after["kind"][:, others], before["kind"][:, others])
-    assert not heights_of(COURSE.without(genes, range(6)), COURSE).any()
+    assert not make_heights(COURSE.without(genes, range(6)), COURSE).any()
     np.testing.assert_array_equal(COURSE.without(genes, []), genes)
 
 
@@ -94,4 +94,4 @@ def test_scaled_elements_are_lower_and_stay_in_their_ranges():
     for name in ("kind", "first", "cells", "detail"):
         np.testing.assert_array_equal(half[name], before[name])
     np.testing.assert_allclose(COURSE.scaled(genes, 1.0), genes, atol=1e-6)
-    np.testing.assert_allclose(heights_of(COURSE.scaled(genes, 0.9), COURSE).max(), 0.18, atol=1e-6)
+    np.testing.assert_allclose(make_heights(COURSE.scaled(genes, 0.9), COURSE).max(), 0.18, atol=1e-6)

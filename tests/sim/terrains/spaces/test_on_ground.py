@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space, identity, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -29,8 +29,8 @@ class Wet:
 def test_genes_of_the_ground_come_behind_those_of_the_space():
     genes = BOTH.hard_random(3, 5)
     assert (BOTH.num_genes, genes.shape, BOTH.ground) == (128, (3, 128), ("friction", "softness"))
-    heights, ground = terrains_of(genes, BOTH)
-    np.testing.assert_array_equal(heights, heights_of(genes[:, :64]))
+    heights, ground = make_terrains(genes, BOTH)
+    np.testing.assert_array_equal(heights, make_heights(genes[:, :64]))
     # Hard-random ground is as it always is, or as slippery or soft as can be.
     assert sorted(np.unique(ground.friction).round(6)) == [0.15, 1.0]
     assert sorted(np.unique(ground.time_constant_s).round(6)) == [0.0, 0.06]
@@ -39,7 +39,7 @@ def test_genes_of_the_ground_come_behind_those_of_the_space():
     only = get_space("course+softness")
     assert (only.num_genes, only.sigma0, only.genes_per_part) == (36 + 32, COURSE.sigma0, None)
     assert BOTH.genes_per_part == 8
-    assert terrains_of(genes[:, :64], SUPER_GAUSSIAN)[1] is None
+    assert make_terrains(genes[:, :64], SUPER_GAUSSIAN)[1] is None
 
 
 def test_a_patch_is_a_part_that_is_absent_where_it_changes_nothing():
@@ -49,8 +49,8 @@ def test_a_patch_is_a_part_that_is_absent_where_it_changes_nothing():
     assert words[8 + 10].startswith("friction 0.") and words[8 + 10].endswith("at x = 4 to 6 m, y = 2 to 4 m")
     assert words[8 + 32].startswith("soft ground of 0.0")
     without = BOTH.without(genes, [0, 8 + 10, 8 + 32 + 31])
-    heights, ground = terrains_of(without, BOTH)
-    np.testing.assert_array_equal(heights, heights_of(SUPER_GAUSSIAN.without(genes[:, :64], [0])))
+    heights, ground = make_terrains(without, BOTH)
+    np.testing.assert_array_equal(heights, make_heights(SUPER_GAUSSIAN.without(genes[:, :64], [0])))
     assert (ground.friction[:, 1, 2] == 1.0).all() and (ground.friction < 1.0).sum() == 2 * 31
     assert (ground.time_constant_s[:, 3, 7] == 0.0).all() and (ground.time_constant_s > 0.0).sum() == 2 * 31
     assert (without != genes).sum() == 2 * 3
@@ -124,7 +124,7 @@ def test_a_space_of_ones_own_may_have_ground(tmp_path):
         + "\n    def softness(self, genes, x, y):\n        return 0.03 * (y < 4) * (genes[:, 1, None, None] > 0)\n"
     )
     space = load_space(f"{file}:Wet")
-    ground = terrains_of(np.array([[0.0, 1.0], [0.0, -1.0]]), space)[1]
+    ground = make_terrains(np.array([[0.0, 1.0], [0.0, -1.0]]), space)[1]
     assert (space.ground, space.num_genes) == (("friction", "softness"), 2)
     assert (ground.friction[:, :, 4:] == 0.5).all() and (ground.friction[:, :, :4] == 1.0).all()
     assert (ground.time_constant_s[0, :2] == np.float32(0.03)).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import clipped
 from sim.terrains.spaces.registry import SPACES, get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -44,8 +44,8 @@ def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
     without = SUPER_GAUSSIAN.without(genes, [0, 3, 7])
     others = genes.reshape(2, 8, 8)[:, [1, 2, 4, 5, 6]].reshape(2, 40)
     expected = [oracle.mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in others]
-    np.testing.assert_allclose(heights_of(without), expected, atol=1e-5)
-    assert not heights_of(SUPER_GAUSSIAN.without(genes, range(8))).any()
+    np.testing.assert_allclose(make_heights(without), expected, atol=1e-5)
+    assert not make_heights(SUPER_GAUSSIAN.without(genes, range(8))).any()
     np.testing.assert_array_equal(SUPER_GAUSSIAN.without(genes, []), genes)
 
 
@@ -60,7 +60,7 @@ def test_a_bump_in_words():
 
 def test_scaled_bumps_are_lower_everywhere():
     genes = 2 * SUPER_GAUSSIAN.hard_random(2, 5)  # beyond the limits, which are clipped
-    np.testing.assert_allclose(heights_of(SUPER_GAUSSIAN.scaled(genes, 0.3)), 0.3 * heights_of(genes), atol=1e-6)
+    np.testing.assert_allclose(make_heights(SUPER_GAUSSIAN.scaled(genes, 0.3)), 0.3 * make_heights(genes), atol=1e-6)
     np.testing.assert_array_equal(SUPER_GAUSSIAN.scaled(genes, 1.0), clipped(genes))
 
 
@@ -68,7 +68,7 @@ def test_scaled_bumps_are_lower_everywhere():
 def test_a_lower_space_is_the_same_terrain_with_all_heights_scaled(name):
     space, lower = get_space(name), get_space(f"{name}@0.1")
     genes = space.hard_random(3, 0)
-    np.testing.assert_allclose(heights_of(genes, lower), 0.4 * heights_of(genes, space), atol=1e-6)
+    np.testing.assert_allclose(make_heights(genes, lower), 0.4 * make_heights(genes, space), atol=1e-6)
     assert lower.name == f"{name}@0.1" and get_space(f"{name}@0.1+friction").name == f"{name}@0.1+friction"
     with pytest.raises(ValueError, match=r"at most at 0\.25 m, got 0\.3"):
         get_space(f"{name}@0.3")

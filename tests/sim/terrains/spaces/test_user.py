@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.terrains.bank import heights_of
+from sim.terrains.bank import make_heights
 from sim.terrains.spaces import registry
 from sim.terrains.spaces.registry import get_space, is_own, load_space
 from tests.sim.terrains.spaces.spaces import write_ridges
@@ -46,13 +46,13 @@ def test_a_space_from_a_file(ridges):
     assert (space.name, space.num_genes, space.sigma0) == (ridges, 3, 0.4)
     assert is_own(ridges) and not is_own("course")
     # Height .3 m, ridges 0.9 m apart, not turned: a crest at x = 8 m, the next at 8.9 m; a hollow half way is flat.
-    heights = heights_of(np.array([[1.0, 0.0, 0.0]]), space)[0]
+    heights = make_heights(np.array([[1.0, 0.0, 0.0]]), space)[0]
     assert heights[[0, 80, 160], 160] == pytest.approx(0.3) and heights[80, 178] == pytest.approx(0.3, abs=1e-6)
     assert heights[80, 169] == 0.0 and not heights[:, :80].any()
-    assert heights_of(np.array([[5.0, 0.0, 0.0]]), space).max() == pytest.approx(0.3)  # genes are clipped
+    assert make_heights(np.array([[5.0, 0.0, 0.0]]), space).max() == pytest.approx(0.3)  # genes are clipped
     assert (space.hard_random(4, 0)[:, 0] == 1).all()
     assert space.describe([0.0, 0.0, 0.0]) == "ridges of 0.15 m, 0.90 m apart"
-    assert not heights_of(space.without(space.hard_random(2, 0), [0]), space).any()
+    assert not make_heights(space.without(space.hard_random(2, 0), [0]), space).any()
 
 
 def test_what_a_space_may_leave_out(write):
@@ -66,7 +66,7 @@ def test_what_a_space_may_leave_out(write):
 
 def test_numpy_will_do(write):
     name = write("import numpy as np\n" + LEAST.replace("return", "return np.ones((len(genes), *x.shape)) #"))
-    assert (heights_of(np.zeros((2, 2)), load_space(name)) == 1.0).all()
+    assert (make_heights(np.zeros((2, 2)), load_space(name)) == 1.0).all()
 
 
 @pytest.mark.parametrize(
