@@ -89,25 +89,22 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
-        from qd.check import ensure_ready
         from qd.faults.judge import judge
         from qd.faults.searches import find_search
         from qd.search.directory import free_path
         from qd.search.loop import search
-        from qd.search.settings import preset
+        from qd.search.start import start_search
         from qd.search.summary import print_summary
-        from sim.terrains.spaces.registry import at_height, load_space, space_at
+        from sim.terrains.spaces.registry import load_space
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
         compute = _compute(self)
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:
-            robot, policy, space = get_robot(self.robot), None, load_space(self.space)
-            if self.height is not None:
-                space = at_height(space, self.height)
-            robot = ensure_ready(robot, self.policy, compute)
-            space = space_at(space, self.height, robot)
-            cfg = preset(self.preset, robot, self.policy, space=space.name, space_sha256=space.sha256)
+            policy = None
+            cfg, robot = start_search(
+                self.robot, self.policy, compute=compute, size=self.preset, space=self.space, height=self.height
+            )
         elif self.run_dir or self.height is not None:
             flag = "--run-dir" if self.run_dir else "--height"
             raise ValueError(f"--resume goes on with a run as it is, got {flag} too: leave it out")

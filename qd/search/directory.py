@@ -61,9 +61,9 @@ def find_run(
     if newest is not None:
         runs.insert(len(runs) if published == "first" else 0, newest)
     if not runs:
-        places = f"{RUNS}/" if published == "never" else f"{RUNS}/ or in {folder} (a clone of the project has it)"
+        searched = f"{RUNS}/" if published == "never" else f"{RUNS}/ or in {folder} (a clone of the project has it)"
         raise FileNotFoundError(
-            f"no archive of {robot.name} under {places}: search one with `faultline archive`, or name a run"
+            f"no archive of {robot.name} under {searched}: search one with `faultline archive`, or name a run"
         )
     print(f"Run: {runs[0]}", flush=True)
     return runs[0]
@@ -75,7 +75,7 @@ def _is_published(path: Path) -> bool:
 
 
 def _read_robot(file: Path) -> str | None:
-    """Robot of an archive; None, with a line, of one that cannot be read."""
+    """Robot of an archive; None, with a printed line, if it cannot be read."""
     try:
         return read_archive(file).robot
     except ValueError as error:
@@ -89,7 +89,7 @@ def find_directory(run: Path) -> Path:
 
 
 def search_seed(run: Path) -> int | None:
-    """Seed of the search that left an archive; None where no config lies beside it."""
+    """Seed of the search that wrote an archive; None without a config beside it."""
     folder = RunDirectory(find_directory(run))
     return folder.read_cfg().seed if folder.exists() else None
 
@@ -107,10 +107,11 @@ def read_robot_archive(robot: RobotCfg, run: Path, space: str | None = None) -> 
 
 
 def check_space(archive: Archive, named: str | None) -> None:
-    """Refuses an archive whose terrain space is not at hand, once the one that the command line names is loaded."""
+    """Loads the terrain space that the command line names; refuses an archive whose space is not known then."""
     if named is not None:
         load_space(named)
-    expected, got = get_space(archive.space, archive.space_sha256).num_genes, archive.genes.shape[1]
+    expected = get_space(archive.space, archive.space_sha256).num_genes
+    got = archive.genes.shape[1]
     if got != expected:
         raise ValueError(
             f"the archive must have {expected} genes a terrain of {archive.space}, got {got}: put a copy of it back"
@@ -119,18 +120,18 @@ def check_space(archive: Archive, named: str | None) -> None:
 
 def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
     """Refuses an archive that is not of the settings beside it."""
-    of_archive = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
-    if of_archive != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
+    stored = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
+    if stored != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
         raise ValueError(
             f"{folder / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
-            f"{', '.join(map(str, of_archive))}: put back the one that is not this run's"
+            f"{', '.join(map(str, stored))}: put back the one that is not this run's"
         )
 
 
 def output_folder(run: Path, robot: str) -> Path:
-    """Where what is made from a run goes: into its directory, or of a published one into a folder of its own in runs/.
+    """Folder for what is made from a run: its directory; for a published run a folder below runs/.
 
-    That is runs/<robot>-published, or such as runs/<robot>-published-course of results/<robot>/spaces/course.
+    That is runs/<robot>-published, for results/<robot>/spaces/course it is runs/<robot>-published-course.
     """
     folder = find_directory(run)
     if not _is_published(folder):
@@ -140,7 +141,7 @@ def output_folder(run: Path, robot: str) -> Path:
 
 
 def free_path(name: str) -> Path:
-    """The first of runs/NAME, runs/NAME-2, runs/NAME-3 and so on that is not there."""
+    """The first of runs/NAME, runs/NAME-2, runs/NAME-3 and so on that does not exist."""
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
     return next(path for path in map(RUNS.joinpath, names) if not path.exists())
 

@@ -153,7 +153,8 @@ def _run_iterations(
         put(ask(group, len(metrics) + 1), group, len(metrics) + 1)
     while (iteration := len(metrics) + 1) <= last:
         emitters = _Stopwatch()
-        results, evaluations, num_new = [], [], 0
+        results, evaluations = [], []
+        num_new = 0
         for group in range(num_groups):
             result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
             refuse_all_invalid(result)

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from qd import check
 from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
-from qd.search import settings
+from qd.search import settings, start
 from qd.search.archive import read_archive
 from qd.search.methods.registry import METHODS
 from qd.search.summary import print_summary
@@ -96,7 +95,7 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
 
 @pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
 def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch, again, settling, name):
-    monkeypatch.setattr(check, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
+    monkeypatch.setattr(start, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
     assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
     assert os.listdir() == []
 
@@ -163,7 +162,7 @@ def test_a_controller_may_move_but_not_change(capsys):
     assert archive("--resume", "a", *MORE, "3") == 0
 
 
-def test_the_last_lines_print_summary_and_which_commands_come_next(capsys):
+def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(capsys):
     fine = f"{__name__}:fine_policy"
     assert archive(*TINY, "--policy", fine, "--run-dir", "a b") == 0
     *_, summary, worst, following, judging = capsys.readouterr().out.splitlines()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, select_terrains
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, join_evaluations, select_terrains
 from qd.search.pool import DEPTH, Pool, chance_to_stay, expected_score
 from tests.qd.stand_in import make_result
 
@@ -121,3 +121,30 @@ def test_a_terrain_that_was_crossed_again_several_times_at_once_has_all_episodes
     assert pool.terrains.episodes.tolist() == [9]
     assert pool.terrains.penalty_mean.sum() == pytest.approx((8.0 + 2.0 + 5.0) / 3)
     assert select_terrains(told, [0]).penalty_mean.sum() == pytest.approx(2.0)  # what it was told stays as it was
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_pool_keeps_its_promises_through_any_crossings(seed):
+    """Numbers ascend, all episodes of a terrain count, no cell has two holders, and pending terrains stay."""
+    rng = np.random.default_rng(seed)
+    pool = Pool(2, CELLS, CFG)
+    episodes: dict[int, int] = {}
+    for iteration in range(1, 13):
+        again = rng.choice(pool.number, rng.integers(0, 5)) if len(pool) else pool.number
+        number = rng.permutation(np.append(again, np.full(rng.integers(1, 5), -1)))
+        crossed_in = [crossed(rng.dirichlet(np.full(3, 4.0)), episodes=int(rng.integers(1, 6))) for _ in number]
+        first_new = max(episodes, default=-1) + 1
+        pool.tell(rng.normal(size=(len(number), 2)).astype(np.float32), number, join_evaluations(crossed_in), iteration)
+        new = iter(range(first_new, first_new + int((number < 0).sum())))
+        for name, evaluation in zip(number.tolist(), crossed_in, strict=True):
+            name = next(new) if name < 0 else name
+            episodes[name] = episodes.get(name, 0) + int(evaluation.episodes[0])
+        pending = rng.choice(pool.number, 3)
+        rows = pool.settle(pending)
+        assert (np.diff(pool.number) > 0).all() and np.isin(pending, pool.number).all()
+        assert pool.terrains.episodes.tolist() == [episodes[name] for name in pool.number.tolist()]
+        assert len({*pool.terrains.cell[rows].tolist()}) == len(rows) > 0
+        kept_unasked = ~np.isin(pool.number, pending)
+        assert np.bincount(pool.terrains.cell[kept_unasked]).max(initial=0) <= DEPTH
+        asked = pool.least_known(7, pending)
+        assert len(asked) == 7 and np.isin(asked, pool.number).all()
