@@ -4,17 +4,19 @@ import os
 import re
 import shutil
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from sim.controllers.formats import isaac_lab, mjlab, rl_sar, unitree_rl_gym, weights
-from sim.controllers.formats.source import Source, SourceFormat
+from sim.controllers.formats.source import Source
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
 from sim.robots.user import NEW_NAME, is_new_name
 
-FORMATS: tuple[SourceFormat, ...] = (isaac_lab, unitree_rl_gym, rl_sar, mjlab, weights)
-"""Formats of sources; the first that matches reads a source."""
+FORMATS: tuple[ModuleType, ...] = (isaac_lab, unitree_rl_gym, rl_sar, mjlab, weights)
+"""Formats of sources: the first whose ``matches(path)`` is true has ``read(path, source)``, which returns the file of
+the weights. A path that a format cannot read is a ValueError."""
 _SETTINGS_BY_FILE = {
     "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
                    "max_duration_s"),
@@ -39,13 +41,8 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
     if not path.exists():
         raise ValueError(f"{path} is not there: expected a folder, a YAML, or weights")
     robot_file = read_robot_file(model_file)
-    source = Source(
-        file=path,
-        model_file=model_file,
-        model=robot_file.model,
-        joints=joint_names(robot_file.model),
-        home=robot_file.home,
-    )
+    model = robot_file.model
+    source = Source(file=path, model_file=model_file, model=model, joints=joint_names(model), home=robot_file.home)
     source_format = _find_format(path)
     weights_file = _read(source_format, path, source)
     copy = out / weights_file.name
@@ -68,14 +65,14 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         print(f"  {command_line(name, robot=out / 'robot.toml')}")
 
 
-def _find_format(path: Path) -> SourceFormat:
+def _find_format(path: Path) -> ModuleType:
     for source_format in FORMATS:
         if source_format.matches(path):
             return source_format
     raise ValueError(f"{path} must be {', or '.join(source_format.LABEL for source_format in FORMATS)}")
 
 
-def _read(source_format: SourceFormat, path: Path, source: Source) -> Path:
+def _read(source_format: ModuleType, path: Path, source: Source) -> Path:
     """The file of the weights; errors name the source and its format."""
     try:
         return source_format.read(path, source)

@@ -39,8 +39,11 @@ def read(path: Path, source: Source) -> Path:
     """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
     source.file = path / "params" / "env.yaml"
     env = read_yaml(source.file)
-    _read_pose(env["scene"]["robot"], source)
-    _read_actuators(env["scene"]["robot"]["actuators"], source)
+    articulation = env["scene"]["robot"]
+    pose = articulation["init_state"]["joint_pos"]
+    pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+    source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
+    _read_actuators(articulation["actuators"], source)
     source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
     _read_speed(env, source)
     joint_order = _read_action(env["actions"], path, source)
@@ -50,9 +53,8 @@ def read(path: Path, source: Source) -> Path:
     lengths = [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
     rows = [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
     source.set_history(rows, lengths)
-    source.set(
-        observation=rows, reason="lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
-    )
+    reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
+    source.set(observation=rows, reason=reason)
     agent_file = path / "params" / "agent.yaml"
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
     if agent.get("clip_actions") is not None:
@@ -68,20 +70,13 @@ def read(path: Path, source: Source) -> Path:
     return checkpoints[-1]
 
 
-def _read_pose(articulation: dict[str, Any], source: Source) -> None:
-    label = f"{source.file}: init_state.joint_pos"
-    pose = per_joint(articulation["init_state"]["joint_pos"], source.joints, label, partly=True)
-    source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
-
-
 def _read_actuators(groups: dict[str, Any], source: Source) -> None:
     """Gains, limits and delays."""
     notes: list[str] = []
     ideal = [name for name, group in groups.items() if group.get("saturation_effort") is None]
     omitted = _IDEAL_DRIVE if len(ideal) == len(groups) else ()
-    values_by_key: dict[str, dict[str, Any]] = {
-        key: dict.fromkeys(source.joints) for key in PER_JOINT[1:] if key not in omitted
-    }
+    keys = [key for key in PER_JOINT[1:] if key not in omitted]
+    values_by_key: dict[str, dict[str, Any]] = {key: dict.fromkeys(source.joints) for key in keys}
     for name, group in groups.items():
         drive = ("DelayedPDActuator", "PD gains with a limit") if name in ideal else ("DCMotor", "a DC motor")
         kind = str(group.get("class_type", "")).rpartition(":")[2]

@@ -52,13 +52,9 @@ def read(path: Path, source: Source) -> Path:
         imu = source.find_imu() if TERM_NAMES[name] == "lin_vel" else None
         if imu is not None:
             reason = "the velocity is that of the IMU's site"
-        terms.append(make_term(TERM_NAMES[name], float(scale or 1.0), clip=_read_limits(clip), at=imu))
+        limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
+        limits = np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None
+        terms.append(make_term(TERM_NAMES[name], float(scale or 1.0), clip=limits, at=imu))
     source.set_history(terms, [max(1, round(float(length or 0))) for length in lengths])
     source.set(observation=terms, reason=reason)
     return path
-
-
-def _read_limits(text: str) -> list[float] | None:
-    """Limits such as ``-5.0;inf``; None if there is none."""
-    limits = [float(limit) for limit in (text or "-inf;inf").split(";")]
-    return np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim.controllers.formats.source import TERM_NAMES, Source, find_weights, make_term
+from sim.controllers.formats.source import SCALES, TERM_NAMES, Source, find_weights, make_term
 from sim.controllers.formats.yaml_file import SUFFIXES, read_yaml
 
 LABEL: str = "a controller of rl_sar (its YAML, or a folder with config.yaml)"
@@ -17,17 +17,8 @@ _SETTINGS = {
 }
 _OPTIONAL_SETTINGS = {"torque_limits": "effort_limit", "clip_obs": "observation_clip"}
 _TERMS = TERM_NAMES | {"g1_phase": "clock"}
-_SCALES = {
-    "lin_vel_scale": "lin_vel",
-    "ang_vel_scale": "ang_vel",
-    "commands_scale": "command",
-    "dof_pos_scale": "joint_pos",
-    "dof_vel_scale": "joint_vel",
-}
 _PERIODS = {"g1_phase": 0.8}  # of rl_sar's code [s]
-_WITHOUT_EFFECT = (
-    "fixed_kp", "fixed_kd", "num_of_dofs", "num_observations", "joint_controller_names", "framework",
-)  # fmt: skip
+_WITHOUT_EFFECT = ("fixed_kp", "fixed_kd", "num_of_dofs", "num_observations", "joint_controller_names", "framework")
 
 
 def _find_config(path: Path) -> Path:
@@ -63,17 +54,13 @@ def read(path: Path, source: Source) -> Path:
         pairs = [list(pair) for pair in limits]
         high = pairs[0][1]
         source.set(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
-    _set_history(
-        source,
-        content.pop("observations_history", None) or [0],
-        content.pop("observations_history_priority", "time"),
-    )
+    steps = content.pop("observations_history", None) or [0]
+    _set_history(source, steps, content.pop("observations_history_priority", "time"))
     terms = content.pop("observations")
     source.refuse_unknown(terms, _TERMS)
-    scales = {name: content.pop(key) for key, name in _SCALES.items() if key in content}
-    source.set(
-        observation=[make_term(_TERMS[term], scales.get(_TERMS[term]), period_s=_PERIODS.get(term)) for term in terms]
-    )
+    scales = {name: content.pop(key) for key, name in SCALES.items() if key in content}
+    rows = [make_term(_TERMS[term], scales.get(_TERMS[term]), period_s=_PERIODS.get(term)) for term in terms]
+    source.set(observation=rows)
     weights = find_weights(file.parent, content.pop("model_name"))
     source.refuse_unknown(content, _WITHOUT_EFFECT)
     return weights

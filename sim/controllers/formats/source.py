@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from sim.robots.compiled import PER_JOINT
 
 BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
+"""Terms of a controller without sight, in the usual order."""
 
 TERM_NAMES = {
     "lin_vel": "lin_vel", "ang_vel": "ang_vel", "ang_vel_body": "ang_vel", "gravity_vec": "gravity",
@@ -18,6 +19,9 @@ TERM_NAMES = {
     "joint_pos": "joint_pos", "joint_vel": "joint_vel", "actions": "last_action", "last_action": "last_action",
 }  # fmt: skip
 """Terms of the observation by the names that rl_sar and mjlab give them."""
+SCALES = {"lin_vel_scale": "lin_vel", "ang_vel_scale": "ang_vel", "commands_scale": "command", "cmd_scale": "command",
+          "dof_pos_scale": "joint_pos", "dof_vel_scale": "joint_vel"}  # fmt: skip
+"""Terms by the settings that rl_sar and unitree_rl_gym scale them with."""
 
 
 @dataclass(kw_only=True)
@@ -77,20 +81,6 @@ class Source:
         model = self.model
         sites = [k for k in range(model.nsite) if model.site_bodyid[k] == 1 and "imu" in model.site(k).name.lower()]
         return model.site_pos[sites[0]].round(5).tolist() if len(sites) == 1 else None
-
-
-class SourceFormat(Protocol):
-    """A module that reads one kind of source."""
-
-    LABEL: str
-
-    def matches(self, path: Path) -> bool:
-        """Whether a path is of this kind; a ValueError if it cannot be read."""
-        ...
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Fills in the source's settings, and returns the file of the weights."""
-        ...
 
 
 def collapse(values: Any) -> Any:

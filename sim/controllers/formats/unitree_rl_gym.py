@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim.controllers.formats.source import BLIND_TERMS, Source, find_weights, make_term
+from sim.controllers.formats.source import BLIND_TERMS, SCALES, Source, find_weights, make_term
 from sim.controllers.formats.yaml_file import SUFFIXES, read_yaml
 
 LABEL: str = "a deployment of unitree_rl_gym (a YAML with kps, kds, ...)"
@@ -14,12 +14,6 @@ _SETTINGS = {
     "simulation_dt": "physics_dt",
     "control_decimation": "decimation",
     "action_scale": "action_scale",
-}
-_SCALES = {
-    "ang_vel_scale": "ang_vel",
-    "cmd_scale": "command",
-    "dof_pos_scale": "joint_pos",
-    "dof_vel_scale": "joint_vel",
 }
 
 
@@ -41,7 +35,7 @@ def read(path: Path, source: Source) -> Path:
         by_hand = "describe it by hand (docs/controllers.md)"
         raise ValueError(f"{path}: num_obs must be {blind}, or {blind + 2} with a clock, got {width}: {by_hand}")
     source.move(content, _SETTINGS, source.joints)
-    scales = {name: content.pop(key) for key, name in _SCALES.items()}
+    scales = {SCALES[key]: content.pop(key) for key in ("ang_vel_scale", "cmd_scale", "dof_pos_scale", "dof_vel_scale")}
     terms = [make_term(name, scales.get(name)) for name in BLIND_TERMS]
     reason = "the order of unitree_rl_gym's deploy_mujoco.py"
     if width > blind:
