@@ -288,7 +288,7 @@ def film_source(
     if not gif and out is not None and out.suffix == ".gif":
         raise ValueError(f"{out} is a GIF by its name: give --gif too")
     files = source.files(".gif" if gif else ".mp4", out)
-    replicas = source.wanted[0].replicas
+    replicas = source.requests[0].replicas
     if episode is not None and episode >= replicas:
         raise ValueError(f"episode must be one of 0..{replicas - 1}, got {episode}")
     open_context(64, 64).free()

@@ -1,11 +1,8 @@
-"""Recorded crossings, stored on disk by all that they depend on. Those that are missing are crossed.
-
-So no file is ever out of date, and what one command recorded the others find.
-"""
+"""Recorded crossings, stored on disk by all that they depend on; missing ones are crossed."""
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,49 +24,42 @@ from sim.recording.recorder import Recording, make_recording
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.terrains.ground import GroundMaps
-from sim.terrains.spaces.registry import get_space, identity, load_space
+from sim.terrains.spaces.registry import get_space, identity
 from sim.terrains.terrains import Terrains
 
 FOLDER = RUNS / "recordings"
-AT_ONCE = 32
-"""Terrains crossed side by side on a GPU."""
+_LOT = 32  # terrains crossed side by side on a GPU
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """Crossings of one terrain by one controller."""
+class CrossingRequest:
+    """A controller's crossings of one terrain. Requests are equal if their crossings are."""
 
     label: str = field(compare=False)
-    """What the terrain is, in words."""
-    terrain: NDArray[np.float32] = field(compare=False)
-    """Genes, shape (num_genes,), or heights [m], shape (nrow, ncol)."""
+    """Of the terrain."""
+    terrain: Terrains = field(compare=False)
+    """One row."""
     policy: str
     replicas: int = 20
-    seed: int = 0
-    """What ``terrain_seed`` was drawn with, for the record."""
-    terrain_seed: int
-    """Seed of the terrain's episodes."""
-    space: str = "super_gaussian"
-    """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
-    ground: GroundMaps | None = field(default=None, compare=False)
-    """Friction and softness beside heights."""
+    seed: int = field(default=0, compare=False)
+    """What the terrain's seed was drawn with, for the record."""
+    terrain_key: str = field(init=False)
+    """Hash of the terrain and its seed."""
+
+    def __post_init__(self) -> None:
+        (digest,) = self.terrain.digests()
+        space = self.terrain.space
+        object.__setattr__(self, "terrain_key", f"{identity(space.name, space.sha256)} {digest.hex()}")
 
     @property
-    def terrains(self) -> Terrains:
-        """The terrain as what crosses it takes it."""
-        kind: dict[str, Any] = {"heights" if self.terrain.ndim == 2 else "genes": self.terrain[None]}
-        seeds = np.array([self.terrain_seed], np.uint32)
-        return Terrains(seeds=seeds, space=load_space(self.space), ground=self.ground, **kind)
-
-    @property
-    def kind(self) -> tuple[Any, ...]:
-        """What crossings have in common that one simulation makes side by side."""
-        conditions = self.ground is not None and self.ground.conditions is not None
-        about = self.policy, self.replicas, self.seed, self.space, self.terrain.shape
-        return *about, self.ground is None, conditions
+    def lot_key(self) -> tuple[Any, ...]:
+        """Equal for requests that one simulation crosses side by side."""
+        space = self.terrain.space.name
+        maps = (self.terrain.has_ground, self.terrain.has_conditions)
+        return self.policy, self.replicas, self.seed, space, self.terrain.values.shape, maps
 
 
-def on_elite(
+def request_elite(
     archive: Archive,
     number: int,
     *,
@@ -77,53 +67,53 @@ def on_elite(
     minimal: NDArray[np.float32] | None = None,
     seed: int = 0,
     **crossing: Any,
-) -> Wanted:
+) -> CrossingRequest:
     """The crossings of an elite that ``faultline replay`` shows, by a ``policy`` in ``replicas`` episodes.
 
-    With ``minimal``, the genes of its minimal terrain, they are of that, from the same starts.
+    ``minimal`` are genes to cross in place of the elite's, from the same starts.
     """
-    return Wanted(
-        label=label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}",
-        terrain=archive.genes[number] if minimal is None else minimal,
-        seed=seed,
-        terrain_seed=int(episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)[0]),
-        space=get_space(archive.space, archive.space_sha256).name,
-        **crossing,
-    )
+    genes = archive.genes[number] if minimal is None else minimal
+    seeds = episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)
+    terrain = Terrains(genes=genes[None], seeds=seeds, space=get_space(archive.space, archive.space_sha256))
+    label = label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}"
+    return CrossingRequest(label=label, terrain=terrain, seed=seed, **crossing)
 
 
-def on_heights(heights: NDArray[np.float32], *, seed: int = 0, **crossing: Any) -> Wanted:
-    """Crossings of a user's own terrain; further arguments as of :class:`Wanted`."""
-    terrain_seed = int(episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)[0])
-    return Wanted(terrain=heights, seed=seed, terrain_seed=terrain_seed, **crossing)
+def request_map(
+    heights: NDArray[np.float32], *, ground: GroundMaps | None = None, seed: int = 0, **crossing: Any
+) -> CrossingRequest:
+    """Crossings of a user's height map; further arguments as of :class:`CrossingRequest`."""
+    seeds = episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)
+    terrain = Terrains(heights=heights[None], seeds=seeds, ground=ground)
+    return CrossingRequest(terrain=terrain, seed=seed, **crossing)
 
 
-Cross = Callable[[Sequence[Wanted], Callable[[float], None]], list[Recording]]
-"""Crosses terrains of one :attr:`Wanted.kind`, and calls back with the share that is done."""
+Cross = Callable[[Sequence[CrossingRequest], Callable[[float], None]], list[Recording]]
+"""Crosses terrains of one :attr:`CrossingRequest.lot_key`, and calls back with the share that is done."""
 
 
 class RecordingCrosser:
-    """Crosses terrains and records the crossings; the simulation of each kind stays open."""
+    """Crosses terrains and records the crossings; the simulation of each controller stays open."""
 
     def __init__(self, robot: RobotCfg, device: str) -> None:
         self._robot = robot
         self._device = device
-        self._crossers: dict[Any, Crosser] = {}
+        self._crossers: dict[str, Crosser] = {}
 
-    def __call__(self, wanted: Sequence[Wanted], progress: Callable[[float], None]) -> list[Recording]:
+    def __call__(self, requests: Sequence[CrossingRequest], progress: Callable[[float], None]) -> list[Recording]:
         """Recordings of all, in their order."""
-        first = wanted[0]
-        if first.kind not in self._crossers:
-            self._crossers[first.kind] = Crosser(self._robot, Compute(self._device, workers="1"))
-        terrains = Terrains.join([crossing.terrains for crossing in wanted])
-        result = self._crossers[first.kind].cross(
-            first.policy, terrains, replicas=first.replicas, record=True, progress=progress, invalid_ok=True
+        policy = requests[0].policy
+        if policy not in self._crossers:
+            self._crossers[policy] = Crosser(self._robot, Compute(self._device, workers="1"))
+        terrains = Terrains.join([request.terrain for request in requests])
+        result = self._crossers[policy].cross(
+            policy, terrains, replicas=requests[0].replicas, record=True, progress=progress, invalid_ok=True
         )
         recording = make_recording(
-            self._robot, first.policy, terrains, result, device=self._device,
-            labels=[crossing.label for crossing in wanted], seed=first.seed,
+            self._robot, policy, terrains, result, device=self._device,
+            labels=[request.label for request in requests], seed=requests[0].seed,
         )  # fmt: skip
-        return [recording.select_terrain(k) for k in range(len(wanted))]
+        return [recording.select_terrain(k) for k in range(len(requests))]
 
 
 class Recordings:
@@ -133,24 +123,24 @@ class Recordings:
         self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER, cross: Cross | None = None
     ) -> None:
         on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
-        self._about = [robot_identity(robot), robot.penalties, on_gpu, code_fingerprint(("kernels", "sim"))]
+        self._settings = [robot_identity(robot), robot.penalties, on_gpu, code_fingerprint(("kernels", "sim"))]
         self._cache = Cache(folder)
-        self._at_once = AT_ONCE if on_gpu else 1
+        self._lot = _LOT if on_gpu else 1  # on the CPU each is stored as soon as it is done
         self._cross = cross or RecordingCrosser(robot, device)
 
-    def read(self, wanted: Wanted) -> Recording | None:
-        """The recording of some crossings; None if there is none, or it is damaged."""
-        key = self._key(wanted)
+    def read(self, request: CrossingRequest) -> Recording | None:
+        """The stored recording; None if there is none, or it is damaged."""
+        key = self._key(request)
         try:
             recording = read_recording(self._cache.file(key))
         except (OSError, ValueError):
             return None
         self._cache.touch(key)
-        return replace(recording, labels=(wanted.label,))
+        return replace(recording, labels=(request.label,))
 
-    def keep(self, wanted: Wanted, recording: Recording) -> None:
+    def store(self, request: CrossingRequest, recording: Recording) -> None:
         """Stores a recording; prints a warning if it cannot be written."""
-        key = self._key(wanted)
+        key = self._key(request)
         try:
             self._cache.folder.mkdir(parents=True, exist_ok=True)
             write_recording(self._cache.file(key), recording)
@@ -158,41 +148,29 @@ class Recordings:
         except OSError as error:  # it can be shown all the same
             print(f"not stored: {error}", flush=True)
 
-    def all_of(self, wanted: Sequence[Wanted]) -> list[Recording]:
-        """Recordings of all that is wanted, in its order; what is missing is crossed and stored, batch by batch."""
-        recordings = {k: recording for k, crossing in enumerate(wanted) if (recording := self.read(crossing))}
-        missing = [k for k in range(len(wanted)) if k not in recordings]
+    def record(self, requests: Sequence[CrossingRequest]) -> list[Recording]:
+        """Recordings of all requests in their order; missing ones are crossed and stored, lot by lot."""
+        recordings = {k: recording for k, request in enumerate(requests) if (recording := self.read(request))}
+        missing = [k for k in range(len(requests)) if k not in recordings]
         if not missing:
             return [*recordings.values()]
-        words = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {wanted[missing[0]].replicas} times each"
+        lots: dict[Any, list[int]] = {}
+        for k in missing:
+            lots.setdefault(requests[k].lot_key, []).append(k)
+        text = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {requests[missing[0]].replicas} times each"
         done = 0
-        with Bar(f"crossing {words}", len(missing)) as bar:
-            for batch in self._batches(wanted, missing):
-                crossed = self._cross([wanted[k] for k in batch], bar.within(done, len(batch)))
-                for k, recording in zip(batch, crossed, strict=True):
-                    self.keep(wanted[k], recording)
+        with Bar(f"crossing {text}", len(missing)) as bar:
+            for lot in (rows[k : k + self._lot] for rows in lots.values() for k in range(0, len(rows), self._lot)):
+                crossed = self._cross([requests[k] for k in lot], bar.within(done, len(lot)))
+                for k, recording in zip(lot, crossed, strict=True):
+                    self.store(requests[k], recording)
                     recordings[k] = recording
-                done += len(batch)
+                done += len(lot)
                 bar.move_to(done)
-        return [recordings[k] for k in range(len(wanted))]
+        return [recordings[k] for k in range(len(requests))]
 
-    def _batches(self, wanted: Sequence[Wanted], missing: Sequence[int]) -> Iterator[list[int]]:
-        """Those that can be crossed side by side; on the CPU one a time, so that what is done is stored."""
-        for kind in dict.fromkeys(wanted[k].kind for k in missing):
-            numbers = [k for k in missing if wanted[k].kind == kind]
-            yield from (numbers[k : k + self._at_once] for k in range(0, len(numbers), self._at_once))
-
-    def _key(self, wanted: Wanted) -> str:
+    def _key(self, request: CrossingRequest) -> str:
         """Hash of all that a recording depends on."""
-        ground = wanted.ground
-        maps = [] if ground is None else [ground.friction, ground.time_constant_s, ground.rows]
-        arrays = [array.astype(np.float32).tobytes().hex() for array in (wanted.terrain, *maps)]
-        parts = [
-            *self._about,
-            controller_hash(wanted.policy) or wanted.policy,
-            identity(wanted.space, get_space(wanted.space).sha256),
-            wanted.terrain_seed,
-            wanted.replicas,
-            arrays,
-        ]
-        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+        policy = controller_hash(request.policy) or request.policy
+        content = [*self._settings, policy, request.terrain_key, request.replicas]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:32]

@@ -15,7 +15,7 @@ from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
-from qd.show.recordings import Recordings, Wanted, on_elite, on_heights
+from qd.show.recordings import CrossingRequest, Recordings, request_elite, request_map
 from qd.workers.invalid import format_reasons, invalid_reasons, refuse_all_invalid
 from sim.controllers.spec import ControllerSpec, crosser_name
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -46,7 +46,7 @@ class ReplaySource:
     """Names of files, without their ending."""
     about: Sequence[dict[str, Any]]
     """Facts for the file of its numbers."""
-    wanted: Sequence[Wanted]
+    requests: Sequence[CrossingRequest]
     inputs: tuple[Path, ...] = ()
     """Files of the user, which are never overwritten."""
     by: str = ""
@@ -62,8 +62,8 @@ class ReplaySource:
 
     def record(self, device: str, policy: str | None = None) -> list[Recording]:
         """The recording of each terrain, by another controller if one is named. Only missing ones are crossed."""
-        wanted = [replace(crossing, policy=policy or crossing.policy) for crossing in self.wanted]
-        return Recordings(self.robot, device=device).all_of(wanted)
+        requests = [replace(request, policy=policy or request.policy) for request in self.requests]
+        return Recordings(self.robot, device=device).record(requests)
 
     def files(self, ending: str, out: Path | None) -> list[Path]:
         """The file of each terrain: in its folder, in a folder ``out``, or ``out``; bad ones are refused at once."""
@@ -89,8 +89,8 @@ def select_elites(
     controller = opened_run.policy(policy)
     suffix = opened_run.suffix(controller)
     terrains = opened_run.terrains(elite, minimal)
-    wanted = [
-        on_elite(
+    requests = [
+        request_elite(
             opened_run.archive, terrain.number, label=terrain.label, minimal=terrain.genes if minimal else None,
             policy=controller, **crossing,
         ) for terrain in terrains
@@ -102,7 +102,7 @@ def select_elites(
         stems=[f"{terrain.stem}{suffix}" for terrain in terrains],
         by=suffix[1:],
         about=[{"run": str(opened_run.path), "elite": t.number, "minimal": t.minimal} for t in terrains],
-        wanted=wanted,
+        requests=requests,
         opened_run=opened_run,
         terrains=terrains,
     )
@@ -140,7 +140,7 @@ def select_map(
         stems=[f"{stem}-{label}"],
         by=label.removeprefix(robot.name)[1:],
         about=[about],
-        wanted=[on_heights(heights, label=file.name, policy=controller, ground=heightmap.ground, **crossing)],
+        requests=[request_map(heights, label=file.name, policy=controller, ground=heightmap.ground, **crossing)],
         inputs=(file, file.with_suffix(".json")),
     )
 

@@ -50,20 +50,22 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frame
 
 
 def stand_in_cross(crossed: list):
-    """What crosses terrains in no time; the labels of what was crossed go into a list."""
+    """A service that crosses terrains in no time; their labels go into a list."""
 
-    def cross(wanted, progress):
+    def cross(requests, progress):
         made = []
-        for crossing in wanted:
-            crossed.append(crossing.label)
-            number = int("".join(filter(str.isdigit, crossing.label)) or 0)  # elite 3 of anymal
+        for request in requests:
+            crossed.append(request.label)
+            number = int("".join(filter(str.isdigit, request.label)) or 0)  # elite 3 of anymal
             ends = (Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT)
-            outcomes = [ends[(number + k) % 4] for k in range(crossing.replicas)]
-            recording = recording_of(outcomes, np.linspace(6.0, 14.0, crossing.replicas), seed=crossing.terrain_seed)
-            origin = controller_identity(get_robot("anymal"), crossing.policy) | {"space": "super_gaussian"}
-            origin["seed"] = crossing.seed
-            given = {"genes" if crossing.terrain.ndim == 1 else "heights": crossing.terrain[None]}
-            made.append(replace(recording, labels=(crossing.label,), origin=origin, **given))
+            outcomes = [ends[(number + k) % 4] for k in range(request.replicas)]
+            seed = int(request.terrain.seeds[0])
+            recording = recording_of(outcomes, np.linspace(6.0, 14.0, request.replicas), seed=seed)
+            origin = controller_identity(get_robot("anymal"), request.policy) | {"space": "super_gaussian"}
+            origin["seed"] = request.seed
+            values = {name: getattr(request.terrain, name) for name in ("genes", "heights")}
+            values = {name: value for name, value in values.items() if value is not None}
+            made.append(replace(recording, labels=(request.label,), origin=origin, **values))
         progress(1.0)
         return made
 

@@ -13,7 +13,7 @@ from qd.search.directory import ROUNDS_FILE, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
-from qd.show.recordings import Cross, Recordings, on_elite
+from qd.show.recordings import Cross, Recordings, request_elite
 from qd.show.report.evaluation import compare_controllers, write_rounds
 from qd.show.report.page import Table, check_page, encode_figure, publish_page
 from qd.show.report.pictures import explain_missing_pictures, find_failure, find_same_moment, render_close_pictures
@@ -126,8 +126,8 @@ def cross_cases(
     certifiers = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
     crossings += [(number, files[name]) for number, name in certifiers.items()]
-    wanted = [on_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
-    recorded = dict(zip(crossings, recordings.all_of(wanted), strict=True))
+    requests = [request_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
+    recorded = dict(zip(crossings, recordings.record(requests), strict=True))
     cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):

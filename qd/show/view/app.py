@@ -46,9 +46,9 @@ class App:
         recorder.robot = show.robot
         recorder.report = partial(self.post, self.show_progress)
         first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
-        wanted = show.request(first, next(iter(show.controllers), None), minimal=show.minimal)
-        if wanted is not None and recordings.read(wanted) is None:
-            recorder.request(wanted, key="first")  # before a page is open
+        request = show.request(first, next(iter(show.controllers), None), minimal=show.minimal)
+        if request is not None and recordings.read(request) is None:
+            recorder.request(request, key="first")  # before a page is open
         skeleton = Skeleton(show.robot)
         self._shared = Shared(
             show=show, skeleton=skeleton, parts=robot_parts(skeleton, show.robot), recordings=recordings,
@@ -93,7 +93,7 @@ class App:
     def show_progress(self, progress: Progress) -> None:
         """Store a recording, and show all tabs how far it is."""
         if isinstance(progress.result, Recording):
-            self._shared.recordings.keep(progress.task, progress.result)
+            self._shared.recordings.store(progress.task, progress.result)
             self._shared.recorder.cancel(progress.task)  # a tab may have requested it just before
         for tab in self.tabs.values():
             tab.show_progress(progress)

@@ -21,7 +21,7 @@ class Progress:
     """How far a task is."""
 
     task: Any
-    """A :class:`qd.show.recordings.Wanted`, or a film: a partial call of :func:`qd.show.film.film`."""
+    """A :class:`qd.show.recordings.CrossingRequest`, or a film: a partial call of :func:`qd.show.film.film`."""
     text: str = ""
     """An error, or what the process does where its share does not say it."""
     share: float = 0.0

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
-from qd.show.recordings import Recordings, Wanted
+from qd.show.recordings import CrossingRequest, Recordings
 from qd.show.view.meshes import Part
 from qd.show.view.playing import Crossing, trace_crossing
 from qd.show.view.recorder import Progress, Recorder
@@ -33,7 +33,7 @@ class ShownController:
         self._shared = shared
         self._key = key
         self.name: str | None = None
-        self.wanted: Wanted | None = None
+        self.request: CrossingRequest | None = None
         self.recording: Recording | None = None
         self.crossing: Crossing | None = None
 
@@ -42,14 +42,14 @@ class ShownController:
         self.name = name
         self.recording = None
         self.crossing = None
-        self.wanted = self._shared.show.request(elite, name, minimal=minimal)
-        if self.wanted is not None:
-            self.recording = self._shared.recordings.read(self.wanted)
-        self._shared.recorder.request(self.wanted if self.recording is None else None, key=self._key)
+        self.request = self._shared.show.request(elite, name, minimal=minimal)
+        if self.request is not None:
+            self.recording = self._shared.recordings.read(self.request)
+        self._shared.recorder.request(self.request if self.recording is None else None, key=self._key)
 
     def take(self, progress: Progress) -> bool:
         """Take the recording, if it is done; returns whether the progress is of this controller's request."""
-        if self.wanted is None or progress.task != self.wanted or self.recording is not None:
+        if self.request is None or progress.task != self.request or self.recording is not None:
             return False
         self.recording = progress.result
         return True

@@ -13,7 +13,7 @@ import viser
 from qd.search.directory import output_folder
 from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
-from qd.show.recordings import Wanted
+from qd.show.recordings import CrossingRequest
 from qd.show.view.address import Address, read_address
 from qd.show.view.listing import count_endings
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
@@ -274,8 +274,8 @@ class Tab:
 
     def choose_replica(self, replica: int, begin_s: float | None = None, *, playing: bool = True) -> None:
         """Show another episode, counted from 0, from a time [s]; from just before the robot fails if None."""
-        if not 0 <= replica < Wanted.replicas:
-            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {Wanted.replicas}.")
+        if not 0 <= replica < CrossingRequest.replicas:
+            self.refuse(f"There is no episode {replica + 1} here: there are 1 to {CrossingRequest.replicas}.")
             return
         self.replica = replica
         self._begin_s = begin_s
@@ -396,7 +396,7 @@ class Tab:
         self._show_frame()
 
     def _show_share(self, text: str, share: float) -> None:
-        task = f"Recording {Wanted.replicas} episodes of {self.controller}: {text or f'{share:.0%}'}"
+        task = f"Recording {CrossingRequest.replicas} episodes of {self.controller}: {text or f'{share:.0%}'}"
         self.bar.show({"share": share, "task": task})
 
     def _show_crossings(self) -> None:
@@ -414,7 +414,7 @@ class Tab:
         self._load_ghost()
         if self.robot.recording is not None:
             self._show_recording(self.robot.recording)
-        elif self.robot.wanted is None:
+        elif self.robot.request is None:
             self.bar.show({"status": f"No crossing: {escape(show.note)}"})
         else:
             self._show_share("", 0.0)

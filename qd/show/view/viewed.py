@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
 from qd.show.elites import OpenedRun, open_run
-from qd.show.recordings import Wanted, on_elite
+from qd.show.recordings import CrossingRequest, request_elite
 from qd.show.view.listing import Listing
 from qd.workers.compute import check_policy
 from sim.controllers.spec import ControllerSpec, parse_controllers
@@ -53,12 +53,12 @@ class ViewedRun:
         """Genes of the minimal terrain of an elite; None if it has none."""
         return None if self.minima is None else self.minima.genes.get(elite)
 
-    def request(self, elite: int, controller: str | None, *, minimal: bool = False) -> Wanted | None:
+    def request(self, elite: int, controller: str | None, *, minimal: bool = False) -> CrossingRequest | None:
         """A controller's crossings of an elite, or of its minimal terrain if it has one; None without a controller."""
         if controller is None:
             return None
         genes = self.minimal_genes(elite) if minimal else None
-        return on_elite(self.opened_run.archive, elite, policy=self.controllers[controller], minimal=genes)
+        return request_elite(self.opened_run.archive, elite, policy=self.controllers[controller], minimal=genes)
 
     def find_certifier(self, number: int) -> tuple[str | None, str]:
         """Name of the controller that crosses a failing elite most often, or why there is none to show."""

@@ -195,16 +195,16 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     number = next(iter(genes))
     wanted = []
 
-    def all_of(recordings, asked):
+    def record(recordings, asked):
         wanted.extend(asked)
         return [
             dataclasses.replace(recording_of([Outcome.GOAL, Outcome.TIME_OUT], [14.0, 6.0]), genes=genes[number][None])
         ]
 
-    monkeypatch.setattr(Recordings, "all_of", all_of)
+    monkeypatch.setattr(Recordings, "record", record)
     source = select_elites(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
     (report,) = replay(source)
-    np.testing.assert_array_equal(wanted[0].terrain, genes[number])
+    np.testing.assert_array_equal(wanted[0].terrain.genes[0], genes[number])
     assert (wanted[0].policy, wanted[0].replicas, wanted[0].seed) == (str(opened_run.robot.policy_file), 2, 3)
     assert (run / f"minimal-{number}.png").is_file()
     assert json.loads((run / f"minimal-{number}.json").read_text()) == report and report["elite"] == number

@@ -14,12 +14,12 @@ class Instant:
         wanted, robot = self.wanted.pop(0)
         if wanted.policy == "refused":
             return ValueError("no such controller")
-        if wanted.terrain_seed == 13:
+        if int(wanted.terrain.seeds[0]) == 13:
             raise RuntimeError("broken")
         progress(0.5)
         if wanted.policy == "slow" and self.drop.wait(1.0):
             return None
-        return f"{robot}: {wanted.policy} on {wanted.terrain_seed}"
+        return f"{robot}: {wanted.policy} on {wanted.terrain.seeds[0]}"
 
 
 def build(drop, num_terrains):

@@ -11,7 +11,7 @@ import pytest
 from kernels.episode import Outcome
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.show.crossed import find_failure_time, find_typical_episode
-from qd.show.recordings import Recordings, on_elite
+from qd.show.recordings import Recordings, request_elite
 from qd.show.view.app import App
 from qd.show.view.recorder import Progress
 from qd.show.view.tab import Tab
@@ -77,14 +77,14 @@ def worst_crossed(show):
     recording = read_recording(Path(__file__).with_name("crossing.npz"))
     outcome = recording.outcome.copy()
     outcome[0, 16] = Outcome.TIME_OUT
-    wanted = on_elite(show.opened_run.archive, 0, policy=str(show.robot.policy_file), replicas=20)
+    wanted = request_elite(show.opened_run.archive, 0, policy=str(show.robot.policy_file), replicas=20)
     return wanted, dataclasses.replace(recording, outcome=outcome)
 
 
 @pytest.fixture
 def shown(show, worst_crossed, tmp_path):
     recordings = Recordings(show.robot, folder=tmp_path)
-    recordings.keep(*worst_crossed)
+    recordings.store(*worst_crossed)
     with closing(Shown(show, recordings)) as shown:
         yield shown
 
@@ -209,7 +209,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
              "margin_m": None}  # fmt: skip
     minima = MinimalTerrains(numbers={"elites": [entry]}, genes={0: genes})
     recordings = Recordings(show.robot, folder=tmp_path)
-    recordings.keep(*worst_crossed)
+    recordings.store(*worst_crossed)
     with closing(Shown(dataclasses.replace(show, minima=minima), recordings)) as shown:
         tab = shown.tab
         assert tab.panel.terrain.visible and tab.panel.terrain.value == "whole"
@@ -217,7 +217,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
         assert "fresh" in tab.panel.rates.content
         shown.do((tab.choose_terrain, True))
         assert shown.asked[-1].label == "minimal terrain of elite 0 of anymal" and not tab.scene.robot.visible
-        np.testing.assert_array_equal(shown.asked[-1].terrain, genes)
+        np.testing.assert_array_equal(shown.asked[-1].terrain.genes[0], genes)
         tab.show_address()
         assert "terrain=minimal" in tab.query and shown.come(f"?{tab.query}").minimal
         assert tab.panel.rates.content == ""  # what is known is of the whole terrain
@@ -270,7 +270,7 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
     assert not tab.scene.robot.visible and not tab.bar.shown["enabled"]
     shown.do((shown.app.show_progress, Progress(task=wanted, text="", share=0.4)))
     assert tab.bar.shown["task"] == "Recording 20 episodes of base: 40%" and tab.bar.shown["share"] == 0.4
-    other = dataclasses.replace(wanted, terrain_seed=8)
+    other = dataclasses.replace(wanted, replicas=8)
     shown.do((shown.app.show_progress, Progress(task=other, text="no", failed=True)))
     assert tab.bar.shown["share"] == 0.4  # of what is not shown nothing is said
     shown.do((shown.app.show_progress, Progress(task=wanted, text="it <broke>", failed=True)))

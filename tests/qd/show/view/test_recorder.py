@@ -4,14 +4,15 @@ import time
 import numpy as np
 import pytest
 
-from qd.show.recordings import Wanted
+from qd.show.recordings import CrossingRequest
 from qd.show.view.recorder import Recorder
+from sim.terrains.terrains import Terrains
 from tests.qd.show.view.instant import build
 
 
 def wish(number, policy="fast"):
-    genes = np.full(64, number, np.float32)
-    return Wanted(label="", terrain=genes, policy=policy, replicas=1, terrain_seed=number)
+    terrain = Terrains(genes=np.zeros((1, 64), np.float32), seeds=np.array([number]))
+    return CrossingRequest(label="", terrain=terrain, policy=policy, replicas=1)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_of_several_wishes_the_last_one_counts(recorder, reports):
     recorder.request(wish(5))
     recorder.request(None)
     time.sleep(0.5)
-    assert all(reports.get().task.terrain_seed == 5 for _ in range(reports.qsize()))
+    assert all(reports.get().task.terrain.seeds == [5] for _ in range(reports.qsize()))
 
 
 def test_a_failure_is_told_and_the_next_recording_works(recorder, reports):
