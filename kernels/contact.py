@@ -20,7 +20,7 @@ vec5 = wp.types.vector(5, float)
 
 @wp.struct
 class Probes:
-    """Sphere probes of one robot, in strips, and these in bundles."""
+    """Sphere probes of one robot in strips, and strips in bundles."""
 
     position: wp.array[wp.vec3]
     """Probe centres in the frame of their body [m], shape (num_probes,), strip after strip in order along the strip."""
@@ -29,7 +29,7 @@ class Probes:
     strip_radius: wp.array[float]
     """Probe radius of each strip [m], shape (num_strips,)."""
     strip_spread: wp.array[float]
-    """Farthest that a strip's centres lie from the line between its ends [m], shape (num_strips,); 0 if straight."""
+    """Largest distance of a strip's centres from the line between its ends [m], shape (num_strips,); 0 if straight."""
     strip_shape: wp.array[int]
     """Collision shape of each strip, counted within one robot, shape (num_strips,)."""
     bundle_start: wp.array[int]
@@ -45,7 +45,7 @@ class Contacts:
     """Terrain contacts of every robot, shape (num_envs, capacity) each."""
 
     count: wp.array[int]
-    """Of each robot, shape (num_envs,): of those beyond the capacity nothing else is kept."""
+    """Number of contacts of each robot, shape (num_envs,); contacts beyond the capacity are counted, but not stored."""
     shape: wp.array2d[int]
     """Collision shape, counted within one robot."""
     point: wp.array2d[wp.vec3]
@@ -53,9 +53,9 @@ class Contacts:
     normal: wp.array2d[wp.vec3]
     """From the ground to the robot."""
     distance: wp.array2d[float]
-    """Of the surfaces [m], below 0."""
+    """Signed distance of the surfaces [m], negative."""
     friction: wp.array2d[float]
-    """Factor of the friction, by the patch of ground."""
+    """Factor of the friction, from the patch of ground."""
     time_constant: wp.array2d[float]
     """Contact time constant of soft ground [s], ``FIRM`` for the robot's own."""
     force: wp.array2d[wp.vec3]
@@ -64,13 +64,13 @@ class Contacts:
 
 @wp.struct
 class Surfaces:
-    """What contacts of each collision shape of a robot with the ground are like, by MuJoCo's names; (num_shapes,) each.
+    """Contact parameters of each collision shape with the ground, under MuJoCo's names; (num_shapes,) each.
 
-    Those of two dimensions have a row for each robot, or one for all.
+    Arrays of two dimensions have a row for each robot, or one for all.
     """
 
     geom: wp.array[int]
-    """The solver's number."""
+    """The solver's geom."""
     body: wp.array[int]
     condim: wp.array[int]
     friction: wp.array2d[vec5]
@@ -184,12 +184,13 @@ def collide_strips(
     ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
     the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
-    num_envs, device = body_q.shape[0], body_q.device
+    num_envs = body_q.shape[0]
     if terrain_of_env.shape[0] != num_envs:
         raise ValueError(f"body_q must hold {terrain_of_env.shape[0]} robots, one a terrain_of_env, got {num_envs}")
     contacts_out.count.zero_()
-    inputs, size = [body_q, terrain_of_env, terrain, probes, ground, parked], (probes.bundle_body.shape[0], num_envs)
-    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=device)
+    inputs = [body_q, terrain_of_env, terrain, probes, ground, parked]
+    size = (probes.bundle_body.shape[0], num_envs)
+    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=body_q.device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:
@@ -210,6 +211,7 @@ def _sum_forces_kernel(contacts: Contacts, column_of_shape: wp.array[int], geom_
 
 
 def sum_forces(contacts: Contacts, column_of_shape: Any, geom_force_out: Any) -> None:
-    """Sum the contact forces on each robot geom; ``column_of_shape`` is that of each collision shape, -1 for others."""
-    inputs, device = [contacts, column_of_shape], geom_force_out.device
-    wp.launch(_sum_forces_kernel, geom_force_out.shape, inputs, outputs=[geom_force_out], device=device)
+    """Sum the contact forces on each geom; ``column_of_shape`` is its column for each collision shape, -1 for none."""
+    size = geom_force_out.shape
+    inputs = [contacts, column_of_shape]
+    wp.launch(_sum_forces_kernel, size, inputs, outputs=[geom_force_out], device=geom_force_out.device)

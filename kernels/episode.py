@@ -1,4 +1,4 @@
-"""An episode on the device, of a crossing and of training alike: its task, its command, and the latch that ends it."""
+"""An episode on the device, in crossings and in training: its task, its command, and the latch that ends it."""
 
 from enum import IntEnum
 from typing import Any
@@ -7,6 +7,7 @@ import warp as wp
 
 from kernels.penalties import max_base_force
 from kernels.state import (
+    RobotStep,
     base_position,
     base_rotation,
     base_yaw,
@@ -19,7 +20,7 @@ from kernels.state import (
 
 
 class Outcome(IntEnum):
-    """How an episode ended; tilt ends those of training alone."""
+    """End of an episode; tilt ends episodes of training only."""
 
     RUNNING = 0
     GOAL = 1
@@ -46,11 +47,11 @@ PARKING_HEIGHT = wp.constant(50.0)
 
 @wp.struct
 class Task:
-    """Goal, command and limits of an episode; steps are those it is judged after."""
+    """Goal, command and limits of an episode; steps are the judged ones."""
 
     goal: wp.vec2
     goal_radius: float
-    """Within this of the goal the episode ends [m]; 0 where it never does."""
+    """The episode ends within this distance of the goal [m]; 0 for never."""
     speed: float
     """Commanded speed toward the goal [m/s]."""
     yaw_gain: float
@@ -63,13 +64,13 @@ class Task:
     max_steps: int
     """Steps of the longest episode."""
     first_counted_step: int
-    """Penalties count from this step on."""
+    """First step whose penalties count."""
     base_force: float
     """Contact force on the base that counts as a collision [N]."""
     max_gravity_z: float
-    """Tilt ends an episode where the projected gravity's z exceeds this (-1: upright); 2 where it never does."""
+    """The episode ends where the z of projected gravity exceeds this (-1: upright); 2 for never."""
     max_speed: float
-    """Any velocity beyond is invalid [m/s or rad/s]."""
+    """A faster robot is invalid [m/s or rad/s]."""
     overflow_mask: int
     """Solver overflow bits that make an episode invalid."""
 
@@ -83,21 +84,21 @@ class Episodes:
     invalidity: wp.array[int]
     """:class:`Invalidity` at the end; means nothing while the episode runs."""
     steps: wp.array[int]
-    """Steps made up to the end."""
+    """Steps up to the end."""
     counted: wp.array[int]
-    """1 if the step just made counts for the penalties."""
+    """1 if the penalties of the last step count."""
     base_force: wp.array[float]
-    """Largest contact force on the base noted since the episode was last judged [N]."""
+    """Largest contact force on the base since the episode was last judged [N]."""
     start: wp.array[wp.vec2]
     """Where the episode began, world-local [m]."""
     final_pose: wp.array[wp.transform]
     """Base pose at the end, world-local frame."""
     rng: wp.array[wp.uint32]
-    """State of the random numbers that the next start is drawn from."""
+    """Random state of the next start."""
 
 
 def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
-    """Allocate episodes of which none runs."""
+    """Allocate episodes that do not run."""
     episodes = make_zeros(Episodes, device, **dict.fromkeys(Episodes.vars, num_envs))
     episodes.outcome.fill_(int(Outcome.TIME_OUT))
     return episodes
@@ -158,38 +159,33 @@ def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> No
 
 
 @wp.func
-def find_invalidity(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], action: wp.array2d[float], overflow: int, task: Task,
-    env: int,
-) -> int:  # fmt: skip
-    """Why a step is invalid, if it is; causes go before what comes of them."""
-    if not row_is_finite(action, env):
+def find_invalidity(step: RobotStep, task: Task, env: int) -> int:
+    """Why a step is invalid, if it is; causes come before their effects."""
+    if not row_is_finite(step.action, env):
         return int(Invalidity.ACTION)
-    if (overflow & task.overflow_mask) != 0:
+    if (step.overflow[env] & task.overflow_mask) != 0:
         return int(Invalidity.OVERFLOW)
-    if not row_is_finite(joint_q, env) or not row_is_finite(joint_qd, env):
+    if not row_is_finite(step.joint_q, env) or not row_is_finite(step.joint_qd, env):
         return int(Invalidity.STATE)
-    if is_too_fast(joint_qd, env, task.max_speed):
+    if is_too_fast(step.joint_qd, env, task.max_speed):
         return int(Invalidity.SPEED)
     return int(Invalidity.NONE)
 
 
 @wp.func
-def judge_state(
-    joint_q: wp.array2d[float], base_force: float, invalidity: int, steps: int, task: Task, env: int
-) -> int:
+def judge_state(step: RobotStep, base_force: float, invalidity: int, steps: int, task: Task, env: int) -> int:
     """Outcome of an episode after its ``steps``-th step; the gravest of several wins."""
     if invalidity != Invalidity.NONE:
         return int(Outcome.INVALID)
     if base_force > task.base_force:
         return int(Outcome.BASE_COLLISION)
-    if projected_gravity(joint_q, env)[2] > task.max_gravity_z:
+    if projected_gravity(step.joint_q, env)[2] > task.max_gravity_z:
         return int(Outcome.TILT)
-    position = base_position(joint_q, env)
+    position = base_position(step.joint_q, env)
     if wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius:
         return int(Outcome.GOAL)
-    beside = position[1] < task.lower[1] or position[1] > task.upper[1]
-    if beside or position[0] < task.lower[0] or position[0] > task.upper[0]:
+    left_sideways = position[1] < task.lower[1] or position[1] > task.upper[1]
+    if left_sideways or position[0] < task.lower[0] or position[0] > task.upper[0]:
         return int(Outcome.OUT)
     if steps >= task.max_steps:
         return int(Outcome.TIME_OUT)
@@ -197,38 +193,30 @@ def judge_state(
 
 
 @wp.kernel
-def _note_base_forces_kernel(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], episodes_out: Episodes):
+def _note_base_forces_kernel(step: RobotStep, episodes_out: Episodes):
     """Grid (num_envs,)."""
     env = wp.tid()
-    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
+    force = max_base_force(step.geom_force, step.geom_role, env)
+    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], force)
 
 
-def note_base_forces(geom_force: Any, geom_role: Any, episodes_out: Episodes) -> None:
-    """Raise ``base_force`` to how hard bases are touched in a physics step after which no episode is judged."""
-    inputs, device = [geom_force, geom_role], geom_force.device
-    wp.launch(_note_base_forces_kernel, geom_force.shape[0], inputs, outputs=[episodes_out], device=device)
+def note_base_forces(step: RobotStep, episodes_out: Episodes) -> None:
+    """Raise ``base_force`` to the contact force on the base, after a physics step that is not judged."""
+    forces = step.geom_force
+    wp.launch(_note_base_forces_kernel, forces.shape[0], [step], outputs=[episodes_out], device=forces.device)
 
 
 @wp.kernel
-def _latch_outcomes_kernel(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    action: wp.array2d[float],
-    geom_force: wp.array2d[wp.vec3],
-    geom_role: wp.array[int],
-    overflow: wp.array[int],
-    task: Task,
-    episodes_out: Episodes,
-):
+def _latch_outcomes_kernel(step: RobotStep, task: Task, episodes_out: Episodes):
     """Grid (num_envs,)."""
     env = wp.tid()
     episodes_out.counted[env] = 0
     if episodes_out.outcome[env] != Outcome.RUNNING:
         return
     steps = episodes_out.steps[env] + 1
-    force = wp.max(episodes_out.base_force[env], max_base_force(geom_force, geom_role, env))
-    invalidity = find_invalidity(joint_q, joint_qd, action, overflow[env], task, env)
-    outcome = judge_state(joint_q, force, invalidity, steps, task, env)
+    force = wp.max(episodes_out.base_force[env], max_base_force(step.geom_force, step.geom_role, env))
+    invalidity = find_invalidity(step, task, env)
+    outcome = judge_state(step, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.steps[env] = steps
     if outcome != Outcome.INVALID and steps >= task.first_counted_step:
@@ -236,20 +224,13 @@ def _latch_outcomes_kernel(
     if outcome != Outcome.RUNNING:
         episodes_out.outcome[env] = outcome
         episodes_out.invalidity[env] = invalidity
-        episodes_out.final_pose[env] = wp.transform(base_position(joint_q, env), base_rotation(joint_q, env))
+        episodes_out.final_pose[env] = wp.transform(base_position(step.joint_q, env), base_rotation(step.joint_q, env))
 
 
-def latch_outcomes(
-    joint_q: Any, joint_qd: Any, action: Any, geom_force: Any, geom_role: Any, overflow: Any, task: Task,
-    episodes_out: Episodes,
-) -> None:  # fmt: skip
-    """Judge every running episode after a step and latch its end; forget what forces were noted.
-
-    Coordinates and forces are those after the step, the action as :func:`kernels.observation.apply_action` left it.
-    ``overflow`` (num_envs,) are the solver's bits of the step.
-    """
-    inputs = [joint_q, joint_qd, action, geom_force, geom_role, overflow, task]
-    wp.launch(_latch_outcomes_kernel, overflow.shape[0], inputs, outputs=[episodes_out], device=joint_q.device)
+def latch_outcomes(step: RobotStep, task: Task, episodes_out: Episodes) -> None:
+    """Judge every running episode after a step and latch its end; clear the noted ``base_force``."""
+    num_envs = step.overflow.shape[0]
+    wp.launch(_latch_outcomes_kernel, num_envs, [step, task], outputs=[episodes_out], device=step.overflow.device)
 
 
 @wp.kernel

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.state import base_ang_vel_b, base_lin_vel_b
+from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b
 
 BASE = 1
 FOOT = 2
@@ -54,20 +54,6 @@ def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], en
     return largest
 
 
-@wp.struct
-class PenaltyStep:
-    """The end of a physics step; one row an environment. :mod:`kernels` has the arrays."""
-
-    joint_q: wp.array2d[float]
-    joint_qd: wp.array2d[float]
-    base_com: wp.vec3
-    command: wp.array2d[float]
-    geom_force: wp.array2d[wp.vec3]
-    geom_role: wp.array[int]
-    force_limit: float
-    """Foot contact force beyond which it is penalised [N]."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlainStep:
     """The same for N robots in float64 NumPy, in the terms of the penalties."""
@@ -92,7 +78,7 @@ class Penalty:
     name: str
     """In robots' settings, archives and tables."""
     function: Any
-    """Warp function of a :class:`PenaltyStep` and an environment: the penalty before it is multiplied by the step."""
+    """Warp function of a :class:`kernels.state.RobotStep` and an environment; its value is multiplied by the step."""
     plain: Callable[[PlainStep], NDArray[Any]]
     """The same in NumPy, shape (N,), by which crossings in MuJoCo C are penalised and the Warp function is tested."""
     label: str
@@ -137,7 +123,7 @@ def _plain_stumble(step: PlainStep) -> NDArray[Any]:
 
 
 @wp.func
-def _squared_velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
+def _squared_velocity_error(step: RobotStep, env: int, axis: int) -> float:
     velocity = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
     error = velocity[axis] - step.command[env, axis]
     return error * error
@@ -150,7 +136,7 @@ def _squared_velocity_error(step: PenaltyStep, env: int, axis: int) -> float:
     unit="(rad/s)^2 s",
     color="#cc79a7",
 )
-def _yaw_rate(step: PenaltyStep, env: int) -> float:
+def _yaw_rate(step: RobotStep, env: int) -> float:
     """Squared error of the yaw rate [(rad/s)^2], base frame."""
     error = base_ang_vel_b(step.joint_q, step.joint_qd, env)[2] - step.command[env, 2]
     return error * error
@@ -163,7 +149,7 @@ def _yaw_rate(step: PenaltyStep, env: int) -> float:
     unit="(m/s)^2 s",
     color="#0072b2",
 )
-def _vel_x(step: PenaltyStep, env: int) -> float:
+def _vel_x(step: RobotStep, env: int) -> float:
     """Squared error of the forward velocity of the base link [(m/s)^2], base frame."""
     return _squared_velocity_error(step, env, 0)
 
@@ -175,7 +161,7 @@ def _vel_x(step: PenaltyStep, env: int) -> float:
     unit="(m/s)^2 s",
     color="#56b4e9",
 )
-def _vel_y(step: PenaltyStep, env: int) -> float:
+def _vel_y(step: RobotStep, env: int) -> float:
     """Squared error of the sideways velocity of the base link [(m/s)^2], base frame."""
     return _squared_velocity_error(step, env, 1)
 
@@ -187,13 +173,13 @@ def _vel_y(step: PenaltyStep, env: int) -> float:
     unit="N s",
     color="#000000",
 )
-def _contact_force(step: PenaltyStep, env: int) -> float:
+def _contact_force(step: RobotStep, env: int) -> float:
     """Sum over the feet of the contact force beyond the limit [N]."""
     return excess_contact_force(step.geom_force, step.geom_role, step.force_limit, env)
 
 
 @penalty("stumble", plain=_plain_stumble, label="stumble", unit="s", color="#e69f00")
-def _stumble(step: PenaltyStep, env: int) -> float:
+def _stumble(step: RobotStep, env: int) -> float:
     """1 if any foot hits a vertical surface, else 0."""
     return is_stumbling(step.geom_force, step.geom_role, env)
 
@@ -206,7 +192,7 @@ def _stumble(step: PenaltyStep, env: int) -> float:
     color="#d55e00",
     needs_limbs=True,
 )
-def _collision(step: PenaltyStep, env: int) -> float:
+def _collision(step: RobotStep, env: int) -> float:
     """Number of base and limb geoms touched with more than 0.1 N."""
     count = float(0.0)
     for g in range(step.geom_role.shape[0]):
@@ -222,7 +208,7 @@ def _kernel(functions: tuple[Any, ...]) -> Any:
     options = {"max_unroll": max(16, count)}  # the loop calls another function each time
 
     @wp.kernel(module="unique", module_options=options)
-    def add_penalties_kernel(step: PenaltyStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
+    def add_penalties_kernel(step: RobotStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
         """Grid (num_envs,)."""
         env = wp.tid()
         if counted[env] != 0:
@@ -232,7 +218,7 @@ def _kernel(functions: tuple[Any, ...]) -> Any:
     return add_penalties_kernel
 
 
-def add_penalties(step: PenaltyStep, dt: float, counted: Any, sums_out: Any) -> None:
+def add_penalties(step: RobotStep, dt: float, counted: Any, sums_out: Any) -> None:
     """Add one physics step's raw penalties times ``dt`` [s] to the sums, columns :data:`PENALTIES`.
 
     Where the int ``counted`` (num_envs,) is 0, nothing is added.

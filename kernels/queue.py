@@ -1,10 +1,10 @@
-"""The queue of episodes: a robot whose episode has ended writes down what came of it and takes the next one.
+"""The queue of episodes: a robot whose episode has ended stores its result and takes the next one.
 
 Any number of episodes runs through a fixed number of robots, on the device, without the host. Which robot takes which
-episode changes nothing: a start depends on the seed of the terrain and the number of the replica alone.
+episode changes nothing: a start depends on the terrain's seed and the number of the replica alone.
 
-The terrains are a ring of slots. Terrains that are put in take the slots behind those put in before, so that episode
-number ``n`` since the ring was empty is replica ``n % num_replicas`` of slot ``n // num_replicas % num_slots``.
+The terrains are a ring of slots. New terrains take the slots behind the former ones: episode number ``n`` since the
+ring was empty is replica ``n % num_replicas`` of slot ``n // num_replicas % num_slots``.
 """
 
 from typing import Any
@@ -21,10 +21,10 @@ _READY = wp.constant(1)
 
 @wp.struct
 class EpisodeQueue:
-    """Episodes to come, who runs which, and what came of those that ended."""
+    """Waiting episodes, the robots of running ones, and the results of ended ones."""
 
     num_replicas: int
-    """Episodes a terrain."""
+    """Episodes of a terrain."""
     counts: wp.array[int]
     """Episodes taken and episodes ready to be taken since the ring was empty, less whole rounds of it; shape (2,)."""
     seed: wp.array[wp.uint32]
@@ -32,7 +32,7 @@ class EpisodeQueue:
     num_ended: wp.array[int]
     """Episodes that have ended on each slot's terrain, shape (num_slots,)."""
     episode_of_env: wp.array[int]
-    """Row of the results that each robot works on, -1 where it waits; shape (num_envs,)."""
+    """Row of the results of each robot's episode, -1 where it waits; shape (num_envs,)."""
     begins: wp.array[int]
     """1 where a robot has just taken an episode, shape (num_envs,)."""
     busy: wp.array[int]
@@ -74,7 +74,7 @@ def ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
 
 
 @wp.func
-def _write_down(
+def _store_result(
     row: int, env: int, episodes: Episodes, penalty_sums: wp.array2d[float], rewards: Rewards, queue_out: EpisodeQueue
 ):
     queue_out.outcome[row] = episodes.outcome[env]
@@ -92,7 +92,7 @@ def _write_down(
 def _take_next(queue_out: EpisodeQueue) -> int:
     """Row of the next episode, -1 where none is ready."""
     ready = queue_out.counts[_READY]
-    if queue_out.counts[_TAKEN] >= ready:  # so that robots that wait do not count on for ever
+    if queue_out.counts[_TAKEN] >= ready:  # waiting robots must not increment it for ever
         return -1
     number = wp.atomic_add(queue_out.counts, _TAKEN, 1)
     if number >= ready:
@@ -118,7 +118,7 @@ def _turn_over_kernel(
     if stepped[env] == Outcome.RUNNING:
         return
     if row >= 0:
-        _write_down(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
+        _store_result(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
     row = _take_next(queue_out)
     queue_out.episode_of_env[env] = row
     if row < 0:
@@ -136,12 +136,12 @@ def turn_over(
     stepped: Any, rewards: Rewards, episodes_out: Episodes, penalty_sums_out: Any, terrain_of_env_out: Any,
     queue_out: EpisodeQueue,
 ) -> None:  # fmt: skip
-    """Write down what came of the episodes that ended, and let their robots take the next ones.
+    """Store the results of the episodes that ended, and let their robots take the next ones.
 
     It moves no robot: :func:`kernels.restart.restart_episodes` does, where ``begins`` is 1.
 
-    ``stepped`` is the outcome of what each robot is stepped for; not ``episodes_out.outcome`` where a robot goes on
-    after the crossing has ended. Where an episode begins, ``rng`` and terrain are written and penalty sums are zero.
+    ``stepped`` is the outcome that ends a robot's stepping; it differs from ``episodes_out.outcome`` where a robot goes
+    on after its crossing has ended. Where an episode begins, ``rng`` and terrain are written and penalty sums are zero.
     """
     outputs = [episodes_out, penalty_sums_out, terrain_of_env_out, queue_out]
     wp.launch(_turn_over_kernel, stepped.shape[0], [stepped, rewards], outputs=outputs, device=stepped.device)
@@ -151,7 +151,7 @@ def turn_over(
 def _make_ready_kernel(count: int, queue_out: EpisodeQueue):
     """Grid (1,)."""
     ready = queue_out.counts[_READY]
-    taken = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have counted on
+    taken = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have incremented it
     # Whole rounds change no row; left in, they would outgrow an int in a search of many days.
     size = queue_out.seed.shape[0] * queue_out.num_replicas
     rounds = taken // size * size

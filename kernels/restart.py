@@ -1,4 +1,4 @@
-"""The restart of an episode, of a crossing and of training alike: a randomised start, with nothing remembered."""
+"""The restart of an episode, in crossings and in training: a randomised start without memory of the episode before."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ class StartRanges:
     """Nominal start, world-local x, y [m]."""
     position_range: float
     ahead: float
-    """Starts lie up to this further along x, uniform [m]; 0 for none."""
+    """Starts are up to this further along x, uniform [m]."""
     yaw_range: float
     joint_scale_range: float
     """Joint angles are the default pose times 1 +- this."""
@@ -30,7 +30,7 @@ class StartRanges:
     base_height: float
     """Base height over the highest ground under the robot [m]."""
     footprint: wp.vec2
-    """Half length and half width of the ground looked at [m]."""
+    """Half length and half width of the ground under the robot [m]."""
 
 
 @wp.func
@@ -48,7 +48,7 @@ def highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> 
 
 
 @wp.func
-def _place_robot(
+def _write_start(
     rng: wp.uint32, terrain: Terrain, t: int, ranges: StartRanges, sensors: Sensors, env: int,
     joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float],
 ):  # fmt: skip
@@ -71,9 +71,9 @@ def _place_robot(
     v = ranges.velocity_range
     lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
     ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    of_com = velocity_beside(lin_vel, ang_vel, rotation, sensors.base_com)
+    com_velocity = velocity_beside(lin_vel, ang_vel, rotation, sensors.base_com)
     for k in range(3):
-        joint_qd_out[env, k] = of_com[k]
+        joint_qd_out[env, k] = com_velocity[k]
         joint_qd_out[env, 3 + k] = ang_vel[k]
 
 
@@ -94,7 +94,7 @@ def _restart_episodes_kernel(
     env = wp.tid()
     if mask[env] == 0:
         return
-    _place_robot(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
+    _write_start(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
     episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
     begin_episode(env, episodes_out)
     for j in range(last_action_out.shape[1]):
@@ -112,7 +112,7 @@ def restart_episodes(
     mask: Any, terrain_of_env: Any, terrain: Terrain, ranges: StartRanges, sensors: Sensors, joint_q_out: Any,
     joint_qd_out: Any, last_action_out: Any, episodes_out: Episodes, rewards_out: Rewards,
 ) -> None:  # fmt: skip
-    """Put robots at a new randomised start where the int ``mask`` (num_envs,) is not 0, with nothing remembered.
+    """Put robots at a new randomised start where the int ``mask`` (num_envs,) is not 0, and clear their memory.
 
     Starts are drawn from ``rng`` of the episodes, which run from then on. ``rewards_out`` is empty where nothing is
     rewarded.
@@ -124,7 +124,7 @@ def restart_episodes(
 
 @wp.kernel
 def _clear_rows_kernel(mask: wp.array[int], stride: int, rows_out: wp.array2d[float]):
-    """Grid (num_envs, stride); a thread a number would mostly look at masks, since rows are long and seldom cleared."""
+    """Grid (num_envs, stride); rows are long and seldom cleared: a thread for each number would mostly read masks."""
     env, first = wp.tid()
     if mask[env] != 0:
         for k in range(first, rows_out.shape[1], stride):

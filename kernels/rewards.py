@@ -21,7 +21,7 @@ MIN_COMMANDED_SPEED = wp.constant(0.1)
 
 @wp.struct
 class Motion:
-    """What a control step ended in; one row an environment. :mod:`kernels` has the arrays without a line."""
+    """Robots at the end of a control step, one row each; :mod:`kernels` has the arrays without a line."""
 
     joint_q: wp.array2d[float]
     joint_qd: wp.array2d[float]
@@ -30,7 +30,7 @@ class Motion:
     geom_force: wp.array2d[wp.vec3]
     geom_role: wp.array[int]
     command: wp.array2d[float]
-    """The one that the action answered."""
+    """The command that the action followed."""
     action: wp.array2d[float]
     """Clipped."""
     base_com: wp.vec3
@@ -39,7 +39,7 @@ class Motion:
     dt: float
     """Control step [s]."""
     min_air_time_s: float
-    """A foot in the air for longer earns a reward when it lands, for less long it costs one [s]."""
+    """A longer flight of a foot earns a reward when it lands, a shorter one costs [s]."""
     joint_lower: wp.array[float]
     """Soft lower limit of each joint [rad], shape (num_joints,)."""
     joint_upper: wp.array[float]
@@ -52,7 +52,7 @@ class Motion:
 
 @wp.struct
 class Rewards:
-    """Rewards of the episodes so far, and what the next step's are compared with; shape (num_envs,) unless said."""
+    """Rewards of the episodes so far, and memory of the step before; shape (num_envs,) unless noted."""
 
     running: wp.array[int]
     """1 if the episode had not ended when the control step began."""
@@ -92,8 +92,8 @@ def _ang_vel(motion: Motion, env: int) -> wp.vec3:
 
 
 @wp.func
-def _is_told_to_stand(motion: Motion, env: int) -> bool:
-    """Whether the commanded velocity is none, up to 0.1 m/s."""
+def _shall_stand(motion: Motion, env: int) -> bool:
+    """Whether the commanded velocity is at most 0.1 m/s."""
     return wp.length(wp.vec2(motion.command[env, 0], motion.command[env, 1])) <= MIN_COMMANDED_SPEED
 
 
@@ -147,7 +147,7 @@ def dof_acc(motion: Motion, rewards: Rewards, env: int) -> float:
 
 @_term
 def feet_air_time(motion: Motion, rewards: Rewards, env: int) -> float:
-    """Sum over the feet that land of their time in the air less the least; 0 when told to stand. Updates ``rewards``.
+    """Sum over landing feet of their time in the air less the minimum; 0 at a command to stand. Updates ``rewards``.
 
     A foot is on the ground if it touches now or did in the step before: one missed step is no take-off.
     """
@@ -165,7 +165,7 @@ def feet_air_time(motion: Motion, rewards: Rewards, env: int) -> float:
             else:
                 rewards.air_time[env, g] = air_time + motion.dt
             rewards.touched[env, g] = touching
-    if _is_told_to_stand(motion, env):
+    if _shall_stand(motion, env):
         total = 0.0
     return total
 
@@ -214,12 +214,12 @@ def dof_pos_limits(motion: Motion, rewards: Rewards, env: int) -> float:
 
 @_term
 def no_fly(motion: Motion, rewards: Rewards, env: int) -> float:
-    """1 if exactly one foot is pushed up, by more than 0.1 N; 0 when told to stand, where legged_gym pays it too."""
+    """1 if exactly one foot is pushed up, by more than 0.1 N; 0 at a command to stand, unlike legged_gym's."""
     count = int(0)
     for g in range(motion.geom_role.shape[0]):
         if (motion.geom_role[g] & FOOT) != 0 and motion.geom_force[env, g][2] > COLLISION_FORCE:
             count += 1
-    return wp.where(count == 1 and not _is_told_to_stand(motion, env), 1.0, 0.0)
+    return wp.where(count == 1 and not _shall_stand(motion, env), 1.0, 0.0)
 
 
 @_term
@@ -250,14 +250,14 @@ wp.set_module_options({"max_unroll": len(_TERMS)})  # the loop over the terms ca
 
 @wp.struct
 class RewardWeights:
-    """What a step pays; made by :func:`make_weights`."""
+    """Weights of the terms; made by :func:`make_weights`."""
 
     terms: _TermWeights
     """Weight of each term per second, in the order of :data:`REWARDS`."""
     termination: float
     """Weight of a fall per second."""
     falls: int
-    """Outcomes that are a fall, bits ``1 << Outcome``."""
+    """Outcomes that count as a fall, bits ``1 << Outcome``."""
     only_positive: int
     """1: the sum of the terms is clipped at 0, so that ending early never pays."""
 
@@ -326,6 +326,6 @@ def _remember_steps_kernel(
 
 
 def remember_steps(action: Any, joint_qd: Any, rewards_out: Rewards, counter_out: Any) -> None:
-    """Keep what the next step's rewards are compared with, and count the step in ``counter_out`` (1,)."""
+    """Keep action and joint rates for the rewards of the next step, and count the step in ``counter_out`` (1,)."""
     inputs = [action, joint_qd]
     wp.launch(_remember_steps_kernel, action.shape, inputs, outputs=[rewards_out, counter_out], device=action.device)

@@ -17,6 +17,24 @@ def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...])
     return made
 
 
+@wp.struct
+class RobotStep:
+    """Robots at the end of a physics step, one row each; :mod:`kernels` has the arrays without a line."""
+
+    joint_q: wp.array2d[float]
+    joint_qd: wp.array2d[float]
+    base_com: wp.vec3
+    command: wp.array2d[float]
+    action: wp.array2d[float]
+    """As :func:`kernels.observation.apply_action` left it."""
+    geom_force: wp.array2d[wp.vec3]
+    geom_role: wp.array[int]
+    overflow: wp.array[int]
+    """The solver's overflow bits of the step, shape (num_envs,)."""
+    force_limit: float
+    """Foot contact force beyond which it is penalised [N]."""
+
+
 @wp.func
 def base_position(joint_q: wp.array2d[float], env: int) -> wp.vec3:
     """Position of the base link's origin, world-local frame [m]."""
@@ -61,10 +79,10 @@ def base_ang_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env:
 @wp.func
 def base_lin_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_com: wp.vec3, env: int) -> wp.vec3:
     """Velocity of the base link's origin in the base frame [m/s]; ``base_com`` is the mass centre in that frame [m]."""
-    of_com = wp.quat_rotate_inv(
+    com_velocity = wp.quat_rotate_inv(
         base_rotation(joint_q, env), wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
     )
-    return of_com - wp.cross(base_ang_vel_b(joint_q, joint_qd, env), base_com)
+    return com_velocity - wp.cross(base_ang_vel_b(joint_q, joint_qd, env), base_com)
 
 
 @wp.func

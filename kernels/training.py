@@ -1,7 +1,7 @@
-"""What training adds to an episode: levels of terrain, random commands, pushes, and the statistics of its progress.
+"""Training's additions to an episode: levels of terrain, random commands, pushes, and statistics of progress.
 
-Random numbers come from the counter of :class:`Training` and the environment's number alone, so that a run is
-repeatable on the CPU and nothing is drawn on the host.
+Random numbers come from the counter of :class:`TrainingState` and the environment's number alone: a run is repeatable
+on the CPU, and nothing is drawn on the host.
 """
 
 from typing import Any
@@ -10,7 +10,7 @@ import warp as wp
 
 from kernels.episode import Episodes, Outcome, Task, goal_command
 from kernels.rewards import Rewards
-from kernels.state import base_ang_vel_b, base_lin_vel_b, base_yaw, make_zeros, wrap_angle
+from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b, base_yaw, make_zeros, wrap_angle
 
 STATISTICS = (
     "steps", "episodes", *(outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING), "overflow",
@@ -28,35 +28,35 @@ _PUSH_STAGGER = wp.constant(7919)  # a prime: pushes meet the environments one a
 
 @wp.struct
 class Rules:
-    """What is commanded, when robots are pushed and where they restart; steps are control steps."""
+    """Commands, pushes and restarts; steps are control steps."""
 
     crosses: int
-    """1: robots are told to go to the goal of the task; 0: they are told random velocities and headings."""
+    """1: commands lead to the goal of the task; 0: commands are random velocities and headings."""
     overflow_mask: int
-    """Solver overflow bits that are counted."""
+    """Overflow bits that count."""
     num_levels: int
     num_columns: int
     """Tile ``level * num_columns + column`` is the terrain of an environment."""
     promotion_distance: float
-    """Walked farther [m]: one level up."""
+    """A robot that walks farther goes one level up [m]."""
     demotion_time_s: float
-    """Walked less than the commanded speed times this: one level down."""
+    """A robot that walks less than the commanded speed times this goes one level down."""
     command_steps: int
-    """A new command every so often."""
+    """Steps from command to command."""
     lin_vel_x: wp.vec2
     """Range of the commanded vx [m/s]."""
     lin_vel_y: wp.vec2
     min_speed: float
     """Slower commands become 0 [m/s]."""
     push_steps: int
-    """A push every so often; 0 for none."""
+    """Steps from push to push; 0 for none."""
     push_speed: float
     """A push sets vx and vy of the mass centre to +- this, world frame [m/s]."""
 
 
 @wp.struct
-class Training:
-    """What training keeps beside the episodes, shape (num_envs,) unless it is said here or in :mod:`kernels`."""
+class TrainingState:
+    """State of training beside the episodes, shape (num_envs,) unless noted here or in :mod:`kernels`."""
 
     counter: wp.array[int]
     """Control steps so far, counted from a seed: what all random numbers come from; shape (1,)."""
@@ -70,20 +70,20 @@ class Training:
     action: wp.array2d[float]
     last_action: wp.array2d[float]
     observation: wp.array2d[float]
-    """What the policy sees next, shape (num_envs, observation_size)."""
+    """Next input of the policy, shape (num_envs, observation_size)."""
     statistics: wp.array2d[float]
     """Sums since they were last cleared, columns :data:`STATISTICS`; shape (num_envs, len(STATISTICS))."""
 
 
 def make_training(
     columns: Any, levels: Any, *, num_joints: int, observation_size: int, first_count: int, device: str
-) -> Training:
-    """Allocate what training keeps, zero but for terrain columns and levels, (num_envs,), and the first count."""
+) -> TrainingState:
+    """Allocate the state, zero but for terrain columns and levels, (num_envs,), and the first count."""
     num_envs = len(columns)
     widths = {"command": 3, "observation": observation_size, "statistics": len(STATISTICS)}
     widths |= {"action": num_joints, "last_action": num_joints}
     shapes = {name: (num_envs, width) for name, width in widths.items()}
-    training = make_zeros(Training, device, ended=num_envs, heading=num_envs, **shapes)
+    training = make_zeros(TrainingState, device, ended=num_envs, heading=num_envs, **shapes)
     training.counter = wp.array([first_count], dtype=int, device=device)
     training.column = wp.array(columns, dtype=int, device=device)
     training.level = wp.array(levels, dtype=int, device=device)
@@ -92,14 +92,7 @@ def make_training(
 
 @wp.kernel
 def _record_steps_kernel(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    base_com: wp.vec3,
-    overflow: wp.array[int],
-    rules: Rules,
-    episodes: Episodes,
-    rewards: Rewards,
-    training_out: Training,
+    step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rewards, training_out: TrainingState
 ):
     """Grid (num_envs,)."""
     env = wp.tid()
@@ -111,11 +104,11 @@ def _record_steps_kernel(
         training_out.statistics[env, wp.static(_COLUMN["goal"] - int(Outcome.GOAL)) + outcome] += 1.0
         training_out.statistics[env, wp.static(_COLUMN["episode_steps"])] += float(episodes.steps[env])
         training_out.statistics[env, wp.static(_COLUMN["episode_reward"])] += rewards.total[env]
-    if (overflow[env] & rules.overflow_mask) != 0:
+    if (step.overflow[env] & rules.overflow_mask) != 0:
         training_out.statistics[env, wp.static(_COLUMN["overflow"])] += 1.0
     if outcome != Outcome.INVALID:
-        lin_vel = base_lin_vel_b(joint_q, joint_qd, base_com, env)
-        ang_vel = base_ang_vel_b(joint_q, joint_qd, env)
+        lin_vel = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
+        ang_vel = base_ang_vel_b(step.joint_q, step.joint_qd, env)
         error = wp.vec2(lin_vel[0] - training_out.command[env, 0], lin_vel[1] - training_out.command[env, 1])
         training_out.statistics[env, wp.static(_COLUMN["lin_vel_error"])] += wp.length(error)
         error_yaw = wp.abs(ang_vel[2] - training_out.command[env, 2])
@@ -123,15 +116,12 @@ def _record_steps_kernel(
 
 
 def record_steps(
-    joint_q: Any, joint_qd: Any, base_com: wp.vec3, overflow: Any, rules: Rules, episodes: Episodes, rewards: Rewards,
-    training_out: Training,
-) -> None:  # fmt: skip
-    """Note how a judged and rewarded step ended, and add it to the statistics.
-
-    ``overflow`` (num_envs,) are the solver's bits of its last physics step.
-    """
-    inputs = [joint_q, joint_qd, base_com, overflow, rules, episodes, rewards]
-    wp.launch(_record_steps_kernel, joint_q.shape[0], inputs, outputs=[training_out], device=joint_q.device)
+    step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rewards, training_out: TrainingState
+) -> None:
+    """Keep the outcome of a judged and rewarded step, and add it to the statistics."""
+    inputs = [step, rules, episodes, rewards]
+    num_envs = step.overflow.shape[0]
+    wp.launch(_record_steps_kernel, num_envs, inputs, outputs=[training_out], device=step.overflow.device)
 
 
 @wp.func
@@ -153,7 +143,7 @@ def next_level(level: int, walked: float, commanded_speed: float, drawn: int, ru
 @wp.kernel
 def _promote_episodes_kernel(
     joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, terrain_of_env_out: wp.array[int],
-    training_out: Training,
+    training_out: TrainingState,
 ):  # fmt: skip
     """Grid (num_envs,)."""
     env = wp.tid()
@@ -172,30 +162,30 @@ def _promote_episodes_kernel(
 
 
 def promote_episodes(
-    joint_q: Any, episodes: Episodes, rules: Rules, terrain_of_env_out: Any, training_out: Training
+    joint_q: Any, episodes: Episodes, rules: Rules, terrain_of_env_out: Any, training_out: TrainingState
 ) -> None:
-    """Move the ended episodes up or down the terrain levels by how far they came; an invalid one stays."""
+    """Move ended episodes up or down the terrain levels by the distance walked; invalid ones stay."""
     inputs = [joint_q, episodes, rules]
     outputs = [terrain_of_env_out, training_out]
     wp.launch(_promote_episodes_kernel, joint_q.shape[0], inputs, outputs=outputs, device=joint_q.device)
 
 
 @wp.kernel
-def _seed_restarts_kernel(training: Training, episodes_out: Episodes):
+def _seed_restarts_kernel(training: TrainingState, episodes_out: Episodes):
     """Grid (num_envs,)."""
     env = wp.tid()
     num_envs = episodes_out.rng.shape[0]
     episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
 
 
-def seed_restarts(training: Training, episodes_out: Episodes) -> None:
+def seed_restarts(training: TrainingState, episodes_out: Episodes) -> None:
     """Let the starts of this control step be drawn from its counter; writes ``rng``."""
     rng = episodes_out.rng
     wp.launch(_seed_restarts_kernel, rng.shape[0], inputs=[training], outputs=[episodes_out], device=rng.device)
 
 
 @wp.func
-def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: Training):
+def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: TrainingState):
     vx = wp.randf(rng, rules.lin_vel_x[0], rules.lin_vel_x[1])
     vy = wp.randf(rng, rules.lin_vel_y[0], rules.lin_vel_y[1])
     training_out.heading[env] = wp.randf(rng, -wp.pi, wp.pi)
@@ -207,7 +197,7 @@ def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: Training
 @wp.kernel
 def _command_episodes_kernel(
     joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, task: Task, joint_qd_out: wp.array2d[float],
-    training_out: Training,
+    training_out: TrainingState,
 ):  # fmt: skip
     """Grid (num_envs,)."""
     env = wp.tid()
@@ -231,9 +221,9 @@ def _command_episodes_kernel(
 
 
 def command_episodes(
-    joint_q: Any, episodes: Episodes, rules: Rules, task: Task, joint_qd_out: Any, training_out: Training
+    joint_q: Any, episodes: Episodes, rules: Rules, task: Task, joint_qd_out: Any, training_out: TrainingState
 ) -> None:
-    """Tell every robot what to do next, and push where that is due.
+    """Write the next command of every robot, and push where a push is due.
 
     Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
     and headings become yaw rates. A push overwrites vx and vy of ``joint_qd_out``.

@@ -13,7 +13,7 @@ import warp as wp
 
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
 from kernels.observation import Noise, apply_action, write_observation
-from kernels.penalties import PENALTIES, PenaltyStep, add_penalties, penalty_columns
+from kernels.penalties import PENALTIES, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
@@ -201,7 +201,7 @@ class Rollout:
         self._last_action = wp.zeros_like(self._action)
         self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
         self._counter = wp.zeros(1, dtype=int)
-        self._penalty_step = sim.fill(PenaltyStep, command=self.command, force_limit=robot.contact_force_limit)
+        self._robot_step = sim.make_step(self.command, self._last_action)
         self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
         self._queue = make_queue(
             num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
@@ -234,11 +234,8 @@ class Rollout:
             sim.physics_step()
             sim.read_geom_forces()
             for task, episode in self._latches:
-                latch_outcomes(
-                    sim.joint_q, sim.joint_qd, self._last_action, sim.geom_force, sim.geom_role, sim.overflow,
-                    task, episode,
-                )  # fmt: skip
-            add_penalties(self._penalty_step, robot.physics_dt, self._episode.counted, self.penalty_sums)
+                latch_outcomes(self._robot_step, task, episode)
+            add_penalties(self._robot_step, robot.physics_dt, self._episode.counted, self.penalty_sums)
         if self._reward is not None:
             self._reward.pay(self._stepped.outcome)
 

@@ -18,7 +18,7 @@ from kernels.ground import Ground
 from kernels.observation import Sensors
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.restart import clear_rows
-from kernels.state import make_zeros
+from kernels.state import RobotStep, make_zeros
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
 from sim.robots.compiled import robot_spec
@@ -256,6 +256,10 @@ class Simulation:
             if name in values or hasattr(self, name):
                 setattr(filled, name, values.get(name, getattr(self, name, None)))
         return filled
+
+    def make_step(self, command: Any, action: Any) -> RobotStep:
+        """A view of the robots at the end of a step that obeys the command (num_envs, 3) by the clipped action."""
+        return self.fill(RobotStep, command=command, action=action, force_limit=self.robot.contact_force_limit)
 
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""

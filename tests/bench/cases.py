@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels.episode import command_goal
 from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation
-from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, PenaltyStep, add_penalties
+from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, add_penalties
 from kernels.super_gaussian import LOWER, NEGLIGIBLE, UPPER, rasterise
 from sim.crossing import CrossingCfg, make_task
 from sim.robots.robot import RobotCfg
@@ -254,7 +254,7 @@ def _penalties_case(scene: Scene) -> Case:
     feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
     base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
     limits = (robot.contact_force_limit, robot.physics_dt)
-    step = sim.fill(PenaltyStep, command=scene.command, force_limit=robot.contact_force_limit)
+    step = sim.make_step(scene.command, scene.last_action)
     # Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom.
     geoms = len(robot.geom_names)
     values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)

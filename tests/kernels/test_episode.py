@@ -14,16 +14,17 @@ from kernels.episode import (
     note_base_forces,
 )
 from kernels.penalties import BASE, FOOT, LIMB
+from kernels.state import RobotStep
 from sim.crossing import CrossingCfg, make_task
 from sim.mujoco_c.model import goal_commands, to_mujoco
 from sim.robots.find import get_robot
-from tests.kernels.states import random_states, upright
+from tests.kernels.states import filled, random_states, upright
 
 ROLES = [LIMB, BASE, FOOT, BASE]
 MAX_STEPS = 4000
 
 
-def task_of(**settings):
+def create_task(**settings):
     return make_task(CrossingCfg(**settings), get_robot("anymal"))
 
 
@@ -37,17 +38,18 @@ def make_state(num_envs, outcome=0, steps=0):
 
 def latch(states, state, *, action=0.0, force=0.0, overflow=0, task=None, **limits):
     """One judged step; ``force`` [N] acts on the second base geom of every environment, ``action`` is of one joint."""
-    num_envs, task = len(states[0]), task or task_of()
+    num_envs = len(states[0])
+    task = task or create_task()
     forces = np.zeros((num_envs, len(ROLES), 3), np.float32)
     forces[:, 0] = forces[:, 2] = 500.0  # limbs and feet may touch as they like
     forces[:, 3, 1] = force
     for name, value in limits.items():
         setattr(task, name, value)
-    actions, bits = np.broadcast_to(np.float32(action), num_envs)[:, None], np.broadcast_to(overflow, num_envs)
-    latch_outcomes(
-        *(wp.array(np.float32(array)) for array in (*states, actions)), wp.array(forces, dtype=wp.vec3),
-        wp.array(ROLES, dtype=int), wp.array(bits, dtype=int), task, state,
+    step = filled(
+        RobotStep, joint_q=states[0], joint_qd=states[1], geom_force=forces, geom_role=ROLES,
+        action=np.broadcast_to(np.float32(action), num_envs)[:, None], overflow=np.broadcast_to(overflow, num_envs),
     )  # fmt: skip
+    latch_outcomes(step, task, state)
     return [Outcome(k) for k in state.outcome.numpy()]
 
 
@@ -119,7 +121,7 @@ def test_penalties_may_count_from_a_later_step():
     # From 0.02 s on: the first four steps of 0.005 s do not count, the fifth does.
     state, counted = make_state(1), []
     for _ in range(6):
-        latch(upright(1, 3), state, task=task_of(penalties_from_s=0.02))
+        latch(upright(1, 3), state, task=create_task(penalties_from_s=0.02))
         counted.append(int(state.counted.numpy()[0]))
     assert counted == [0, 0, 0, 0, 1, 1]
 
@@ -149,12 +151,13 @@ def test_without_a_goal_and_borders_neither_ends_an_episode():
 
 
 def test_a_touch_noted_between_ends_the_episode_and_is_then_forgotten():
-    state, roles = make_state(2), wp.array(ROLES, dtype=int)
-    still, touched = np.zeros((2, 4, 3), np.float32), np.zeros((2, 4, 3), np.float32)
+    state = make_state(2)
+    still = np.zeros((2, 4, 3), np.float32)
+    touched = still.copy()
     touched[1, 1, 2] = 40.0  # on the base
     touched[0, 2, 2] = 500.0  # on a foot
     for force in (touched, still):
-        note_base_forces(wp.array(force, dtype=wp.vec3), roles, state)
+        note_base_forces(filled(RobotStep, geom_force=force, geom_role=ROLES), state)
     assert state.base_force.numpy().tolist() == [0.0, 40.0]
     assert latch(upright(2, 3), state) == [Outcome.RUNNING, Outcome.BASE_COLLISION]
     assert state.base_force.numpy().tolist() == [0.0, 0.0]
@@ -162,7 +165,7 @@ def test_a_touch_noted_between_ends_the_episode_and_is_then_forgotten():
 
 def commands(q, outcome=0):
     out = wp.zeros((len(q), 3), dtype=float)
-    command_goal(wp.array(q), wp.array(np.broadcast_to(outcome, len(q)), dtype=int), task_of(), out)
+    command_goal(wp.array(q), wp.array(np.broadcast_to(outcome, len(q)), dtype=int), create_task(), out)
     return out.numpy()
 
 

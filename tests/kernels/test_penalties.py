@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, PenaltyStep, add_penalties, penalty_columns
+from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, add_penalties, penalty_columns
+from kernels.state import RobotStep
 from sim.mujoco_c.model import step_penalties, to_mujoco
 from tests.kernels.states import filled, random_states, upright
 
@@ -18,7 +19,7 @@ def sums_after(states, command, forces, *, counted=None, sums=None):
     """Penalty sums after adding a physics step."""
     num_envs = len(command)
     step = filled(
-        PenaltyStep, joint_q=states[0], joint_qd=states[1], base_com=BASE_COM, command=np.float32(command),
+        RobotStep, joint_q=states[0], joint_qd=states[1], base_com=BASE_COM, command=np.float32(command),
         geom_force=np.float32(forces), geom_role=ROLES, force_limit=LIMIT,
     )  # fmt: skip
     out = wp.array(np.zeros((num_envs, len(PENALTIES)), np.float32) if sums is None else sums)

@@ -6,6 +6,7 @@ import warp as wp
 
 from kernels.episode import Outcome, Task, make_episodes
 from kernels.rewards import make_rewards
+from kernels.state import RobotStep
 from kernels.training import (
     STATISTICS,
     Rules,
@@ -151,10 +152,11 @@ def test_statistics_add_up():
     episodes.steps.assign(np.array([5, 1000, 20, 30], np.int32))
     rewards.total.assign(np.float32([11, 22, 33, 44]))
     training.command.assign(np.float32([[0.3, 0.4, 0.2]] * 4))
-    joint_q = wp.array(np.float32([UPRIGHT] * 3 + [(*UPRIGHT[:7], np.nan)]), dtype=float)
-    joint_qd = wp.zeros((4, 7), dtype=float)
-    overflow = wp.array([1, 512 | 1024, 0, 2 | 512], dtype=int)
-    record_steps(joint_q, joint_qd, wp.vec3(0.0), overflow, make_rules(), episodes, rewards, training)
+    step = filled(
+        RobotStep, joint_q=[UPRIGHT] * 3 + [(*UPRIGHT[:7], np.nan)], joint_qd=np.zeros((4, 7)), base_com=(0, 0, 0),
+        overflow=[1, 512 | 1024, 0, 2 | 512],
+    )  # fmt: skip
+    record_steps(step, make_rules(), episodes, rewards, training)
     assert training.ended.numpy().tolist() == outcome
     sums = dict(zip(STATISTICS, training.statistics.numpy().sum(0), strict=True))
     expected = {

@@ -1,4 +1,4 @@
-"""A penalty that only :mod:`tests.toys.penalty` knows: searched with, drawn and reported by its label."""
+"""A toy penalty: robots are searched with it, and figures and replays have its label."""
 
 from contextlib import contextmanager
 

@@ -1,7 +1,7 @@
-"""A penalty in one file: :mod:`tests.conftest` imports it before any robot is simulated, so that all tests share it."""
+"""A penalty in one file, registered before any robot is simulated, so that all tests share one compilation."""
 
-from kernels.penalties import PenaltyStep, penalty
-from kernels.state import base_ang_vel_b
+from kernels.penalties import penalty
+from kernels.state import RobotStep, base_ang_vel_b
 
 
 @penalty(
@@ -12,7 +12,7 @@ from kernels.state import base_ang_vel_b
     color="#009e73",
     default=False,
 )
-def _roll_rate(step: PenaltyStep, env: int) -> float:
+def _roll_rate(step: RobotStep, env: int) -> float:
     """Squared roll rate [(rad/s)^2], base frame."""
     rate = base_ang_vel_b(step.joint_q, step.joint_qd, env)[0]
     return rate * rate

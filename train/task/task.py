@@ -86,6 +86,7 @@ class CommandTask:
             device=device,
         )
         self._reward = Reward(self.sim, cfg, command=training.command, action=training.last_action, falls=_FALLS)
+        self._robot_step = self.sim.make_step(training.command, training.last_action)
         rewards = self._reward.state
         self._action = torch.from_dlpack(training.action)
         self.observation = torch.from_dlpack(training.observation)
@@ -182,17 +183,11 @@ class CommandTask:
             # A crossing ends at the first touch of the base, however short; other outcomes are checked once a step.
             if self.cfg.crosses and step < self.robot.decimation:
                 sim.read_geom_forces()
-                note_base_forces(sim.geom_force, sim.geom_role, episodes)
+                note_base_forces(self._robot_step, episodes)
         sim.read_geom_forces()
-        latch_outcomes(
-            sim.joint_q, sim.joint_qd, training.last_action, sim.geom_force, sim.geom_role, sim.overflow,
-            self._task, episodes,
-        )  # fmt: skip
+        latch_outcomes(self._robot_step, self._task, episodes)
         self._reward.pay(episodes.outcome)
-        record_steps(
-            sim.joint_q, sim.joint_qd, sim.sensors.base_com, sim.overflow, self._rules, episodes, self._reward.state,
-            training,
-        )  # fmt: skip
+        record_steps(self._robot_step, self._rules, episodes, self._reward.state, training)
         promote_episodes(sim.joint_q, episodes, self._rules, sim.terrain_of_env, training)
         self._begin_episodes()
 
