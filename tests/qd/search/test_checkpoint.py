@@ -21,7 +21,7 @@ def wrap(payload: bytes) -> bytes:
 def test_what_is_no_part_of_a_search_is_never_looked_up(tmp_path, name):
     names = b"".join(b"\x8c" + bytes([len(part)]) + part.encode() for part in name.split())
     (tmp_path / "checkpoint.bin").write_bytes(wrap(b"\x80\x04" + names + b"\x93."))
-    with pytest.raises(ValueError, match="is no part of a search"):
+    with pytest.raises(ValueError, match=name.replace(" ", ".")):
         load_checkpoint(tmp_path / "checkpoint.bin")
 
 

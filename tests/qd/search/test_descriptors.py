@@ -71,7 +71,7 @@ def test_collision_bit_selects_the_upper_half():
     without, with_collision = cells.find_cells(ratios, [False, True])
     assert with_collision == without + 1750 and cells.num_cells == 3500
     assert not cells.are_neighbours([without], [with_collision])[0]
-    with pytest.raises(ValueError, match="collided must be given"):
+    with pytest.raises(ValueError, match="collided"):
         cells.find_cells(ratios)
 
 
@@ -96,5 +96,5 @@ def test_neighbours():
 
 @pytest.mark.parametrize("ratios", [[[0.5, 0.6]], [[-0.1, 1.1]], [[np.nan, 1.0]], [[0.5, 0.25, 0.25]], [0.5, 0.5]])
 def test_ratios_that_are_none_are_refused(ratios):
-    with pytest.raises(ValueError, match="ratios must"):
+    with pytest.raises(ValueError, match="ratios"):
         Cells(2).find_cells(ratios)

@@ -23,7 +23,7 @@ ORIGIN = {"command": "faultline archive", "commit": "c", "device": "CPU", "seed"
 def test_a_claim_keeps_others_out_and_leaves_no_empty_directory(tmp_path):
     (tmp_path / "mine").mkdir()
     for path in (tmp_path / "a" / "b", tmp_path / "mine"):
-        with claimed(path), pytest.raises(ValueError, match="another command works in"), claimed(path):
+        with claimed(path), pytest.raises(ValueError, match=path.name), claimed(path):
             pass
         with claimed(path):
             assert path.is_dir()
@@ -65,7 +65,7 @@ def test_what_is_no_run_or_has_not_begun_has_no_state(tmp_path):
     (tmp_path / ".config.json.tmp").write_text("{")  # what a killed beginning leaves
     assert run.load(CFG) is None
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="holds no run"):
+    with pytest.raises(ValueError, match="--run-dir"):
         run.load(CFG)
 
 
@@ -100,7 +100,7 @@ def test_the_run_is_the_one_named_the_newest_of_the_robot_or_the_published_one(r
     assert output_folder(course, "anymal") == Path("runs/anymal-published-course")
     with pytest.raises(FileNotFoundError):
         find_run(robot, published="never")
-    with pytest.raises(ValueError, match="is published and stays as it is: copy"):
+    with pytest.raises(ValueError, match=published.name):
         find_run(robot, published, published="never")
     assert find_run(robot, published) == published
     for number in (1, 3, 2):

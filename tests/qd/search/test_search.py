@@ -112,9 +112,9 @@ def test_a_finished_search_crosses_nothing_writes_what_is_lost_and_keeps_what_wa
     saved = (path / "checkpoint.bin").read_bytes()
     (path / "checkpoint.bin").unlink()  # the largest file by far, which only more iterations need
     assert run(path, opener=never).fresh is not None
-    with pytest.raises(ValueError, match=r"checkpoint\.bin is lost"):
+    with pytest.raises(ValueError, match=r"checkpoint\.bin"):
         run(path, iterations=3)
-    with pytest.raises(ValueError, match="other settings: seed"):
+    with pytest.raises(ValueError, match="seed"):
         run(path, seed=4)
     (path / "checkpoint.bin").write_bytes(saved)
     assert run(path, iterations=3).fresh is None  # there are other elites now
@@ -142,20 +142,20 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
             run(path, **changes)
         assert {name: (path / name).read_bytes() for name in os.listdir(path)} == before
 
-    refused("iterations must be at least 3", iterations=2)
+    refused("iterations", iterations=2)
     fitness = FitnessCfg(penalties=("yaw_rate", "wobble"), scales=(1.0, 1.0))
-    refused("fitness.penalties must be some of anymal's.*wobble", fitness=fitness)
+    refused("wobble", fitness=fitness)
     state = load_checkpoint(path / "checkpoint.bin")
     for name in state:
         save_checkpoint(path / "checkpoint.bin", {key: value for key, value in state.items() if key != name})
         before["checkpoint.bin"] = (path / "checkpoint.bin").read_bytes()
-        refused("must have settings, metrics and a scheduler", iterations=5)
+        refused(name, iterations=5)
     before["checkpoint.bin"] = (tmp_path / "other/checkpoint.bin").read_bytes()
     (path / "checkpoint.bin").write_bytes(before["checkpoint.bin"])  # one that strayed here
     refused(r"checkpoint\.bin.*seed", iterations=5)
     del before["checkpoint.bin"]
     (path / "checkpoint.bin").unlink()
-    refused(r"checkpoint\.bin is lost", iterations=5)
+    refused(r"checkpoint\.bin", iterations=5)
 
 
 def invalid_from(iteration, share):
