@@ -26,7 +26,7 @@ def print_summary(
     """
     if not len(archive):
         return
-    half_width = resolve_robot(archive.named(), robot, run).footprint[1]
+    half_width = resolve_robot(archive.named(), robot, run).half_width
     archive_space = get_space(archive.space, archive.space_sha256)
     ranking = rank(archive, archive_space, read_minimal(run, archive), judged=True, half_width=half_width)
     if not len(ranking):
