@@ -49,12 +49,7 @@ _COUNTS = (
 
 
 def harden(
-    robot: RobotCfg,
-    cfg: HardenCfg,
-    run_dir: Path,
-    compute: Compute,
-    *,
-    certifiers: Mapping[str, str] | None = None,
+    robot: RobotCfg, cfg: HardenCfg, run_dir: Path, compute: Compute, *, certifiers: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Searches for what breaks a controller, trains it on all that was found, and searches again, for some rounds.
 

@@ -19,12 +19,7 @@ SETS = {
     INDEPENDENT: "generated, another search",
 }
 """Label of each set of the tables."""
-MEASURES = {
-    "goal": "goal reached",
-    "success": "no base collision",
-    "fallen": "fallen",
-    "reward": "training reward",
-}
+MEASURES = {"goal": "goal reached", "success": "no base collision", "fallen": "fallen", "reward": "training reward"}
 """Label of each measure beside the penalties: three rates as fractions, and the sum of the reward over 20 s. No base
 collision is what the paper calls success."""
 CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}

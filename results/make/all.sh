@@ -46,8 +46,7 @@ for robot in "${robots[@]}"; do
   "$python" -m results.make.speed --robot "$robot" --device cpu       # 4 min, and to be quoted where two cores are free
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
-  "$python" -m results.make.public "$PUBLIC"                            # 40 min
-  "$python" -m results.make.public "$PUBLIC" --speed                    # 2 min
+  "$python" -m results.make.public "$PUBLIC"                            # 42 min
   "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min

@@ -112,7 +112,7 @@ def rate_table(rows: Mapping[str, tuple[str, str, str]], *, short: bool = False)
     """A table of rates of every controller; rows are robot, measure and set."""
 
     def cell(controller: str) -> Callable[[Any], str]:
-        return lambda row: rate(*row, controller, short=short)
+        return lambda row: rate(row[0], row[1], row[2], controller, short=short)
 
     return table(rows, {controller: cell(controller) for controller in CONTROLLERS})
 

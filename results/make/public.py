@@ -92,15 +92,8 @@ def ready(name: str, folder: Path, runs: Path, compute: Compute) -> tuple[RobotC
     return robot, fitting_space(robot) or SUPER_GAUSSIAN.name
 
 
-def time_alone(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
-    """Episodes a second of many robots, by 4 episodes a robot, and where and when that was measured."""
-    robot, space = ready(name, folder, runs, compute)
-    row = time_crossings(robot, 4 if small else 32768, compute.device, seed, space=space, each=4)
-    return {"episodes_per_s_32768": row["episodes_per_s"], "timed": provenance(compute.device, seed)}
-
-
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
-    """Imports a controller, lets it cross what is no search's, and searches what breaks it."""
+    """Imports a controller, evaluates it, searches what breaks it, and times many robots."""
     run = runs / f"{name}-archive"
     robot, named = ready(name, folder, runs, compute)
     policy = str(robot.policy_file)
@@ -122,6 +115,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         train_specialist(robot, run, FinetuneCfg.specialist(robot), RunCfg(device=compute.device))
         archive = judge(run, stages=("others",), compute=compute, robot=robot.spec)
     summary = RunDirectory(run).read_summary()
+    speed = time_crossings(robot, 4 if small else 32768, compute.device, seed, space=named, each=4)
     return {
         "contract": {key: value for key, value in read_toml(Path(policy)).items() if key != "policy"},
         "space": named,
@@ -131,6 +125,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "agreement": agreed,
         "archive": {count: summary.get(count) for count in (*COUNTS, "wall_s")},
         "causes": causes_of(archive),
+        "episodes_per_s_32768": speed["episodes_per_s"],
         "dose": dose["dose"],
         "half": dose["half"],
     }
@@ -160,27 +155,26 @@ def agree(crosser: Crosser, space: str, seed: int, terrains: int) -> dict[str, A
     return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 
-def rows_so_far(out: Path, origin: dict[str, Any]) -> dict[str, Any]:
-    """Controllers in the file, if today's sources measured them on this device, or in a trial; else none."""
+def read_rows(out: Path, origin: dict[str, Any]) -> dict[str, Any]:
+    """Controllers in the file that today's sources measured on this device."""
     return read_alike(out, origin, "sources_sha256", "device", "seed", "small").get("controllers", {})
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Measures all of them, or those named, and writes what came of it as each is done; what is done stays done."""
+    """Measures all controllers, or those of ``--only``, and writes the file after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the publishers' files")
     parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pictures", action="store_true", help="stills of searches that are there, and nothing else")
-    parser.add_argument("--speed", action="store_true", help="episodes a second of those in the file, and nothing else")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
     compute = Compute(resolve_device(args.device))
     out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
     runs = out.parent / "public" if args.small else runs_of_today() / "public"
-    if args.small and not (args.pictures or args.speed):
+    if args.small and not args.pictures:
         shutil.rmtree(runs, ignore_errors=True)
     if args.pictures:
         for name in set(args.only) & set(PICTURES):
@@ -190,14 +184,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     prepare_output(out)
     origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()
     for name in args.only:
-        done = rows_so_far(out, origin).get(name)
-        if args.speed and done is None:
-            raise ValueError(f"{out} must hold {name} by today's sources and device: run this without --speed first")
-        if done is None or (args.speed and "timed" not in done):
-            make = time_alone if args.speed else measure
-            numbers = make(name, args.folder, runs, compute, seed=args.seed, small=args.small)
-            rows = rows_so_far(out, origin)  # another process may have written meanwhile
-            rows[name] = rows.get(name, {}) | numbers
+        if name not in read_rows(out, origin):
+            numbers = measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
+            rows = read_rows(out, origin) | {name: numbers}  # another process may have written meanwhile
             content = origin | {"controllers": {name: rows[name] for name in CONTROLLERS if name in rows}}
             print(json.dumps({name: numbers}, indent=1), flush=True)
             write_atomically(out, to_json(content))
