@@ -172,29 +172,25 @@ def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
         for k, rows in enumerate(steps):
             if k == 0 or k % (robot + 3) == 0:
                 alone.reset(torch.ones(1, dtype=torch.bool))
-            own = alone(rows[robot : robot + 1])[0].numpy()
+            action = alone(rows[robot : robot + 1])[0].numpy()
             if device == "cpu":
-                np.testing.assert_array_equal(together[k][robot], own)
+                np.testing.assert_array_equal(together[k][robot], action)
             else:
-                np.testing.assert_allclose(together[k][robot], own, rtol=2e-3, atol=5e-3)  # TF32
+                np.testing.assert_allclose(together[k][robot], action, rtol=2e-3, atol=5e-3)  # TF32
 
 
-def test_an_activation_is_of_a_checkpoint(tmp_path, anymal, describe):
-    torch.jit.script(torch.nn.Linear(3, ACTIONS)).save(str(tmp_path / "weights.pt"))
-    with pytest.raises(ValueError, match=r"controller\.toml: activation .*weights\.pt says its own"):
-        load_policy(describe('{term = "gravity"}', 'activation = "elu"'), anymal, "cpu")
-
-
-def test_a_script_of_other_columns_is_told_both_numbers(tmp_path, anymal, describe):
-    layers = torch.nn.Sequential(torch.nn.Linear(6, 16), torch.nn.ELU(), torch.nn.Linear(16, ACTIONS))
-    torch.jit.script(layers).save(str(tmp_path / "weights.pt"))
-    with pytest.raises(ValueError, match=r"weights\.pt' .*6 columns.*controller\.toml \(gravity 3\) .* 3"):
-        load_policy(describe('{term = "gravity"}'), anymal, "cpu")
-
-
-def test_weights_that_are_not_there_are_named(anymal, describe):
-    with pytest.raises(ValueError, match=r"controller\.toml: policy .*gone\.pt"):
-        load_policy(describe('{term = "gravity"}', policy="gone.pt"), anymal, "cpu")
+@pytest.mark.parametrize(
+    ("width", "line", "weights", "named"),
+    [
+        (3, 'activation = "elu"', "weights.pt", r"controller\.toml: activation .*weights\.pt"),
+        (6, "", "weights.pt", r"weights\.pt' .*6 columns.*controller\.toml \(gravity 3\) .* 3"),
+        (3, "", "gone.pt", r"controller\.toml: policy .*gone\.pt"),
+    ],
+)
+def test_weights_that_do_not_fit_a_description_are_named(tmp_path, anymal, describe, width, line, weights, named):
+    torch.jit.script(torch.nn.Linear(width, ACTIONS)).save(str(tmp_path / "weights.pt"))
+    with pytest.raises(ValueError, match=named):
+        load_policy(describe('{term = "gravity"}', line, policy=weights), anymal, "cpu")
 
 
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -16,30 +17,16 @@ from sim.files.command import Interrupted, UserError, choose_elites, command_lin
 from sim.files.settings import NonNegativeInt
 
 NothingError = type("NothingError", (UserError,), {"status": 1})
-ERRORS = {
-    "value": (ValueError("two\nlines"), 2, "error: two lines\n"),
-    "own status": (NothingError("nothing is valid"), 1, "error: nothing is valid\n"),
-    "file": (OSError("a/b cannot be written"), 2, "error: a/b cannot be written\n"),
-    "number": (FloatingPointError("not finite"), 2, "error: not finite\n"),
-    "stop": (KeyboardInterrupt(), 130, "\nStopped.\n"),
-    "resumable": (Interrupted("Stopped; 3 saved"), 130, "\nStopped; 3 saved\n"),
-    "kernels": (
-        Exception("Failed to load CPU module 'x'"),
-        2,
-        "error: Failed to load CPU module 'x': the compiled kernels in "
-        "/cache/warp are damaged: remove that folder, they are compiled again\n",
-    ),
-    "cache": (
-        OSError(13, "Permission denied", "/cache/warp/x"),
-        2,
-        "error: [Errno 13] Permission denied: '/cache/warp/x': kernels "
-        "are compiled into /cache/warp: let WARP_CACHE_PATH name a folder that can be written\n",
-    ),
-    "file at home": (
-        OSError(2, "No such file", str(Path.home() / "hill.png")),
-        2,
-        f"error: [Errno 2] No such file: '{Path.home() / 'hill.png'}'\n",
-    ),
+IMAGE = str(Path.home() / "hill.png")
+ERRORS = {  # what is raised, the exit status, and the line on stderr, or what it must have
+    "value": (ValueError("two\nlines"), 2, "^error: two lines\n$"),
+    "own status": (NothingError("nothing is valid"), 1, "^error: nothing is valid\n$"),
+    "number": (FloatingPointError("not finite"), 2, "^error: not finite\n$"),
+    "stop": (KeyboardInterrupt(), 130, "^\nStopped.\n$"),
+    "resumable": (Interrupted("Stopped; 3 saved"), 130, "^\nStopped; 3 saved\n$"),
+    "kernels": (Exception("Failed to load CPU module 'x'"), 2, "/cache/warp .*remove"),
+    "cache": (OSError(13, "Permission denied", "/cache/warp/x"), 2, "/cache/warp: .*WARP_CACHE_PATH"),
+    "file at home": (OSError(2, "No such file", IMAGE), 2, f"No such file: '{IMAGE}'\n$"),
     "bug": (ZeroDivisionError(), 0, ""),
 }
 
@@ -76,7 +63,7 @@ def test_errors_become_one_line_and_an_exit_status(capsys, how, monkeypatch):
     monkeypatch.setenv("WARP_CACHE_PATH", "/cache/warp")
     _, status, message = ERRORS[how]
     assert run("--how", how) == status
-    assert capsys.readouterr().err == message
+    assert re.search(message, capsys.readouterr().err)
 
 
 def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsys):
