@@ -116,9 +116,9 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; {_EXPECTED}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; {_EXPECTED}")
-    called, arguments = "robot, device", (robot, device)
+    arguments: tuple[Any, ...] = (robot, device)
     if spec.file is not None:
-        called, arguments = "controller, robot", (_load_file(Path(spec.file), robot, device, fits=False), robot)
+        arguments = (_load_file(Path(spec.file), robot, device, fits=False), robot)
     elif not getattr(target, "faultline_factory", False):
         if inspect.isclass(target):
             raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; {_EXPECTED}")
@@ -126,7 +126,8 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
         policy = target(*arguments)
     except Exception as error:
-        raise ValueError(f"policy '{spec}' failed, called with ({called}): {in_one_line(error)}") from error
+        kinds = "robot, device" if spec.file is None else "controller, robot"
+        raise ValueError(f"policy '{spec}' failed, called with ({kinds}): {in_one_line(error)}") from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy

@@ -49,7 +49,7 @@ def load_network(
 def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
     """A TorchScript module from a file that is no checkpoint, for this reason."""
     try:
-        module, probe = (torch.jit.load(str(path), map_location=place).eval() for place in (device, "cpu"))
+        module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
     except Exception as error:
         raise ValueError(
             f"policy '{path}' is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module (truncated, "

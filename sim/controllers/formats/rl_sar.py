@@ -38,7 +38,7 @@ def read(path: Path, source: Source) -> Path:
     """Settings of both files, refused by name if they are not understood."""
     source.file = file = _find_config(path)
     bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
-    base = next((place for place in bases if place.is_file()), None)
+    base = next((candidate for candidate in bases if candidate.is_file()), None)
     if base is None:
         raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
     content = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
