@@ -1,4 +1,4 @@
-"""Settings of the crossing task and of its physics, and what the kernels take of them."""
+"""Settings of the crossing task and of its physics, and the kernel arguments made of them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -54,11 +54,11 @@ def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Tas
     for name in ("goal", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
         setattr(task, name, getattr(cfg, name))
     task.speed = robot.speed
-    task.goal_radius = cfg.goal_radius if to_goal else 0.0  # nobody is nearer than that
+    task.goal_radius = cfg.goal_radius if to_goal else 0.0  # no distance is smaller
     task.max_steps = round(robot.max_duration_s / robot.physics_dt)
     task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
     task.max_speed = robot.max_speed
-    task.max_gravity_z = 2.0  # above that of any robot: tilt ends no crossing
+    task.max_gravity_z = 2.0  # no tilt ends a crossing
     task.overflow_mask = CAPACITY_OVERFLOWS
     return task
 

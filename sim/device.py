@@ -1,4 +1,4 @@
-"""Which device works: what a user asks for, what small work for the host takes, and how its work is recorded."""
+"""Choice of the device, and recording of graphs on it."""
 
 import gc
 import sys
@@ -10,7 +10,7 @@ import warp as wp
 
 
 def resolve_device(name: str | None) -> str:
-    """Warp device name for what a user asked for: ``None`` is CUDA where there is one, else the CPU."""
+    """Warp's name of the user's device; ``None`` is CUDA where there is one, else the CPU."""
     if name is None:
         return "cuda:0" if wp.is_cuda_available() else _cpu_instead()
     if name.startswith("cuda") and not wp.is_cuda_available():
@@ -24,7 +24,7 @@ def resolve_device(name: str | None) -> str:
 
 @cache
 def _cpu_instead() -> str:
-    """The CPU, where no device was asked for; says so, once."""
+    """The CPU; a message says so once."""
     print("No CUDA device was found here: this machine works on its CPU.", file=sys.stderr, flush=True)
     return "cpu"
 
@@ -36,7 +36,7 @@ def host_device() -> str:
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Has Python collect no garbage while a graph is recorded: memory of the GPU that is freed then can spoil it."""
+    """Suspend garbage collection while a graph is recorded: GPU memory that is freed then can spoil it."""
     collects = gc.isenabled()
     gc.disable()
     try:

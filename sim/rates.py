@@ -1,4 +1,4 @@
-"""Rates of terrains: which episodes count, and how the typical one ends."""
+"""Rates of terrains: the episodes that count, and the typical outcome."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,13 @@ def counted_episodes(invalid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def terrain_means(values: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean of values (..., num_episodes) over the episodes that count, shape (...); NaN where there are none."""
-    sums, counts = np.where(counted, values, 0.0).sum(axis=-1), counted.sum(axis=-1)
+    sums = np.where(counted, values, 0.0).sum(axis=-1)
+    counts = counted.sum(axis=-1)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
 def typical_outcome(outcome: NDArray[np.integer]) -> NDArray[np.int64]:
-    """How most valid episodes of (..., num_episodes) end; where under half reach the goal, how most of the others end.
+    """The commonest outcome of valid episodes (..., num_episodes), GOAL only if at least half reach it.
 
     Shape (...); ``INVALID`` where no episode is valid.
     """

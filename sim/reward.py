@@ -1,4 +1,4 @@
-"""The reward of a robot's training: what a simulation's control steps pay, in training and in a crossing alike."""
+"""The reward of a robot's training for the control steps of a simulation, in training and in crossings."""
 
 from collections.abc import Collection
 from dataclasses import asdict
@@ -17,7 +17,7 @@ class Reward:
     """Pays every control step of every robot.
 
     Attributes:
-        motion: What rewards are computed from, a kernel argument on the simulation's device, whose state is not copied.
+        motion: The state that rewards are computed from, a kernel argument; it shares the simulation's arrays.
         state: Rewards so far (:class:`kernels.rewards.Rewards`).
     """
 

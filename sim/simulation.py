@@ -52,6 +52,7 @@ class Simulation:
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
         geom_of_shape: The solver's number of each.
         base_com: Mass centre of the base in its frame [m].
+        dynamics: The solver's step, ours or mujoco_warp's.
         disturbed: What the conditions of running episodes need; None of a bank without conditions.
         motors: Effort limit [N m], stall torque [N m] and speed limit [rad/s] of each actuator, vectors of shape
             (num_actuators,); None without DC motors.
@@ -83,13 +84,13 @@ class Simulation:
         self.bank = bank
         self.device = bank.device
         self.num_envs = len(terrain_of_env)
-        of_file = robot_spec(robot).compile()
-        builder = make_builder(of_file)
+        file_model = robot_spec(robot).compile()
+        builder = make_builder(file_model)
         with wp.ScopedDevice(self.device):
             self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
             self._build_model(builder)
             self._randomise_model(friction, added_base_mass)
-            self._build_solver(cfg or SolverCfg(), of_file)
+            self._build_solver(cfg or SolverCfg(), file_model)
             self._build_contact(builder)
             self._build_views()
             self._build_conditions()
@@ -124,16 +125,16 @@ class Simulation:
             model.body_mass.assign(mass)
             model.body_inv_mass.assign(1.0 / mass)
 
-    def _build_solver(self, cfg: SolverCfg, of_file: Any) -> None:
-        impratio = float(of_file.opt.impratio)
+    def _build_solver(self, cfg: SolverCfg, file_model: Any) -> None:
+        impratio = float(file_model.opt.impratio)
         # Rows for mujoco_warp's own step: a limit and friction of every joint, and contacts.
-        rows = of_file.neq + 2 * of_file.nv + int(of_file.geom_condim.max(initial=3)) * self.robot.nconmax
+        rows = file_model.neq + 2 * file_model.nv + int(file_model.geom_condim.max(initial=3)) * self.robot.nconmax
         # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
             njmax=rows,
-            njmax_nnz=rows * of_file.nv,  # Newton counts no contacts, and rows that do not fit have no effect
+            njmax_nnz=rows * file_model.nv,  # Newton counts no contacts, and rows that do not fit have no effect
             nconmax=self.robot.nconmax,
             iterations=cfg.iterations * (1 if impratio == 1.0 else 2),  # at 100, 8 are as good as any number
             ls_iterations=cfg.ls_iterations,
@@ -170,7 +171,7 @@ class Simulation:
         roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
         self.geom_role = wp.array(roles, dtype=int)
         model, data = self.solver.mjw_model, self.solver.mjw_data
-        self._dynamics = make_dynamics(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
+        self.dynamics = make_dynamics(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
 
     def _build_views(self) -> None:
         model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
@@ -192,21 +193,23 @@ class Simulation:
         self._build_drives()
 
     def _build_drives(self) -> None:
-        """What ideal drives lack: torque limits that depend on the speed, and a delay of targets."""
-        robot, self.motors, delay = self.robot, None, Delay()
+        """Speed-dependent torque limits and a delay of targets, which ideal drives lack."""
+        robot = self.robot
+        delay = Delay()
+        self.motors = None
         if robot.saturation_effort is not None:
             effort = self.solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
             joints = self._coordinates.target_of_actuator.numpy() - 7
             motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
-        most = robot.drive_delay_steps
+        max_steps = robot.drive_delay_steps
         if self.bank.conditions is not None:
-            most += math.ceil(MAX_DELAY_S / robot.physics_dt)
-        if most:
+            max_steps += math.ceil(MAX_DELAY_S / robot.physics_dt)
+        if max_steps:
             actuators = len(self._coordinates.target_of_actuator)
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
             delay.age = wp.zeros((self.num_envs, actuators), dtype=int)
-            delay.former = wp.zeros((self.num_envs, 1 + most, actuators), dtype=float)
+            delay.former = wp.zeros((self.num_envs, 1 + max_steps, actuators), dtype=float)
             delay.at_first = self.sensors.default_joint_pos
         self._delay = delay
 
@@ -214,13 +217,13 @@ class Simulation:
         self.disturbed = None
         if self.bank.conditions is None:
             return
-        if isinstance(self._dynamics, StockDynamics):
+        if isinstance(self.dynamics, StockDynamics):
             raise ValueError(
                 f"robot '{self.robot.name}' cannot have conditions, since its model takes mujoco_warp's own step "
                 "(sim/solver.py says why): leave conditions out"
             )
         assert self.bank.ground is not None
-        self._varied = self._dynamics.vary_bases()
+        self._varied = self.dynamics.vary_bases()
         self._varied.delay_steps, self._varied.friction = self._delay.steps, self.bank.ground.factor
         self._varied.drive_delay, self._varied.physics_dt = self.robot.drive_delay_steps, self.robot.physics_dt
         max_lag, size = math.ceil(MAX_LAG_S / self.robot.control_dt), self.robot.observation_size
@@ -233,7 +236,7 @@ class Simulation:
         self.disturbed = disturbed
 
     def _build_coordinates(self) -> SolverState:
-        """Where mujoco_warp's data has joints, bodies and targets of the first robot, and so of all."""
+        """Columns of joints, bodies and targets in mujoco_warp's data, the same for all robots."""
         solver: Any = self.solver
         data = solver.mjw_data
         columns = solver.mj_q_start.numpy()[1 : 1 + self.robot.num_joints]  # the first is the base's
@@ -303,10 +306,10 @@ class Simulation:
             to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
-            self._dynamics.find()
+            self.dynamics.find()
             poses_from_solver(coordinates, self.body_q)
             self.collide()
-            self._dynamics.step()
+            self.dynamics.step()
             from_solver(coordinates, self.joint_q, self.joint_qd)
 
     def read_geom_forces(self) -> None:
@@ -320,7 +323,7 @@ class Simulation:
         clear_rows(mask, self.parked.reshape((-1, 1)).view(float))  # whose 0 has the same bits
         if self._delay.age is not None:
             clear_rows(mask, self._delay.age.view(float))
-        if isinstance(self._dynamics, StockDynamics):
+        if isinstance(self.dynamics, StockDynamics):
             # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not
             # finite would stay so, whatever state it is reset to.
             clear_rows(mask, data.efc.J.reshape((self.num_envs, -1)))

@@ -153,6 +153,10 @@ class Dynamics:
 
     External forces (``qfrc_applied``, ``xfrc_applied``) are ignored. Numbers of the model may change if they do so in
     all worlds equally, or differed between worlds at the start; its arrays may not be replaced.
+
+    Attributes:
+        surfaces: Contact parameters of a robot's shapes on the ground.
+        tree: The model.
     """
 
     def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, parked: Any) -> None:
@@ -163,7 +167,7 @@ class Dynamics:
         self.surfaces = surfaces
         self._tree_sizes = _tree_sizes(m)
         self._sizes = _solver_sizes(m, contacts)
-        self._tree = tree = Tree()
+        self.tree = tree = Tree()
         self._problem = problem = Problem()
         self._robots = robots = Robots()
         self._num_worlds = d.nworld
@@ -192,7 +196,7 @@ class Dynamics:
 
     def vary_bases(self) -> VariedRobots:
         """Give each world its own base and motors, for :func:`kernels.conditions.begin_conditions`."""
-        tree, robots, varied = self._tree, self._robots, VariedRobots()
+        tree, robots, varied = self.tree, self._robots, VariedRobots()
         with wp.ScopedDevice(robots.qpos.device):
             for name, base_name in _BASE_ARRAYS.items():
                 array = getattr(tree, name)
@@ -206,7 +210,7 @@ class Dynamics:
 
     def find(self) -> None:
         """Compute poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
-        find_dynamics(self._tree, self._robots, self._tree_sizes, _JOINT_CODES)
+        find_dynamics(self.tree, self._robots, self._tree_sizes, _JOINT_CODES)
 
     def step(self) -> None:
         """Solve the constraints, contacts among them, and move to the next state."""

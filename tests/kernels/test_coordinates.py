@@ -1,4 +1,4 @@
-"""What mujoco_warp is told and asked, against float64 formulas, with joints, bodies and actuators in another order."""
+"""State and contacts in mujoco_warp's data, against float64 formulas, with joints and bodies in another order."""
 
 import numpy as np
 import pytest
@@ -41,15 +41,15 @@ def solver():
 
 
 @pytest.fixture
-def told(solver):
+def written(solver):
     q, qd = random_states(ENVS, 3)
     targets = q + np.float32(1.0)
     to_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), Delay(), solver)
     return q, qd, targets
 
 
-def test_coordinates_and_velocities_are_those_of_mujoco(solver, told):
-    q, qd, _ = told
+def test_coordinates_and_velocities_are_those_of_mujoco(solver, written):
+    q, qd, _ = written
     expected = to_mujoco(q, qd, np.float64(COM))
     order = np.argsort(COLUMNS)
     np.testing.assert_array_equal(solver.qpos.numpy()[:, :7], np.float32(expected.qpos[:, :7]))
@@ -59,13 +59,13 @@ def test_coordinates_and_velocities_are_those_of_mujoco(solver, told):
     assert np.abs(expected.qvel[:, :3] - qd[:, :3]).max() > 0.05  # else the mass centre would not count
 
 
-def test_actuators_are_told_their_targets_and_others_nothing(solver, told):
-    expected = np.where(np.array(FOLLOWED) < 0, -5.0, told[2][:, np.array(FOLLOWED)])
+def test_actuators_without_a_target_keep_their_control(solver, written):
+    expected = np.where(np.array(FOLLOWED) < 0, -5.0, written[2][:, np.array(FOLLOWED)])
     np.testing.assert_array_equal(solver.ctrl.numpy(), np.float32(expected))
 
 
-def test_what_was_told_is_read_back(solver, told):
-    q, qd, _ = told
+def test_state_is_read_back(solver, written):
+    q, qd, _ = written
     now = wp.zeros(q.shape, dtype=float), wp.zeros(qd.shape, dtype=float)
     from_solver(solver, *now)
     np.testing.assert_array_equal(now[0].numpy(), q)
@@ -95,7 +95,7 @@ def contacts():
 
 
 @pytest.fixture
-def theirs():
+def stock():
     """Room for four contacts in two worlds, the rows of which have the forces 1, 2, ... and 11, 12, ..."""
     return filled(
         SolverContacts, count=[4], worldid=[-1] * 4, geom=[[-1, -1]] * 4, dist=[0] * 4, pos=np.zeros((4, 3)),
@@ -105,14 +105,14 @@ def theirs():
     )  # fmt: skip
 
 
-def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
+def test_contacts_have_the_friction_and_softness_of_their_ground(contacts, stock):
     # Shape 0 has stiffness and damping, on firm ground too; 0.02 s is not exceeded by 0.015 s: softer ground counts.
     surfaces = filled(
         Surfaces, geom=[4, 7], body=[1, 2], condim=[3, 4], friction=[[[0.8, 0.8, 0.1, 0.2, 0.2]] * 2],
         solref=[[[-500, -30], [0.02, 1.5]]], solimp=[[[0.7, 0.9, 0.1, 0.5, 2.0]] * 2],
     )  # fmt: skip
-    contacts_to_solver(contacts, surfaces, theirs)
-    found = {name: getattr(theirs, name).numpy() for name in SolverContacts.vars if name not in ("too_many", "ground")}
+    contacts_to_solver(contacts, surfaces, stock)
+    found = {name: getattr(stock, name).numpy() for name in SolverContacts.vars if name not in ("too_many", "ground")}
     slots = found["slot"][[0, 1, 1], [0, 0, 1]]
     assert found["count"][0] == 3 and sorted(slots) == [0, 1, 2]
     assert found["overflow"].tolist() == [0, TOO_MANY]
@@ -131,14 +131,14 @@ def test_contacts_are_told_with_the_ground_they_are_on(contacts, theirs):
     np.testing.assert_allclose(np.linalg.det(frame), 1.0, rtol=1e-6)
 
 
-def test_forces_of_contacts_are_put_together_from_their_rows(contacts, theirs):
+def test_forces_of_contacts_are_put_together_from_their_rows(contacts, stock):
     # Normal along world y, tangents along z and x. The first robot's has rows 3 to 5; of the other's, one has row 1
     # without friction, and one is not active.
     contacts.force.fill_(wp.vec3(7.0))
-    theirs.slot.assign(np.int32([[2, -1], [0, 1]]))
-    theirs.frame.assign(np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4))
-    theirs.dim.assign(np.int32([1, 3, 4, 0]))
-    theirs.efc_address.assign(np.int32([[1, -1, -1, -1], [-1] * 4, [2, 3, 4, 5], [0] * 4]))
-    forces_from_solver(theirs, contacts)
+    stock.slot.assign(np.int32([[2, -1], [0, 1]]))
+    stock.frame.assign(np.float32([[[0, 1, 0], [0, 0, 1], [1, 0, 0]]] * 4))
+    stock.dim.assign(np.int32([1, 3, 4, 0]))
+    stock.efc_address.assign(np.int32([[1, -1, -1, -1], [-1] * 4, [2, 3, 4, 5], [0] * 4]))
+    forces_from_solver(stock, contacts)
     np.testing.assert_array_equal(contacts.force.numpy()[0], [[5, 3, 4], [7, 7, 7]])
     np.testing.assert_array_equal(contacts.force.numpy()[1], [[0, 12, 0], [0, 0, 0]])

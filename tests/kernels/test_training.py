@@ -90,7 +90,7 @@ def test_starts_are_drawn_from_counter_and_environment_alone():
     assert len({*seeds(4, 7), *seeds(4, 8)}) == 8
 
 
-def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, count=0, place=(0.0, 0.0), task=None, **rules):
+def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, count=0, position=(0.0, 0.0), task=None, **rules):
     """Commands, joint velocities and headings after the launch."""
     task = task or filled(Task, yaw_gain=0.5, max_yaw_rate=1.0)
     episodes, training = make_batch(num_envs, outcome=Outcome.RUNNING, count=count)
@@ -98,7 +98,7 @@ def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, count=0, place=(0.0, 
     if heading is not None:
         training.heading.fill_(heading)
     joint_q = np.zeros((num_envs, 7 + NUM_JOINTS), np.float32)
-    joint_q[:, :2] = place
+    joint_q[:, :2] = position
     joint_q[:, 5], joint_q[:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
     joint_qd = wp.full((num_envs, 6 + NUM_JOINTS), 9.0, dtype=float)
     command_episodes(wp.array(joint_q, dtype=float), episodes, make_rules(**rules), task, joint_qd, training)
@@ -124,10 +124,10 @@ def test_heading_becomes_a_yaw_rate_the_short_way_round(heading, yaw, rate):
     assert commands[0, 2] == pytest.approx(rate, abs=1e-4)
 
 
-def test_a_crossing_robot_is_told_to_go_to_its_goal():
+def test_a_crossing_robot_is_commanded_to_its_goal():
     # The goal lies to the left of a robot that looks along x: turn left by half of 90 degrees a second.
     task = make_task(CrossingCfg(), get_robot("anymal"))
-    commands, _, headings = command(steps=0, heading=0.3, place=(14.0, 0.0), crosses=1, task=task)
+    commands, _, headings = command(steps=0, heading=0.3, position=(14.0, 0.0), crosses=1, task=task)
     np.testing.assert_allclose(commands[0], (0.0, 0.75, 0.5 * np.pi / 2), atol=1e-6)
     assert headings.tolist() == [np.float32(0.3)]  # nothing is drawn
 

@@ -17,7 +17,7 @@ NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
 DT = 0.02
 
 
-def paid_for(robot, only_positive=False, **weights):
+def reward_only(robot, only_positive=False, **weights):
     """A robot whose training pays for some terms alone."""
     return replace(robot, training=TrainingCfg(rewards=RewardCfg(**NOTHING | weights), only_positive=only_positive))
 
@@ -25,7 +25,7 @@ def paid_for(robot, only_positive=False, **weights):
 @pytest.fixture(scope="module")
 def tracker(anymal):
     """Paid for its velocity alone."""
-    return paid_for(anymal, tracking_lin_vel=1.0)
+    return reward_only(anymal, tracking_lin_vel=1.0)
 
 
 def rewarded(robot, device, policy=stand, **more):
@@ -34,7 +34,7 @@ def rewarded(robot, device, policy=stand, **more):
     return crossing(robot, device, policy, **dict.fromkeys(ranges, 0.0) | {"reward": True} | more)
 
 
-def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
+def test_after_the_goal_the_command_is_to_stand_and_rewards_go_on(tracker, device):
     # At the goal with the first physics step; the first command was to walk, the 29 after it to stand:
     # .02 s * (exp(-2.25) + 29) = .582.
     rollout = rewarded(tracker, device, start=(14.3, 4.0))
@@ -50,7 +50,7 @@ def test_after_the_goal_it_is_told_to_stand_and_paid_on(tracker, device):
 def test_a_base_collision_costs_its_price_once_and_nothing_is_paid_after_it(anymal, device, start):
     # The same robots with 0.8 s and with 1.6 s: all have fallen on the spike before, from the start and at the goal.
     # -200 a second for the one control step: -4; for its velocity a robot is paid at most 1 a second before.
-    robot, totals = paid_for(anymal, only_positive=True, termination=-200.0, tracking_lin_vel=1.0), []
+    robot, totals = reward_only(anymal, only_positive=True, termination=-200.0, tracking_lin_vel=1.0), []
     for duration in (0.8, 1.6):
         rollout = rewarded(robot, device, start=(start, 4.0), max_duration_s=duration)
         result = rollout.evaluate(Terrains(heights=spike(start)[None], seeds=np.array([1])))
@@ -97,7 +97,7 @@ def test_asking_for_the_reward_changes_nothing_else(anymal):
     assert without.reward is None and np.isfinite(paid.reward).all()
 
 
-def test_a_robots_own_settings_reach_the_kernels(eight, robot):
+def test_a_robots_settings_reach_the_kernels(eight, robot):
     soft = replace(robot.training, soft_joint_limit=0.9)
     motion = Reward(eight, soft, command=None, action=None, falls=()).motion
     steady = {name for name, flag in zip(robot.joint_names, motion.joint_is_steady.numpy(), strict=True) if flag}

@@ -58,7 +58,7 @@ def test_friction_and_mass_of_each_robot(anymal, device):
     stepper.run(4.0)
     stepper.run(0.4, lambda: np.add(forces, np.array(sim.geom_force.numpy()).sum(1) / 20, out=forces))
     np.testing.assert_allclose(forces[:, 2], (52.13 + mass) * 9.81, rtol=0.01)
-    mixed = sim._dynamics.surfaces.friction.numpy()
+    mixed = sim.dynamics.surfaces.friction.numpy()
     np.testing.assert_allclose(
         mixed[..., :2], np.broadcast_to(friction[:, None, None], mixed[..., :2].shape), rtol=1e-5
     )

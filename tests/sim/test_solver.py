@@ -91,8 +91,8 @@ def build(xml, device, **parts):
         return m, d, make_contacts(WORLDS, CAPACITY)
 
 
-def ours_of(m, d, contacts):
-    """Our dynamics of it, or theirs by our road, and whether it is the former."""
+def make_ours(m, d, contacts):
+    """Our dynamics of it, or stock by our road, and whether it is the former."""
     m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
     found = make_dynamics(
         m, d, contacts, wp.zeros(WORLDS, dtype=int, device=d.qpos.device), 1 + np.arange(m.ngeom - 1), 0
@@ -101,30 +101,30 @@ def ours_of(m, d, contacts):
     return found
 
 
-def tell(d, contacts):
-    """Hands ours the contacts that mujoco_warp has found, each with a geom of the ground first."""
+def copy_contacts(d, contacts):
+    """Copy mujoco_warp's contacts into ours; returns their indices by world."""
     count = int(d.nacon.numpy()[0])
     world, found = d.contact.worldid.numpy()[:count], {}
     assert (d.contact.geom.numpy()[:count, 0] == 0).all()
-    of_theirs = {"shape": d.contact.geom.numpy()[:, 1] - 1, "point": d.contact.pos.numpy(),
+    stock = {"shape": d.contact.geom.numpy()[:, 1] - 1, "point": d.contact.pos.numpy(),
                  "normal": d.contact.frame.numpy()[:, 0], "distance": d.contact.dist.numpy()}  # fmt: skip
-    for name, values in of_theirs.items():
+    for name, values in stock.items():
         found[name] = np.zeros(getattr(contacts, name).numpy().shape, values.dtype)
-    places = []
+    indices_by_world = []
     for k in range(WORLDS):
         chosen = np.flatnonzero(world == k)
-        places.append(chosen)
-        for name, values in of_theirs.items():
+        indices_by_world.append(chosen)
+        for name, values in stock.items():
             found[name][k, : len(chosen)] = values[chosen]
     for name, values in found.items():
         getattr(contacts, name).assign(values)
     contacts.friction.fill_(1.0)
-    contacts.count.assign(np.array([len(chosen) for chosen in places], np.int32))
-    return places
+    contacts.count.assign(np.array([len(chosen) for chosen in indices_by_world], np.int32))
+    return indices_by_world
 
 
-def force_of(d, contact):
-    """Their force of a contact, world frame."""
+def read_force(d, contact):
+    """Force of a contact by mujoco_warp, world frame."""
     rows = d.contact.efc_address.numpy()[contact][: min(3, d.contact.dim.numpy()[contact])]
     world = d.contact.worldid.numpy()[contact]
     return d.efc.force.numpy()[world, rows] @ d.contact.frame.numpy()[contact][: len(rows)] if rows[0] >= 0 else 0.0
@@ -133,7 +133,7 @@ def force_of(d, contact):
 STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
-def state_of(d):
+def read_state(d):
     return [getattr(d, name).numpy().copy() for name in STATE]
 
 
@@ -142,23 +142,23 @@ def restore(d, state):
         getattr(d, name).assign(value)
 
 
-def assert_steps_alike(m, d, contacts, ours, relative=2e-3, find=None):
+def assert_equal_steps(m, d, contacts, ours, relative=2e-3, find=None):
     """Their step and ours from the same state, to a share of a world's largest number, forces of contacts too.
 
     Where rounding made one more iteration, ten times that.
     """
-    before = state_of(d)
+    before = read_state(d)
     mjw.step(m, d)
-    expected, iterations = state_of(d), d.solver_niter.numpy().copy()
-    places = tell(d, contacts)
-    forces = [np.array([force_of(d, c) * np.ones(3) for c in chosen]).reshape(-1, 3) for chosen in places]
+    expected, iterations = read_state(d), d.solver_niter.numpy().copy()
+    indices_by_world = copy_contacts(d, contacts)
+    forces = [np.array([read_force(d, c) * np.ones(3) for c in chosen]).reshape(-1, 3) for chosen in indices_by_world]
     restore(d, before)
     (find or ours.find)()
     ours.step()
     differs = np.abs(d.solver_niter.numpy() - iterations)
     assert differs.max() <= 1 and (differs > 0).mean() <= 0.25
     limit = np.where(differs > 0, 10.0 * relative, relative)
-    for name, array, value in zip(STATE, state_of(d), expected, strict=True):
+    for name, array, value in zip(STATE, read_state(d), expected, strict=True):
         error = np.abs(array - value).max(axis=1) / (np.abs(value).max(axis=1) + 1.0)
         assert (error < limit).all(), (name, error)
     found = contacts.force.numpy()
@@ -184,19 +184,19 @@ def everything(device, arms=0, height=0.1):
 @pytest.mark.parametrize(("arms", "height"), [(0, 0.1), (23, 0.1), (31, 0.1), (31, -0.2)])
 def test_every_kind_of_constraint(device, arms, height):
     m, d, contacts = everything(device, arms, height)
-    ours = ours_of(m, d, contacts)
+    ours = make_ours(m, d, contacts)
     assert isinstance(ours, Dynamics)
     kinds, states, dims, most = set(), set(), set(), 0
     with wp.ScopedDevice(device):
         for _ in range(20):
-            before = state_of(d)
+            before = read_state(d)
             mjw.step(m, d)
             for world, count in enumerate(d.nefc.numpy()):
                 kinds |= set(d.efc.type.numpy()[world, :count].tolist())
                 states |= set(d.efc.state.numpy()[world, :count].tolist())
             dims |= set(d.contact.dim.numpy()[: int(d.nacon.numpy()[0])].tolist())
             restore(d, before)
-            assert_steps_alike(m, d, contacts, ours)
+            assert_equal_steps(m, d, contacts, ours)
             most = max(most, int(contacts.count.numpy().max()))
     assert states == {0, 1, 2, 3, 4}
     if height < 0.0:
@@ -210,36 +210,36 @@ def test_every_kind_of_constraint(device, arms, height):
 def test_robots_that_fall(eight, monkeypatch):
     """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's.
 
-    The ground is slippery and soft in places.
+    The ground is slippery and soft in indices_by_world.
     """
     ground, rng = make_ground(8, eight.device), np.random.default_rng(2)
     ground.friction.assign(np.float32(rng.uniform(0.2, 1.0, ground.friction.shape)))
     ground.time_constant.assign(np.float32(rng.choice([FIRM, 0.02, 0.06], ground.friction.shape)))
     monkeypatch.setattr(eight.bank, "ground", ground)
     m, d = eight.solver.mjw_model, eight.solver.mjw_data
-    ours = eight._dynamics
+    ours = eight.dynamics
     assert isinstance(ours, Dynamics)
-    theirs = StockDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
+    stock = StockDynamics(m, d, eight.contacts, ours.surfaces, ground=0)
     states, iterations = set(), []
     q = standing(eight.robot, x=3, z=eight.robot.default_base_height + 0.02)
     put(eight, q, rng.normal(0.0, 0.7, eight.joint_qd.shape))
     with wp.ScopedDevice(eight.device):
         eight.physics_step()
         for _ in range(120):
-            before = state_of(d)
+            before = read_state(d)
             eight.physics_step()
-            found, forces = state_of(d), eight.contacts.force.numpy().copy()
+            found, forces = read_state(d), eight.contacts.force.numpy().copy()
             counted = d.solver_niter.numpy().copy()
             restore(d, before)
-            theirs.find()
-            theirs.step()
+            stock.find()
+            stock.step()
             for world, count in enumerate(d.nefc.numpy()):
                 states |= set(d.efc.state.numpy()[world, :count].tolist())
             iterations.append(d.solver_niter.numpy().mean())
             differs = np.abs(d.solver_niter.numpy() - counted)
             assert differs.max() <= 1
             limit = np.where(differs > 0, 2e-2, 2e-3)
-            for array, value in zip([*found, forces], [*state_of(d), eight.contacts.force.numpy()], strict=True):
+            for array, value in zip([*found, forces], [*read_state(d), eight.contacts.force.numpy()], strict=True):
                 error, size = (np.abs(x.reshape(8, -1)).max(axis=1) for x in (array - value, value))
                 assert (error < limit * (size + 1.0)).all()
             restore(d, found)
@@ -254,7 +254,7 @@ def test_worlds_without_rows_and_worlds_that_are_not_finite_end(device):
     qpos[:, 2], qpos[:, 7:] = 50.0, 0.0
     d.qpos.assign(qpos)
     m.dof_frictionloss.zero_()
-    ours = ours_of(m, d, contacts)
+    ours = make_ours(m, d, contacts)
     with wp.ScopedDevice(device):
         ours.find()
         ours.step()
@@ -279,23 +279,23 @@ def test_every_quantity_of_a_step(device):
     m, d, contacts = build(MODEL, device)
     masses = np.repeat(m.body_mass.numpy(), WORLDS, 0) * np.linspace(0.9, 1.1, WORLDS)[:, None]
     m.body_mass = wp.array(masses, dtype=float, device=device)
-    ours = ours_of(m, d, contacts)
+    ours = make_ours(m, d, contacts)
     shake(d)
     limited, touched = np.zeros(3, int), 0
     roots = m.body_rootid.numpy()[1:]
     with wp.ScopedDevice(device):
         for _ in range(25):
-            before, expected = state_of(d), {}
+            before, expected = read_state(d), {}
             mjw.step(m, d)
             restore(d, before)
             mjw.forward(m, d)
             for name in ("xpos", "xquat", "cdof", "M", "qfrc_actuator", "qfrc_smooth"):
                 expected[name] = getattr(d, name).numpy().copy()
             com = d.subtree_com.numpy()[:, roots].copy()
-            force, of_joint = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
+            force, joint_force = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
             limits = (
                 np.isin(force[:, 0], (-4.0, 5.0)),
-                np.isin(of_joint, (-3.0, 2.0)),
+                np.isin(joint_force, (-3.0, 2.0)),
                 np.isclose(abs(force[:, 1]), 0.5),
             )
             limited += np.sum(limits, axis=1)
@@ -308,7 +308,7 @@ def test_every_quantity_of_a_step(device):
                     np.testing.assert_allclose(getattr(d, name).numpy(), value, atol=3e-6 * size, err_msg=name)
 
             restore(d, before)
-            assert_steps_alike(m, d, contacts, ours, find=find_ours)
+            assert_equal_steps(m, d, contacts, ours, find=find_ours)
             touched = max(touched, int(contacts.count.numpy().max()))
     assert limited.min() > 5  # forces, joints and controls at their limits
     assert touched > 0
@@ -320,18 +320,18 @@ def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
     qpos = d.qpos.numpy()
     qpos[:, 2] += 50.0
     d.qpos.assign(qpos)
-    ours = ours_of(m, d, contacts)
+    ours = make_ours(m, d, contacts)
     shake(d)
     with wp.ScopedDevice(device):
         for _ in range(10):
-            assert_steps_alike(m, d, contacts, ours, relative=3e-5)
+            assert_equal_steps(m, d, contacts, ours, relative=3e-5)
     assert d.nefc.numpy().max() == 0
 
 
 @pytest.mark.parametrize("solver", ["Newton", "CG"])
 def test_too_many_contacts_are_noted(device, solver):
     m, d, contacts = build(MODEL, device, option=f'cone="elliptic" solver="{solver}"')
-    dynamics = ours_of(m, d, contacts)
+    dynamics = make_ours(m, d, contacts)
     assert isinstance(dynamics, Dynamics) == (solver == "Newton")
     m.opt.run_collision_detection = False
     with wp.ScopedDevice(device):
@@ -369,5 +369,5 @@ def test_too_many_contacts_are_noted(device, solver):
     ],
 )
 def test_other_models_take_their_step(device, parts):
-    assert isinstance(ours_of(*build(MODEL, device)), Dynamics)
-    assert isinstance(ours_of(*build(MODEL, device, **parts)), StockDynamics)
+    assert isinstance(make_ours(*build(MODEL, device)), Dynamics)
+    assert isinstance(make_ours(*build(MODEL, device, **parts)), StockDynamics)

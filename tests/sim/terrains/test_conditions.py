@@ -185,7 +185,7 @@ def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, 
     for angle in (0.1, 50.0):  # the second asks for more than there is
         sim.targets.assign(np.float32(np.tile([0.0] * 7 + [angle] * 12, (2, 1))))
         with wp.ScopedDevice(device):
-            sim._dynamics.find()
+            sim.dynamics.find()
             sim.physics_step()
         strong, weak = sim.joint_torque.numpy()[order][:, 6:]
         if angle == 50.0:
@@ -244,7 +244,7 @@ def test_a_negative_payload_leaves_a_body_that_can_be(robot, device):
     row = genes(payload=-0.05, payload_x=0.2, payload_y=0.2)
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=1, device=device, space=SPACE)
     rollout.put(under_conditions(row[None], np.array([1], np.uint32)))
-    tree = rollout.sim._dynamics._tree
+    tree = rollout.sim.dynamics.tree
     plain = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
     share = 1.0 - min(0.5, 0.05 * plain.body_subtreemass[1] / plain.body_mass[1])
     assert tree.body_mass.numpy()[0, 1] == pytest.approx(share * plain.body_mass[1], rel=1e-5)

@@ -184,7 +184,7 @@ def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
     tiles = Tiles(heights=np.zeros((2, 161, 321), np.float32), type_of_column=("a", "b"), ground=ground)
     cfg = TaskCfg(curriculum=CURRICULUM, push_interval_s=1e6, added_base_mass=(5.0, 5.0), friction=(1.0, 1.0))
     task = CommandTask(get_robot("anymal"), cfg, num_envs=4, device=device, seed=0, tiles=tiles)
-    masses = task.sim._dynamics._tree.body_mass.numpy()[:, 1]
+    masses = task.sim.dynamics.tree.body_mass.numpy()[:, 1]
     whole = task.sim.solver.mjw_model.body_subtreemass.numpy()[0, 1]
     assert masses[:2] == pytest.approx(masses[0]) and masses[2:] == pytest.approx(masses[0] + 0.2 * whole)
     sideways = []
@@ -195,7 +195,7 @@ def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
     # The push of 0.1 s is made once the first five control steps have ended, before the sixth begins.
     assert (jump[4, 2:] > 0.7).all() and (jump[:4].abs() < 0.5).all() and (jump[4, :2].abs() < 0.5).all()
     task.exchange(Tiles(heights=tiles.heights, type_of_column=("a", "b")))
-    assert task.sim._dynamics._tree.body_mass.numpy()[:, 1] == pytest.approx(masses[0])
+    assert task.sim.dynamics.tree.body_mass.numpy()[:, 1] == pytest.approx(masses[0])
 
 
 def test_what_no_task_can_do_is_refused(shared_task):
