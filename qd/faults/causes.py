@@ -16,15 +16,17 @@ from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace, WiderSpace
 
 LEAST_HEIGHT = 0.03
-"""A part that is nowhere so high or deep under the robot lies beside its way [m]."""
+"""A part that is lower and less deep everywhere under the robot lies beside its way [m]."""
 GENTLE = 10.0
 """Slopes below are gentle [degrees]."""
-HEAD_ON, SIDEWAYS = 30.0, 60.0
-"""A slope that rises or falls at a smaller angle to the way is met head on, at a larger one from the side [degrees]."""
+HEAD_ON = 30.0
+"""A slope that rises or falls at a smaller angle to the way is met head on [degrees]."""
+SIDEWAYS = 60.0
+"""A slope at a larger angle to the way is met from the side [degrees]."""
 SHORT = 1.0
-"""A part that is at least half as high as at its highest over no more of the way is a ridge or a ditch [m]."""
+"""A part that keeps half of its height over no more of the way is a ridge or a ditch [m]."""
 NARROW = 0.5
-"""A part that falls to half of its height nearer than this beside the way ends there [m]."""
+"""A part that falls to half of its height within this distance of the way ends there [m]."""
 
 SLIPPERY = "slippery ground"
 SOFT = "soft ground"
@@ -46,7 +48,7 @@ _BESIDE = 0.4
 _COARSE = 2  # nodes; parts are compared at 0.1 m
 _NEAR = 1.0  # an oblique ridge goes on before and behind the place where it is highest under the robot [m]
 _CENTRE = round(CrossingCfg.start[1] / SPACING)  # the row of the straight way
-_FIRST_MET = 0.9  # of places nearly as steep as the steepest the one that is met first counts
+_FIRST_MET = 0.9  # share of the steepest slope; the first place that is as steep counts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +127,8 @@ def describe_cause(cause: Mapping[str, Any] | None) -> str:
     """A cause with the values of its :class:`Shape`: ``ridge, 0.25 m high, 53 degrees steep``."""
     if cause is None:
         return UNCLEAR
-    kind, height = cause["kind"], cause.get("height_m")
+    kind = cause["kind"]
+    height = cause.get("height_m")
     if not height:
         return kind
     size = SHAPES[kind] or ("high" if height > 0.0 else "deep")

@@ -23,7 +23,7 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 
 VERDICTS = ("", "failing", "certified", "confirmed", "fault")
-"""From the least to the most: what is certified alone, the controller may cross with contact resolved."""
+"""From the least to the most. The controller may cross with contact resolved what is certified alone."""
 KIN_M = 0.06
 """Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
 _EVERY = 2  # nodes; distances are compared at 0.1 m
@@ -38,13 +38,12 @@ ORDERS = {
     "fitness": "fitness, the highest first",
     "family": "families of like terrains",
 }
-"""Orders of elites, in words."""
+"""Orders of elites, with their labels."""
 
 
 def find_verdicts(archive: Archive) -> NDArray[np.int64]:
     """The verdict on each elite as its index in :data:`VERDICTS`, shape (N,)."""
-    failing, confirmed, certified = archive.failing, archive.confirmed, archive.certified
-    conditions = [confirmed & certified, confirmed, certified, failing]
+    conditions = [archive.is_fault, archive.confirmed, archive.certified, archive.failing]
     return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
 
 
@@ -103,15 +102,16 @@ class Ranking(Evaluation):
         return round(float(getattr(self, rate)[row]) * int(self.counted[row]))
 
     def ending(self, row: int) -> tuple[str, str]:
-        """How most robots that fail an elite end, in a text, and the name of the rate that counts them."""
-        collided, end = self.collision_rate[row], self.end_position[row]
+        """How most robots that fail an elite end, and the name of the rate that counts them."""
+        collided = float(self.collision_rate[row])
+        end = self.end_position[row]
         if collided >= self.other_rate[row]:
-            outcome, rate, share = Outcome.BASE_COLLISION, "collision_rate", collided
-        else:
-            is_out = (end <= CrossingCfg.lower).any() or (end >= CrossingCfg.upper).any()
-            outcome, rate, share = Outcome.OUT if is_out else Outcome.TIME_OUT, "other_rate", 1.0
-        fallen = 2 * self.fallen_rate[row] > share
-        return way_to_end(outcome, fallen), "fallen_rate" if fallen else rate
+            fallen = 2 * self.fallen_rate[row] > collided
+            return way_to_end(Outcome.BASE_COLLISION, fallen), "fallen_rate" if fallen else "collision_rate"
+        is_out = (end <= CrossingCfg.lower).any() or (end >= CrossingCfg.upper).any()
+        outcome = Outcome.OUT if is_out else Outcome.TIME_OUT
+        fallen = 2 * self.fallen_rate[row] > 1.0
+        return way_to_end(outcome, fallen), "fallen_rate" if fallen else "other_rate"
 
     def name(self, row: int) -> str:
         """An elite by its cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""

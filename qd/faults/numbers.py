@@ -77,7 +77,8 @@ def fault_numbers(
 
     ``families`` has shape (N,); ``seen``, of shape (N, C), says whether a certifier has trained on kin of an elite.
     """
-    failing, confirmed, names = archive.failing, archive.confirmed, archive.certifiers
+    failing = archive.failing
+    names = archive.certifiers
     counts = ("confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
@@ -100,16 +101,16 @@ def fault_numbers(
         for column, (name, digest) in enumerate(zip(names, archive.certifier_sha256, strict=True))
     ]
     if resolved.any():
-        numbers["confirmed"] = int(confirmed.sum())
+        numbers["confirmed"] = int(archive.confirmed.sum())
     if names:
         numbers["certified"] = int(certificates.any(axis=1).sum())
     if names and resolved.any():
         in_panel = np.array(names) != SPECIALIST
-        is_fault = confirmed & certificates.any(axis=1)
+        is_fault = archive.is_fault
         numbers["faults"] = None if in_panel.all() else int(is_fault.sum())
-        numbers["faults_panel"] = int((confirmed & certificates[:, in_panel].any(axis=1)).sum())
+        numbers["faults_panel"] = int((is_fault & certificates[:, in_panel].any(axis=1)).sum())
         if seen is not None:
-            numbers["faults_unseen"] = int((confirmed & (certificates & ~seen).any(axis=1)).sum())
+            numbers["faults_unseen"] = int((is_fault & (certificates & ~seen).any(axis=1)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
         if archive.varied_outcomes is not None:

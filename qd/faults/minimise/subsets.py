@@ -155,7 +155,8 @@ def _exhaustive(case: Case) -> Steps:
 def _greedy(case: Case) -> Steps:
     """A subset that fails, of which no part can be taken away."""
     while True:
-        parts, num_needed = case.whole, 0
+        parts = case.whole
+        num_needed = 0
         for part in cycle(case.parts):
             if num_needed == len(parts):  # each is needed since one was taken away the last time
                 break
@@ -164,7 +165,8 @@ def _greedy(case: Case) -> Steps:
             rest = _rest(parts, part)
             yield from _missing(case, case.best_trial(rest))
             if case.fails(case.best_trial(rest)):
-                parts, num_needed = rest, 0
+                parts = rest
+                num_needed = 0
             else:
                 num_needed += 1
         fresh = Trial(parts, fresh=True)
@@ -174,8 +176,9 @@ def _greedy(case: Case) -> Steps:
 
 
 def _scaled(case: Case, parts: Parts) -> Steps:
-    """The least scale that is known to fail, and the largest below it that is known not to, None if none is."""
-    passing, failing = 0.0, 1.0
+    """The least scale that was crossed and fails, and the largest below it that does not; None if none was crossed."""
+    passing = 0.0
+    failing = 1.0
     for _ in range(SCALE_STEPS):
         trial = Trial(parts, scale=(passing + failing) / 2)
         yield from _missing(case, trial)

@@ -47,10 +47,11 @@ def _add_outcomes(
     hashes = dict(zip(archive.certifiers, archive.certifier_sha256, strict=True))
     is_same = hashes.get(name) == controller_hash(policy)
     hashes[name] = str(controller_hash(policy))
-    column, added = [*hashes].index(name), len(hashes) - len(archive.certifiers)
+    column = [*hashes].index(name)
+    num_new = len(hashes) - len(archive.certifiers)
     columns: dict[str, Any] = {}
     for field, values in (("certifier_outcomes", outcomes), ("certifier_resolved_outcomes", resolved)):
-        columns[field] = np.pad(getattr(archive, field), ((0, 0), (0, added), (0, 0)))
+        columns[field] = np.pad(getattr(archive, field), ((0, 0), (0, num_new), (0, 0)))
         if not is_same:
             columns[field][:, column] = 0
         columns[field][rows, column] = values

@@ -32,7 +32,8 @@ class Varied(Stage):
             raise ValueError(f"stages must have others before varied: {judging.search.run} has no faults to cross")
         _check_certifiers(archive, judging, renewed="others" in before)
         if before:  # else the stage itself finds out at once
-            search, compute = judging.search, judging.crosser.compute
+            search = judging.search
+            compute = judging.crosser.compute
             local = Compute(compute.device if compute.on_gpu else "cpu")
             sizes: dict[str, Any] = {"num_terrains": 1, "replicas": 1, "space": varied_name(search.space)}
             build_simulator(PipelineCfg(compute=local, robot=search.robot, policy=search.policy, **sizes), 1)
@@ -40,7 +41,8 @@ class Varied(Stage):
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with outcomes of all controllers under the same conditions."""
         _check_certifiers(archive, judging)
-        search, rows = judging.search, np.flatnonzero(archive.is_fault)
+        search = judging.search
+        rows = np.flatnonzero(archive.is_fault)
         space = load_space(varied_name(search.space))
         seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
         drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]

@@ -69,7 +69,7 @@ def six_elites(ends=(np.nan, np.nan)):
     return ranked(archive, minima_with(causes)), archive
 
 
-def test_an_elite_is_named_by_its_own_cause_and_ending():
+def test_an_elite_is_named_by_its_cause_and_ending():
     ranking, _ = six_elites()
     assert ranking.causes == ("ridge", "drop", "ridge", "ridge", "unclear", "")
     assert [ranking.name(row) for row in range(6)] == [
@@ -90,13 +90,13 @@ def test_causes_are_by_number_and_the_unclear_last():
     ranking, archive = six_elites()
     by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
     assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
-    words, crosses = (
+    summary, crosses = (
         "5 of 6 terrains stop the robot; ridges are the commonest cause",
         "another controller of this robot",
     )
-    assert summarise(ranking, archive) == f"{words}; 1 is a fault: {crosses} crosses it"
+    assert summarise(ranking, archive) == f"{summary}; 1 is a fault: {crosses} crosses it"
     judged = dataclasses.replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
-    assert summarise(ranking, judged) == f"{words}; {crosses} crosses 1 of them"
+    assert summarise(ranking, judged) == f"{summary}; {crosses} crosses 1 of them"
     alone = dataclasses.replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
     assert summarise(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
     one = alone.rows(np.array([0]))

@@ -30,7 +30,7 @@ from tests.qd.stand_in import compute_by, make_result
 SHIPPED = str(get_robot("anymal").policy_file)
 
 
-def archive_of(ratios, *, collided=None):
+def make_elites(ratios, *, collided=None):
     """An archive whose elites have given first ratios of two, found with or without a collision."""
     archive = small_archive(len(ratios))
     columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
@@ -38,7 +38,7 @@ def archive_of(ratios, *, collided=None):
     return dataclasses.replace(archive, cell=archive.cells.find_cells(columns, collided))
 
 
-def fresh_at(archive, ratios, **kwargs):
+def cross_again(archive, ratios, **kwargs):
     """Fresh values of 40 episodes of each elite, all at its ratio."""
     columns = np.stack([np.asarray(ratios), 1.0 - np.asarray(ratios)], axis=1)
     result = make_result(np.repeat(columns[:, None], 40, axis=1), **kwargs)
@@ -49,7 +49,7 @@ def test_an_elite_is_reproduced_in_its_cell_and_in_neighbours_if_it_is_valid():
     invalid = np.zeros((5, 40), bool)
     invalid[4, :11] = True  # 11 of 40 is more than a quarter
     # cells of two ratios: [.3, .4) x [.6, .7) has index 3; .45 is one interval further, .55 two
-    fresh = fresh_at(archive_of([0.35] * 5), [0.38, 0.45, 0.55, 0.25, 0.35], invalid=invalid)
+    fresh = cross_again(make_elites([0.35] * 5), [0.38, 0.45, 0.55, 0.25, 0.35], invalid=invalid)
     assert fresh.reproduced.tolist() == [True, True, False, True, False]
 
 
@@ -57,8 +57,8 @@ def test_the_collision_bit_is_taken_over_the_first_twenty():
     collides = np.zeros((3, 40), bool)
     collides[1, 19] = collides[2, 20] = True
     for collided, expected in ((False, [True, False, True]), (True, [False, True, False])):
-        archive = archive_of([0.35] * 3, collided=[collided] * 3)
-        assert fresh_at(archive, [0.35] * 3, base_collision=collides).reproduced.tolist() == expected
+        archive = make_elites([0.35] * 3, collided=[collided] * 3)
+        assert cross_again(archive, [0.35] * 3, base_collision=collides).reproduced.tolist() == expected
 
 
 def test_seeds_follow_from_what_names_an_elite():
@@ -90,14 +90,14 @@ def crosses(policy, resolved, genes):
     return genes[:, gene] > above
 
 
-def result_of(cfg, genes, seeds):
+def cross_by_genes(cfg, genes, seeds):
     if cfg.replicas == 40:
         return stand_in.evaluate(genes, seeds, 40)
     return ~crosses(cfg.policy, cfg.engine == "resolved", genes)
 
 
 def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, **changes):
-    compute = compute_by(robots or Robots(result_of))
+    compute = compute_by(robots or Robots(cross_by_genes))
     return judge(path, compute=compute, stages=stages, certifiers=certifiers, **changes)
 
 
@@ -105,7 +105,7 @@ def numbers_in(path):
     return json.loads((path / "archive.json").read_text())
 
 
-def test_bars_say_how_many_are_to_come(path, monkeypatch):
+def test_bars_count_the_crossings_to_come(path, monkeypatch):
     bars = []
     monkeypatch.setattr("qd.workers.crosser.Bar", lambda text: bars.append(text) or Bar(text))
     judged(path)
@@ -113,7 +113,7 @@ def test_bars_say_how_many_are_to_come(path, monkeypatch):
 
 
 def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):
-    path, robots = Path(shutil.copytree(made / "found", tmp_path / "run")), Robots(result_of)
+    path, robots = Path(shutil.copytree(made / "found", tmp_path / "run")), Robots(cross_by_genes)
     searched = read_archive(path)
     archive = judged(path, robots, stages=("fresh",))
     assert archive.fresh.episodes.tolist() == [40] * len(searched) == [40] * len(robots.crossed)
@@ -128,7 +128,7 @@ def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_
 
 
 def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
-    before, robots = read_archive(path), Robots(result_of)
+    before, robots = read_archive(path), Robots(cross_by_genes)
     archive = judged(path, robots)
     failing, again = before.failing, ~crosses("searched", True, before.genes)
     once = crosses("C-G", False, before.genes)
@@ -138,12 +138,12 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     faults = int((failing & again & other).sum())
     assert 0 < faults < (failing & again).sum() < failing.sum() < len(archive)
     # A controller that does not cross at the search's settings is not asked with contact resolved.
-    asked = [
+    resolved = [
         [cfg.engine == "resolved" for cfg, _ in robots.crossed if cfg.policy == policy]
         for policy in (SHIPPED, OTHER["C-G"])
     ]
-    assert asked[0] == [True] * failing.sum()
-    assert (asked[1].count(False), asked[1].count(True)) == (failing.sum(), (failing & once).sum())
+    assert resolved[0] == [True] * failing.sum()
+    assert (resolved[1].count(False), resolved[1].count(True)) == (failing.sum(), (failing & once).sum())
     assert len(set(robots.seeds)) == len(robots.seeds)
     numbers, stored = numbers_in(path), read_archive(path)
     assert (numbers["failing"], numbers["confirmed"]) == (failing.sum(), (failing & again).sum())
@@ -155,7 +155,7 @@ def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
     assert stored.certified.tolist() == archive.certified.tolist()
     assert (stored.cause != "").tolist() == failing.tolist() and len(stored.family) == len(archive)
     content = (path / "archive.npz").read_bytes()
-    judged(path, Robots(result_of, stop_after=0))  # nothing is crossed twice, and nothing adds up
+    judged(path, Robots(cross_by_genes, stop_after=0))  # nothing is crossed twice, and nothing adds up
     assert (path / "archive.npz").read_bytes() == content
 
 
@@ -203,7 +203,7 @@ def test_all_controllers_cross_a_fault_under_the_same_20_conditions(path):
 
 def test_only_the_certifiers_of_faults_can_cross_them_under_varied_conditions(path):
     vary(path, judged(path), [])
-    nobody = Robots(result_of, stop_after=0)
+    nobody = Robots(cross_by_genes, stop_after=0)
     for stages in (("varied",), ("others", "varied")):
         with pytest.raises(ValueError, match=r"certifiers .*C-G"):
             judged(path, nobody, stages=stages, certifiers={})
@@ -217,13 +217,13 @@ def test_only_the_certifiers_of_faults_can_cross_them_under_varied_conditions(pa
 def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, monkeypatch):
     monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
-        judged(path, Robots(result_of, stop_after=0), stages=("fresh", "resolved", "others", "varied"))
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=("fresh", "resolved", "others", "varied"))
 
 
 @pytest.mark.parametrize("stages", [("varied",), ("fresh", "varied"), ("resolved", "soon")])
 def test_stages_that_lack_what_they_need_are_refused_before_anything_is_crossed(path, stages):
     with pytest.raises(ValueError, match="stages"):
-        judged(path, Robots(result_of, stop_after=0), stages=stages)
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=stages)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
@@ -250,9 +250,9 @@ def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_re
     assert rows.tolist() == np.flatnonzero(archive.failing)[:1].tolist()
 
 
-def test_the_panel_and_the_runs_own_certifiers_judge_without_the_searched_controller(path, tmp_path, monkeypatch):
-    panel, of_run = tmp_path / "panel", path / "certifiers"
-    for folder, file in ((panel, ROBOTS["anymal"].panel / "S.pt"), (of_run, OTHER["C-G"])):
+def test_the_panel_and_the_certifiers_of_the_run_judge_without_the_searched_controller(path, tmp_path, monkeypatch):
+    panel, run_folder = tmp_path / "panel", path / "certifiers"
+    for folder, file in ((panel, ROBOTS["anymal"].panel / "S.pt"), (run_folder, OTHER["C-G"])):
         folder.mkdir()
         shutil.copy(SHIPPED, folder / "base.pt")
         shutil.copy(file, folder)
@@ -284,11 +284,11 @@ def test_kin_of_what_a_certifier_trained_on_is_seen(tmp_path, monkeypatch):
 )
 def test_what_cannot_be_judged_is_refused_before_anything_is_crossed(path, named, changes):
     with pytest.raises(ValueError, match=named):
-        judged(path, Robots(result_of, stop_after=0), **changes)
+        judged(path, Robots(cross_by_genes, stop_after=0), **changes)
 
 
 def test_a_run_that_is_not_whole_is_refused_and_stays(path, made, tmp_path):
-    nobody = Robots(result_of, stop_after=0)
+    nobody = Robots(cross_by_genes, stop_after=0)
     with pytest.raises(FileNotFoundError):
         judged(tmp_path / "gone", nobody)
     with pytest.raises(ValueError, match="fresh"):
@@ -307,5 +307,5 @@ def test_where_nothing_fails_nothing_is_crossed(path):
     archive = read_archive(path)
     fine = dataclasses.replace(archive, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(len(archive))))
     write_archive(path / "archive.npz", fine)
-    judged(path, Robots(result_of, stop_after=0))
+    judged(path, Robots(cross_by_genes, stop_after=0))
     assert numbers_in(path)["faults"] == 0 and numbers_in(path)["certifiers"] == ["C-G"]

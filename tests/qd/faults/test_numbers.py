@@ -18,47 +18,47 @@ from qd.faults.numbers import (
 from tests.builders import fresh_values, judged_archive, small_archive
 
 
-def numbers_of(archive, *names, **known):
+def pick_numbers(archive, *names, **known):
     numbers = fault_numbers(archive, **known)
     return tuple(numbers[name] for name in names)
 
 
 def test_numbers_by_hand():
     archive = judged_archive()
-    assert numbers_of(archive, "failing", "confirmed", "certified", "faults_panel") == (4, 2, 2, 1)
-    assert numbers_of(archive, "certifiers", "crossed_resolved") == (["C-G", "S"], 4)
-    (certificates,) = numbers_of(archive, "certificates")
+    assert pick_numbers(archive, "failing", "confirmed", "certified", "faults_panel") == (4, 2, 2, 1)
+    assert pick_numbers(archive, "certifiers", "crossed_resolved") == (["C-G", "S"], 4)
+    (certificates,) = pick_numbers(archive, "certificates")
     assert [(entry["crossed"], entry["certified"]) for entry in certificates] == [(4, 1), (3, 1)]
     # Nobody trained a specialist, looked for families, or knows what the certifiers were trained on.
     names = ("faults", "faults_unseen", "families", "fault_families")
-    assert numbers_of(archive, *names) == (None,) * 4 and count_faults(archive) == 1
+    assert pick_numbers(archive, *names) == (None,) * 4 and count_faults(archive) == 1
 
 
 @pytest.mark.parametrize(("certifiers", "expected"), [(("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))])
 def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expected):
     archive = judged_archive()
     archive = dataclasses.replace(archive, certifiers=certifiers)
-    assert numbers_of(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
+    assert pick_numbers(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
 
 
 def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
     # The fault is elite 0, which S crosses; elite 2 is certified by C-G alone and not confirmed.
     archive, families, seen = judged_archive(), np.array([0, 1, 1, 2, 0]), np.zeros((5, 2), bool)
     names = ("faults_unseen", "families", "fault_families")
-    assert numbers_of(archive, *names, families=families, seen=seen) == (1, 3, 1)
+    assert pick_numbers(archive, *names, families=families, seen=seen) == (1, 3, 1)
     seen[0, 1] = True
-    assert numbers_of(archive, *names, families=families, seen=seen) == (0, 3, 1)
+    assert pick_numbers(archive, *names, families=families, seen=seen) == (0, 3, 1)
 
 
 def test_numbers_of_what_nobody_looked_at_are_none():
     archive, names = judged_archive(), ("failing", "certified", "confirmed", "faults_panel")
-    assert numbers_of(small_archive(), *names) == (None,) * 4
+    assert pick_numbers(small_archive(), *names) == (None,) * 4
     fresh_alone = dataclasses.replace(small_archive(5), fresh=archive.fresh)
-    assert numbers_of(fresh_alone, *names) == (4, None, None, None)
+    assert pick_numbers(fresh_alone, *names) == (4, None, None, None)
     fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(5)))
-    assert numbers_of(fine, *names) == (0,) * 4
+    assert pick_numbers(fine, *names) == (0,) * 4
     unresolved = dataclasses.replace(archive, resolved_outcomes=0 * archive.resolved_outcomes)
-    assert numbers_of(unresolved, *names) == (4, 2, None, None)
+    assert pick_numbers(unresolved, *names) == (4, 2, None, None)
 
 
 def test_numbers_of_fresh_episodes_by_hand():
@@ -79,14 +79,14 @@ def test_numbers_of_fresh_episodes_by_hand():
     assert numbers["corrected_coverage"] == 1 / archive.cells.num_cells
 
 
-def test_words_say_counts_and_verdicts():
+def test_sentences_say_counts_and_verdicts():
     archive = judged_archive()
-    words = [describe_elite(archive, number) for number in range(5)]
+    texts = [describe_elite(archive, number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
-    assert [("a fault" in text[-1], "not known" in text[-1]) for text in words] == [
+    assert [("a fault" in text[-1], "not known" in text[-1]) for text in texts] == [
         (True, False), (False, True), (False, False), (False, True), (False, False),
     ]  # fmt: skip
-    assert "9 of 20 (45%, 26 to 66%)" in words[0][0]
+    assert "9 of 20 (45%, 26 to 66%)" in texts[0][0]
     assert describe_elite(small_archive(5), 0) == []
 
 
