@@ -252,7 +252,7 @@ def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDA
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
 
 
-def summarise(ranking: Ranking, archive: Archive) -> str:
+def summarise_search(ranking: Ranking, archive: Archive) -> str:
     """What a search says of the controller, in one plain sentence."""
     failing = int(ranking.failing.sum())
     commonest = next(iter(ranking.by_cause()), UNCLEAR)

@@ -148,7 +148,7 @@ def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
     return {label: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for label, ends in counts.items() if ends.any()}
 
 
-def describe_elite(archive: Archive, number: int) -> list[str]:
+def describe_judgement(archive: Archive, number: int) -> list[str]:
     """What is known of an elite, in sentences; none where nobody crossed it under other conditions."""
     rates = {label: format_rate(*rate) for label, rate in further_rates(archive, number).items()}
     if not rates:

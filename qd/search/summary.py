@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from qd.faults.families import rank, summarise
+from qd.faults.families import rank, summarise_search
 from qd.faults.minimise.results import read_minimal
 from qd.search.archive import Archive
 from sim.files.command import command_line
@@ -36,7 +36,7 @@ def print_summary(
     text = _TEMPLATES.get_template("summary.txt").render(
         archive=archive,
         ranking=ranking,
-        summary=summarise(ranking, archive),
+        summary=summarise_search(ranking, archive),
         number=number,
         name=ranking.name(ranking.find_row(number)),
         view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),

@@ -9,7 +9,7 @@ from typing import Any
 
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from qd.faults.numbers import describe_elite
+from qd.faults.numbers import describe_judgement
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
@@ -273,5 +273,5 @@ def _describe_elite(run: OpenedRun, terrain: EliteTerrain, now: Evaluation) -> d
         "minimal": run.minima().describe(number) if minimal else "",
         "verdict": (minimal or {}).get("verdict", "not judged"),
         "same_cell": same_cell,
-        "verdicts": describe_elite(archive, number),
+        "verdicts": describe_judgement(archive, number),
     }

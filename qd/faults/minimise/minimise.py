@@ -13,7 +13,7 @@ from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
 from qd.faults.judge import CROSSINGS_FOLDER
 from qd.faults.minimise.results import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
-from qd.faults.minimise.subsets import Case, How, Minimal, Trial, cut_genes, open_case, take_apart
+from qd.faults.minimise.subsets import Case, How, Trial, cut_genes, open_case, take_apart
 from qd.faults.numbers import judgement, rate_numbers
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
 from qd.faults.stages import STAGES
@@ -62,20 +62,24 @@ def minimise(
     device_kind = compute.device.partition(":")[0]
     with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crosser:
         archive = search.read_archive()
-        numbers = _choose_failing(archive, elite, search, max_elites=_MAX_ELITES[device_kind])
+        numbers = sorted(_choose_failing(archive, elite, search, max_elites=_MAX_ELITES[device_kind]))
         on_gpu = device_kind == "cuda"
         half_width = search.robot.half_width
         cases = {n: open_case(archive, n, search.space, half_width, how, on_gpu=on_gpu) for n in numbers}
-        minima = take_apart(archive, cases, search, crosser)
-        elites = _as_elites(archive, minima, search.space)
+        take_apart(archive, cases, search, crosser)
+        elites = _as_elites(archive, cases, search.space)
         if judged:
             judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
             for stage in ("resolved", "others"):
                 elites = STAGES[stage].run(elites, judging)
         if not numbers:
             print(f"{run}: none of {len(archive):,} elites fails.")
-        entries = _entries(archive, elites, minima, cases, search)
-        genes = dict(zip(minima, elites.genes, strict=True))
+        verdicts = [VERDICTS[verdict] for verdict in find_verdicts(elites)]
+        entries = {
+            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **judgement(elites, row)}
+            for row, n in enumerate(numbers)
+        }
+        genes = dict(zip(numbers, elites.genes, strict=True))
         stored = read_minimal(run, archive)
         if stored is not None:
             entries = {entry["elite"]: entry for entry in stored.numbers["elites"]} | entries
@@ -84,7 +88,7 @@ def minimise(
             return None
         origin = compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
         result = _write(search, origin, entries, genes)
-    for number in minima:
+    for number in numbers:
         verdict = f"; {entries[number]['verdict']}" if judged else ""
         print(f"Elite {number}: {result.describe(number)}{verdict}.")
     print(f"Numbers: {run / NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
@@ -128,12 +132,12 @@ def _choose_failing(archive: Archive, elite: str | None, search: Search, *, max_
     return numbers
 
 
-def _as_elites(archive: Archive, minima: Mapping[int, Minimal], space: TerrainSpace) -> Archive:
+def _as_elites(archive: Archive, cases: Mapping[int, Case], space: TerrainSpace) -> Archive:
     """Minimal terrains as elites with their own genes and fresh episodes; of the rest only the names hold."""
-    rows = archive.rows(np.array([*minima], np.int64))
+    rows = archive.rows(np.array([*cases], np.int64))
     assert rows.fresh is not None
-    counts = np.array([minimal.counts for minimal in minima.values()], np.int64).reshape(-1, len(OUTCOMES))
-    genes = [cut_genes(archive.genes[number], Trial(minimal.parts), space) for number, minimal in minima.items()]
+    counts = np.array([case.fresh for case in cases.values()], np.int64).reshape(-1, len(OUTCOMES))
+    genes = [cut_genes(archive.genes[number], Trial(case.minimal), space) for number, case in cases.items()]
     fresh = replace(
         rows.fresh,
         goal_rate=goal_rates(counts),
@@ -147,48 +151,38 @@ def _as_elites(archive: Archive, minima: Mapping[int, Minimal], space: TerrainSp
     return replace(rows, genes=np.array(genes, np.float32).reshape(rows.genes.shape), fresh=fresh, **unjudged)
 
 
-def _entries(
-    archive: Archive, elites: Archive, minima: Mapping[int, Minimal], cases: Mapping[int, Case], search: Search
-) -> dict[int, dict[str, Any]]:
-    """The minimal terrains, which are ``elites`` too, as ``minimal.json`` has them, by number of the elite."""
-    verdicts = find_verdicts(elites)
-    return {
-        number: _entry(archive, number, cases[number], minimal, search)
-        | {"verdict": VERDICTS[verdicts[row]], **judgement(elites, row)}
-        for row, (number, minimal) in enumerate(minima.items())
-    }
-
-
-def _entry(archive: Archive, number: int, case: Case, minimal: Minimal, search: Search) -> dict[str, Any]:
+def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[str, Any]:
     """A minimal terrain as ``minimal.json`` has it, without its verdict."""
     space = search.space
     descriptions = space.parts(archive.genes[number])
-    scales = (1.0, minimal.scale or 1.0)
-    genes = [cut_genes(archive.genes[number], Trial(minimal.parts, scale), space) for scale in scales]
-    effects = find_effects(genes[0], minimal.parts, space)
+    scales = (1.0, case.scale or 1.0)
+    genes = [cut_genes(archive.genes[number], Trial(case.minimal, scale), space) for scale in scales]
+    effects = find_effects(genes[0], case.minimal, space)
     half_width = search.robot.half_width
-    shapes = {part: effects.shape(index, half_width) for index, part in enumerate(minimal.parts)}
-    cause = minimal.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
+    shapes = {part: effects.shape(index, half_width) for index, part in enumerate(case.minimal)}
+    cause = case.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
     whole, scaled = make_heights(np.array(genes), space)
-    without = {str(part): rate_numbers(counts) for part, counts in minimal.without.items()}
+    without = {str(part): rate_numbers(counts) for part, counts in case.without.items()}
+    subsets = {trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}
+    scaled_counts = {trial.scale: counts for trial, counts in case.counts.items() if trial.scale < 1.0}
     return {
         "elite": number,
         "cell": int(archive.cell[number]),
         "iteration": int(archive.iteration[number]),
-        "bumps": list(minimal.parts),
-        "words": [descriptions[part] for part in minimal.parts],
+        "bumps": list(case.minimal),
+        "words": [descriptions[part] for part in case.minimal],
         "of": len(case.parts),
         "how": case.how,
-        "subsets_crossed": minimal.subsets,
-        **rate_numbers(minimal.counts),
+        "subsets_crossed": len(subsets),
+        **rate_numbers(case.fresh),
         "without": {part: rate["goal_rate"] for part, rate in without.items()},
         "without_intervals": {part: rate["goal_interval"] for part, rate in without.items()},
         "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
-        "scale": minimal.scale,
-        "passing_scale": minimal.passing_scale,
+        "scale": case.scale,
+        "passing_scale": case.passing_scale,
         "height_m": round(float(np.abs(whole).max()), 4),
-        "margin_m": None if minimal.scale is None else round(float(np.abs(whole - scaled).max()), 4),
-        "scales": [{"scale": scale, **rate_numbers(counts)} for scale, counts in sorted(minimal.scales.items())],
+        "margin_m": None if case.scale is None else round(float(np.abs(whole - scaled).max()), 4),
+        "scales": [{"scale": scale, **rate_numbers(scaled_counts[scale])} for scale in sorted(scaled_counts)],
     }
 
 

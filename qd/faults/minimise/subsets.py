@@ -6,7 +6,7 @@ it. Then its heights are scaled down together as long as it still fails.
 """
 
 import math
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from itertools import combinations, cycle
 from typing import Any, Literal, NamedTuple
@@ -54,7 +54,7 @@ class Trial(NamedTuple):
         return (FRESH_EPISODES if self.fresh else EPISODES) // _ROW_EPISODES
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Case:
     """A failing terrain that is taken apart; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
 
@@ -67,11 +67,27 @@ class Case:
     """Parts that change no height: slippery patches, conditions. A terrain of these alone is not scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
     """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
+    minimal: Parts = ()
+    """Parts that it takes to fail, once it was taken apart."""
+    scale: float | None = None
+    """Least scale of their heights that was crossed and fails; None if they cannot be scaled."""
+    passing_scale: float | None = None
+    """Largest scale below it that was crossed and does not fail; None if there is none."""
 
     @property
     def whole(self) -> Parts:
         """All its parts."""
         return tuple(sorted(self.parts))
+
+    @property
+    def fresh(self) -> NDArray[np.int64]:
+        """Outcomes of the 40 fresh episodes on the minimal terrain."""
+        return self.counts[Trial(self.minimal, fresh=True)]
+
+    @property
+    def without(self) -> dict[int, NDArray[np.int64]]:
+        """Outcomes on the minimal terrain without one of its parts, by the part."""
+        return {part: self.counts[self.best_trial(_rest(self.minimal, part))] for part in self.minimal}
 
     def fails(self, trial: Trial) -> bool:
         """Whether the controller fails it; too many invalid episodes say nothing."""
@@ -81,26 +97,6 @@ class Case:
         """The fresh trial of some parts if it was crossed, else that of 20 episodes."""
         fresh = Trial(parts, fresh=True)
         return fresh if fresh in self.counts else Trial(parts)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Minimal:
-    """A minimal terrain; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
-
-    parts: Parts
-    """Parts that it takes to fail."""
-    counts: NDArray[np.int64]
-    """Of its 40 fresh episodes."""
-    without: dict[int, NDArray[np.int64]]
-    """Outcomes without one of the parts, by its number."""
-    scale: float | None
-    """Least scale of the heights that was crossed and fails; None if they cannot be scaled."""
-    passing_scale: float | None
-    """Largest scale below it that was crossed and does not fail; None if there is none."""
-    scales: dict[float, NDArray[np.int64]]
-    """Outcomes by scale."""
-    subsets: int
-    """How many subsets were crossed for it."""
 
     def cause(self, rank: Mapping[int, float]) -> int | None:
         """The part without which most robots arrive, among equals that of the largest ``rank``; None without parts."""
@@ -113,19 +109,10 @@ Steps = Generator[list[Trial], None, Any]
 
 
 def find_minimal(case: Case) -> Steps:
-    """Finds the minimal terrain of a case; the generator returns a :class:`Minimal`."""
-    parts = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
-    scalable = case.scalable and not set(parts) <= set(case.flat)
-    scale, passing = (yield from _scaled(case, parts)) if scalable else (None, None)
-    return Minimal(
-        parts=parts,
-        counts=case.counts[Trial(parts, fresh=True)],
-        without={part: case.counts[case.best_trial(_rest(parts, part))] for part in parts},
-        scale=scale,
-        passing_scale=passing,
-        scales={trial.scale: case.counts[trial] for trial in case.counts if trial.scale != 1.0},
-        subsets=len({trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}),
-    )
+    """Finds the minimal terrain of a case, and the least scale of its heights."""
+    case.minimal = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
+    if case.scalable and not set(case.minimal) <= set(case.flat):
+        case.scale, case.passing_scale = yield from _scaled(case, case.minimal)
 
 
 def _rest(parts: Parts, part: int) -> Parts:
@@ -219,8 +206,8 @@ def open_case(
     )
 
 
-def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crosser: Crosser) -> dict[int, Minimal]:
-    """Finds the minimal terrains of some elites, all of them together, by number of the elite; counts of cases grow.
+def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crosser: Crosser) -> None:
+    """Finds the minimal terrains of some elites, all of them together, by number of the elite.
 
     All subsets of an elite are crossed from the same starts, fresh episodes from others. Starts follow from the
     search's seed and from what names the elite.
@@ -229,39 +216,24 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, cros
     for fresh, stream in ((False, Stream.MINIMISED), (True, Stream.MINIMISED_FRESH)):
         times = Trial((), fresh=fresh).rows
         seeds[fresh] = elite_seeds(archive, search.cfg.seed, times, stream=stream).reshape(-1, times)
+    subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values() if case.how == "exhaustive"]
+    room = max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
-    minima = dict[int, Minimal]()
-    room = _max_rows(cases.values())
-    while trials := _next_trials(steps, minima):
-        rows = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
+    while steps:
+        wanted = {number: next(step, None) for number, step in steps.items()}
+        steps = {number: step for number, step in steps.items() if wanted[number] is not None}
+        trials = [(number, trial) for number in steps for trial in wanted[number] or ()]
+        if not trials:
+            break
+        genes = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
         terrains = Terrains(
-            genes=np.concatenate(rows),
-            seeds=np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
+            genes=np.concatenate(genes), seeds=np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
             space=search.space,
-        )
-        label = f"{len(minima)} of {len(cases)} elites done"
+        )  # fmt: skip
+        label = f"{len(cases) - len(steps)} of {len(cases)} elites done"
         result = crosser.cross(
             search.policy, terrains, replicas=_ROW_EPISODES, room=room, invalid_ok=True, label=label
         )
         ends = np.cumsum([trial.rows for _, trial in trials])
         for (number, trial), counts in zip(trials, np.split(count_outcomes(result), ends[:-1]), strict=True):
             cases[number].counts[trial] = counts.sum(axis=0)
-    return dict(sorted(minima.items()))
-
-
-def _next_trials(steps: dict[int, Steps], minima: dict[int, Minimal]) -> list[tuple[int, Trial]]:
-    """Trials of all elites that are not done, by number; adds the minimal terrains of those that are."""
-    trials = list[tuple[int, Trial]]()
-    for number, step in list(steps.items()):
-        try:
-            trials += [(number, trial) for trial in next(step)]
-        except StopIteration as end:
-            minima[number] = end.value
-            del steps[number]
-    return trials
-
-
-def _max_rows(cases: Collection[Case]) -> int:
-    """Rows of genes that one call crosses at most."""
-    subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases if case.how == "exhaustive"]
-    return max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.faults.causes import describe_cause
-from qd.faults.families import VERDICTS, Ranking, summarise
+from qd.faults.families import VERDICTS, Ranking, summarise_search
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.faults.numbers import fault_numbers
 from qd.search.archive import Archive
@@ -48,7 +48,7 @@ def collect_content(
         "controller": controller,
         "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
         "place": without_machine(str(opened_run.path)),
-        "summary": summarise(ranking, archive),
+        "summary": summarise_search(ranking, archive),
         "failing": int(ranking.failing.sum()),
         "certifiers": " or ".join(archive.certifiers),
         "numbers": fault_numbers(archive),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from qd.faults.families import ORDERS, VERDICTS, Ranking, rank
 from qd.faults.minimise.minimise import MinimalTerrains
-from qd.faults.numbers import best_certifier, describe_elite
+from qd.faults.numbers import best_certifier, describe_judgement
 from qd.search.archive import Archive
 from qd.show.crossed import ARRIVED, FAILED, count_rates
 from sim.crossing import CrossingCfg
@@ -122,7 +122,7 @@ class Listing:
         ranking = self.ranking
         kin = int((ranking.families == ranking.families[number]).sum()) - 1
         paragraphs = [
-            *describe_elite(self.archive, number),
+            *describe_judgement(self.archive, number),
             f"{kin or 'No'} other elite{'s' * (kin > 1)} like it (within 6 cm).",
             f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
             f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from kernels.penalties import PENALTIES
-from qd.faults.families import ORDERS, summarise
+from qd.faults.families import ORDERS, summarise_search
 from qd.show.crossed import ENDINGS
 from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
 from qd.show.view.playing import Crossing
@@ -110,7 +110,8 @@ class ArchivePanel:
         if tab.window[0] < _WIDE:
             panel.minimize()
         with panel.add_tab("Archive"):
-            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summarise(listing.ranking, listing.archive))}.</b>"))
+            summary = escape(summarise_search(listing.ranking, listing.archive))
+            gui.add_html(_small(f"{escape(title)}<br><b>{summary}.</b>"))
             orders = {label: name for name, label in ORDERS.items()}
             choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", listing.causes(), partial(choose, "cause"))

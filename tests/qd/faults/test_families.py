@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise
+from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise_search
 from qd.faults.minimise.minimise import MinimalTerrains
 from qd.search.archive import no_outcomes
 from sim.terrains.bank import make_heights
@@ -94,15 +94,15 @@ def test_causes_are_by_number_and_the_unclear_last():
         "5 of 6 terrains stop the robot; ridges are the commonest cause",
         "another controller of this robot",
     )
-    assert summarise(ranking, archive) == f"{summary}; 1 is a fault: {crosses} crosses it"
+    assert summarise_search(ranking, archive) == f"{summary}; 1 is a fault: {crosses} crosses it"
     judged = dataclasses.replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
-    assert summarise(ranking, judged) == f"{summary}; {crosses} crosses 1 of them"
+    assert summarise_search(ranking, judged) == f"{summary}; {crosses} crosses 1 of them"
     alone = dataclasses.replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
-    assert summarise(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
+    assert summarise_search(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
     one = alone.rows(np.array([0]))
-    assert summarise(ranked(one), one) == "The only terrain stops the robot"
+    assert summarise_search(ranked(one), one) == "The only terrain stops the robot"
     crossed = dataclasses.replace(alone, goal_rate=np.ones(6))
-    assert summarise(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
+    assert summarise_search(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():

@@ -8,7 +8,7 @@ import pytest
 from qd.faults.numbers import (
     SPECIALIST,
     count_faults,
-    describe_elite,
+    describe_judgement,
     fault_numbers,
     fresh_counts,
     fresh_numbers,
@@ -81,13 +81,13 @@ def test_numbers_of_fresh_episodes_by_hand():
 
 def test_sentences_say_counts_and_verdicts():
     archive = judged_archive()
-    texts = [describe_elite(archive, number) for number in range(5)]
+    texts = [describe_judgement(archive, number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
     assert [("a fault" in text[-1], "not known" in text[-1]) for text in texts] == [
         (True, False), (False, True), (False, False), (False, True), (False, False),
     ]  # fmt: skip
     assert "9 of 20 (45%, 26 to 66%)" in texts[0][0]
-    assert describe_elite(small_archive(5), 0) == []
+    assert describe_judgement(small_archive(5), 0) == []
 
 
 def test_rates_and_certificates_of_an_elite():

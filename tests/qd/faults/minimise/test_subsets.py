@@ -30,17 +30,17 @@ def case(how="exhaustive", parts=range(8), scalable=True):
 
 
 def solve(case, rule, crossed=None):
-    """The minimal terrain where ``rule(trial)`` says how many of 20 robots arrive; notes what is crossed, in steps."""
-    steps = find_minimal(case)
-    while True:
-        try:
-            wanted = next(steps)
-        except StopIteration as end:
-            return end.value
+    """The case taken apart; ``rule(trial)`` says how many of 20 robots arrive. Notes what is crossed, in steps."""
+    for wanted in find_minimal(case):
         (crossed if crossed is not None else []).append(wanted)
         for trial in wanted:
             assert trial not in case.counts
             case.counts[trial] = (2 if trial.fresh else 1) * np.array([rule(trial), 20 - rule(trial), 0, 0])
+    return case
+
+
+def scales(case):
+    return [trial.scale for trial in case.counts if trial.scale != 1.0]
 
 
 def two_and_five(trial):
@@ -51,18 +51,18 @@ def two_and_five(trial):
 @BOTH
 def test_the_parts_that_are_needed_are_found_and_scaled(how):
     minimal = solve(case(how), two_and_five)
-    assert minimal.parts == (2, 5)
-    assert minimal.counts.tolist() == [6, 34, 0, 0]
+    assert minimal.minimal == (2, 5)
+    assert minimal.fresh.tolist() == [6, 34, 0, 0]
     assert {part: counts.tolist() for part, counts in minimal.without.items()} == {2: [18, 2, 0, 0], 5: [18, 2, 0, 0]}
     # .5 passes, .75 fails, .625 fails, .5625 and .59375 pass
     assert (minimal.scale, minimal.passing_scale) == (0.625, 0.59375)
-    assert sorted(minimal.scales) == [0.5, 0.5625, 0.59375, 0.625, 0.75]
+    assert sorted(scales(minimal)) == [0.5, 0.5625, 0.59375, 0.625, 0.75]
     assert minimal.cause({2: 0.1, 5: 0.2}) == 5 and minimal.cause({2: 0.3, 5: 0.2}) == 2
 
 
 def test_subsets_are_crossed_from_the_smallest_on_all_of_a_size_at_once():
     crossed = []
-    assert solve(case(), two_and_five, crossed).subsets == 37
+    solve(case(), two_and_five, crossed)
     # none, one of eight, two of eight; fresh episodes and scales one by one
     assert [len(wanted) for wanted in crossed] == [1, 8, 28, 1, 1, 1, 1, 1, 1]
     assert crossed[3] == [Trial((2, 5), fresh=True)] and crossed[4] == [Trial((2, 5), scale=0.5)]
@@ -87,7 +87,7 @@ def test_what_is_left_has_no_part_to_spare_where_parts_hide_each_other(how):
         return 0 if (0 in parts and 1 not in parts) or {1, 2, 3} <= parts else 20
 
     minimal = solve(case(how, parts=range(4)), rule)
-    assert minimal.parts == ((0,) if how == "exhaustive" else (1, 2, 3))
+    assert minimal.minimal == ((0,) if how == "exhaustive" else (1, 2, 3))
     assert all(counts.tolist() == PASSES.tolist() for counts in minimal.without.values())
 
 
@@ -101,11 +101,11 @@ def test_fresh_episodes_refute(how):
         return 2 if {3, 4} <= set(trial.parts) else 20
 
     minimal = solve(case(how, scalable=False), rule)
-    assert minimal.parts == (3, 4)
+    assert minimal.minimal == (3, 4)
     assert minimal.without[4].tolist() == [24, 16, 0, 0]  # the fresh ones, which are not selected
     assert minimal.without[3].tolist() == [20, 0, 0, 0]
     assert minimal.cause({3: 0.1, 4: 0.1}) == 3
-    assert (minimal.scale, minimal.scales) == (None, {})
+    assert minimal.scale is None and not scales(minimal)
 
 
 def test_of_equally_many_parts_the_lowest_goal_rate_is_taken_and_if_refuted_the_next():
@@ -114,27 +114,27 @@ def test_of_equally_many_parts_the_lowest_goal_rate_is_taken_and_if_refuted_the_
     def rule(trial, refuted=()):
         return 20 if trial.fresh and trial.parts in refuted else rates.get(trial.parts, 20)
 
-    assert solve(case(scalable=False), rule).parts == (2,)
-    assert solve(case(scalable=False), lambda trial: rule(trial, [(2,)])).parts == (1,)
-    assert solve(case(scalable=False), lambda trial: rule(trial, [(1,), (2,), (3,)])).parts == tuple(range(8))
+    assert solve(case(scalable=False), rule).minimal == (2,)
+    assert solve(case(scalable=False), lambda trial: rule(trial, [(2,)])).minimal == (1,)
+    assert solve(case(scalable=False), lambda trial: rule(trial, [(1,), (2,), (3,)])).minimal == tuple(range(8))
 
 
 @BOTH
 def test_the_whole_terrain_is_the_last_and_a_terrain_without_parts_the_first(how):
     every = solve(case(how, parts=range(3)), lambda trial: 0 if len(trial.parts) == 3 and trial.scale == 1.0 else 20)
-    assert every.parts == (0, 1, 2) and every.counts.tolist() == (2 * FAILS).tolist()
+    assert every.minimal == (0, 1, 2) and every.fresh.tolist() == (2 * FAILS).tolist()
     assert (every.scale, every.passing_scale) == (1.0, 0.96875)
     flat = solve(case(how, parts=range(3)), lambda trial: 0)
-    assert (flat.parts, flat.without, flat.scale, flat.cause({})) == ((), {}, None, None)
+    assert (flat.minimal, flat.without, flat.scale, flat.cause({})) == ((), {}, None, None)
     always = solve(case("exhaustive", parts=range(3)), lambda trial: 20 if not trial.parts else 0)
-    assert (always.parts, always.scale, always.passing_scale) == ((0,), 1 / 32, None)
+    assert (always.minimal, always.scale, always.passing_scale) == ((0,), 1 / 32, None)
 
 
 def test_too_many_invalid_episodes_say_nothing():
     known = case(parts=range(2), scalable=False)
     known.counts.update({Trial(()): PASSES, Trial((0,)): INVALID, Trial((1,)): PASSES})
     minimal = solve(known, lambda trial: 20)
-    assert minimal.parts == (0, 1)
+    assert minimal.minimal == (0, 1)
     assert minimal.cause({0: 0.1, 1: 0.3}) == 0  # without 1 nothing is known
 
 
@@ -163,21 +163,20 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
 
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
-        with Crosser(ROBOT, compute_by(robots)) as crossings:
-            return cases, take_apart(archive, cases, search, crossings)
+        with Crosser(ROBOT, compute_by(robots)) as crosser:
+            take_apart(archive, cases, search, crosser)
+        return cases
 
     together, alone = Robots(fails), Robots(fails)
-    cases, minima = apart((2, 0), together)
+    cases = apart((2, 0), together)
     assert len(together.opened) == 1 and together.crossed[0][0].replicas == 5
-    assert {number: (minimal.parts, minimal.scale) for number, minimal in minima.items()} == {
-        0: ((2, 5), 0.625), 2: ((2, 5), 0.625),
-    }  # fmt: skip
+    assert [(case.minimal, case.scale) for case in cases.values()] == [((2, 5), 0.625)] * 2
     # An elite's 20 episodes are of four seeds, its 40 fresh ones of eight others.
     assert len(set(together.seeds)) == 2 * (4 + 8)
     counted = sum(counts.sum() for case in cases.values() for counts in case.counts.values())
     assert counted - 2 * 20 * 2 == 5 * len(together.crossed)  # all but the whole terrains, which are given
-    _, single = apart((2,), alone)
-    assert set(alone.seeds) < set(together.seeds) and single[2].counts.tolist() == minima[2].counts.tolist()
+    single = apart((2,), alone)
+    assert set(alone.seeds) < set(together.seeds) and single[2].fresh.tolist() == cases[2].fresh.tolist()
 
 
 @BOTH
@@ -196,9 +195,9 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
     case = open_case(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
     search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
-    with Crosser(ROBOT, compute_by(Robots(fails))) as crossings:
-        minimal = take_apart(archive, {0: case}, search, crossings)[0]
-    assert (minimal.parts, minimal.scale) == ((3, 8), 0.625)
+    with Crosser(ROBOT, compute_by(Robots(fails))) as crosser:
+        take_apart(archive, {0: case}, search, crosser)
+    assert (case.minimal, case.scale) == ((3, 8), 0.625)
     effects = find_effects(genes[0], range(11), space)
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")
     assert [effects.shape(part, 0.3).kind for part in (8, 10)] == ["payload", "push"]

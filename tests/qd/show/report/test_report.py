@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from kernels.episode import Outcome
-from qd.faults.families import VERDICTS, rank, summarise
+from qd.faults.families import VERDICTS, rank, summarise_search
 from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.page import percent
@@ -50,7 +50,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
 def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whole):
     content, archive = whole[0].read_text(), read_archive(whole[0].parent)
     ranking, text = rank(archive, SUPER_GAUSSIAN, half_width=0.4, judged=True), text_of(content.encode())
-    assert text.startswith(f"anymal: terrains that stop it {summarise(ranking, archive)}")
+    assert text.startswith(f"anymal: terrains that stop it {summarise_search(ranking, archive)}")
     failing = int((archive.fresh.goal_rate < 0.5).sum())
     for part in (f"stop the robot {failing}", "40 terrains and 160 episodes in 10 s", "for this page 1 of 4 5 to 70 %"):
         assert part in text
