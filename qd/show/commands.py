@@ -55,16 +55,18 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
 
     def _source(self) -> Any:
         from qd.show.elites import open_run
-        from qd.show.replay import select_elites, select_map
+        from qd.show.replay import source_from_map, source_from_run
 
         crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
             opened_run = open_run(self.robot, self.run, space=self.space)
-            return select_elites(opened_run, self.elite, self.minimal, **crossing)
+            return source_from_run(opened_run, self.elite, self.minimal, **crossing)
         if self.run is not None:
             raise ValueError("give one of --run and --terrain")
-        robot, how = get_robot(self.robot or "anymal"), {"size_m": self.size, "scale_m": self.scale}
-        return select_map(self.terrain, robot, offset_m=self.offset, **how, **crossing)
+        return source_from_map(
+            self.terrain, get_robot(self.robot or "anymal"), size_m=self.size, scale_m=self.scale,
+            offset_m=self.offset, **crossing,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +177,8 @@ class ExportCommand(ControllerFlags, EliteFlags):
         from qd.search.directory import find_run
         from qd.workers.compute import Compute
 
-        making, robot = self.making, get_robot(self.robot or "anymal")
+        making = self.making
+        robot = get_robot(self.robot or "anymal")
         run = find_run(robot, self.run, published="never")
         make_pack(
             find_search(run, robot=self.robot, policy=self.policy, space=self.space),

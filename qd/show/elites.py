@@ -1,4 +1,4 @@
-"""Where the archive that is shown lies, which of its terrains, and who was searched."""
+"""The archive of a run, its terrains, and the controller that was searched."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,12 +30,20 @@ class EliteTerrain(NamedTuple):
     number: int
     genes: NDArray[np.float32]
     """Shape (num_genes,)."""
-    stem: str
-    """Name of files about it: ``elite-3`` or ``minimal-3``."""
-    label: str
-    """In words."""
+    cause: str
+    """What stops the robot; empty if nothing does, or nobody knows."""
     minimal: dict[str, Any] | None
-    """What is known of a minimal terrain."""
+    """Entry of a minimal terrain in ``minimal.json``."""
+
+    @property
+    def stem(self) -> str:
+        """Name of files about it: ``elite-3`` or ``minimal-3``."""
+        return f"{'minimal' if self.minimal else 'elite'}-{self.number}"
+
+    @property
+    def label(self) -> str:
+        """For people: ``elite 3 (ridge)``."""
+        return f"{'minimal terrain' if self.minimal else 'elite'} {self.number}" + f" ({self.cause})" * bool(self.cause)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +51,7 @@ class OpenedRun:
     """An archive, its robot, and the search that made it."""
 
     path: Path
-    """What was given: a run directory or an archive file."""
+    """A run directory or an archive file."""
     archive: Archive
     robot: RobotCfg
 
@@ -64,9 +72,9 @@ class OpenedRun:
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config."""
-        archive, cfg = self.archive, self.search()
+        cfg = self.search()
         if cfg is None:
-            return SHIPPED, FitnessCfg(penalties=archive.penalties, scales=archive.scales)
+            return SHIPPED, FitnessCfg(penalties=self.archive.penalties, scales=self.archive.scales)
         return cfg.policy, cfg.fitness
 
     def search(self) -> SearchCfg | None:
@@ -77,13 +85,14 @@ class OpenedRun:
         check_config(self.archive, cfg, self.folder)
         return cfg
 
-    def policy(self, given: str | None = None) -> str:
-        """The controller to cross with: the one given, or that of the search."""
+    def policy(self, named: str | None = None) -> str:
+        """The controller to cross with: the named one, or that of the search."""
         cfg = self.search()
-        if given is None and cfg is not None:
+        if named is None and cfg is not None:
             return find_policy(self.path, cfg, self.robot)
-        policy, searched = resolve_policy(given or SHIPPED, self.robot), self.archive.policy_sha256
-        if given is None and searched not in (None, digest := controller_hash(policy)):
+        policy = resolve_policy(named or SHIPPED, self.robot)
+        searched = self.archive.policy_sha256
+        if named is None and searched not in (None, digest := controller_hash(policy)):
             raise ValueError(
                 f"{self.path} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
                 f"{digest}): say with --policy which one to cross with"
@@ -91,24 +100,27 @@ class OpenedRun:
         return policy
 
     def suffix(self, policy: str) -> str:
-        """The ending of the names of what is made with a controller: empty for the search's, else such as ``-C-G``."""
-        searched, named = self.archive.policy_sha256, resolve_policy(self.as_searched()[0], self.robot)
-        same = is_same_controller(policy, named) if searched is None else controller_hash(policy) == searched
-        return "" if same else label_suffix(policy)
+        """Suffix of names of files about a controller's crossings: empty for the search's, else like ``-C-G``."""
+        searched = self.archive.policy_sha256
+        if searched is None:
+            is_searched = is_same_controller(policy, resolve_policy(self.as_searched()[0], self.robot))
+        else:
+            is_searched = controller_hash(policy) == searched
+        return "" if is_searched else label_suffix(policy)
 
     def certifiers(self) -> dict[str, str]:
-        """Files of the controllers that crossed its failing elites, as far as they are at hand, by their names.
+        """Files of the controllers that crossed its failing elites, by their names, as far as they exist.
 
         They are of the robot's panel, of the run, or beside a published run.
         """
-        archive, folder = self.archive, self.folder
-        names = dict(zip(archive.certifier_sha256, archive.certifiers, strict=True))
-        own = [*controllers_in(folder / CERTIFIERS_FOLDER).values(), str(folder.parent / f"{folder.name}.pt")]
-        files = [*controllers_in(self.robot.panel).values(), *own]
+        names = dict(zip(self.archive.certifier_sha256, self.archive.certifiers, strict=True))
+        folders = (self.robot.panel, self.folder / CERTIFIERS_FOLDER)
+        files = [file for folder in folders for file in controllers_in(folder).values()]
+        files.append(str(self.folder.parent / f"{self.folder.name}.pt"))
         return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
 
     def certifier(self, number: int) -> str | None:
-        """Name of the one of :meth:`certifiers` that crosses an elite most often; None if none has a certificate."""
+        """Name of the certifier that crosses an elite most often, of :meth:`certifiers`; None without a certificate."""
         return best_certifier(self.archive, number, self.certifiers())
 
     def minima(self) -> MinimalTerrains:
@@ -121,23 +133,23 @@ class OpenedRun:
     def terrains(self, elite: str = "", minimal: str | None = None) -> list[EliteTerrain]:
         """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
 
-        Without a number it is the worst elite. Labels name what stops the robot, where that is known.
+        Without a number it is the worst elite.
         """
-        archive, minima = self.archive, read_minimal(self.folder, self.archive)
-        half_width = self.robot.half_width
-        if minimal is not None:
-            minima = self.minima()
+        archive = self.archive
+        minima = read_minimal(self.folder, archive) if minimal is None else self.minima()
+        if minimal is not None and minima is not None:
             numbers = minima.choose(minimal, self.path)
-            known = [(minima.genes[n], f"minimal-{n}", f"minimal terrain {n}", minima.entry(n)) for n in numbers]
+            rows = [(minima.genes[number], minima.entry(number)) for number in numbers]
         else:
             if not elite and len(archive):
-                elite = str(rank(archive, self.space, minima, half_width=half_width).worst(1)[0])
+                ranking = rank(archive, self.space, minima, half_width=self.robot.half_width)
+                elite = str(ranking.worst(1)[0])
             numbers = choose_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
-            known = [(archive.genes[n], f"elite-{n}", f"elite {n}", None) for n in numbers]
-        causes = rank(archive, self.space, minima, half_width=half_width, numbers=numbers).causes
+            rows = [(archive.genes[number], None) for number in numbers]
+        causes = rank(archive, self.space, minima, half_width=self.robot.half_width, numbers=numbers).causes
         return [
-            EliteTerrain(n, genes, stem, label if cause in ("", UNCLEAR) else f"{label} ({cause})", entry)
-            for n, (genes, stem, label, entry), cause in zip(numbers, known, causes, strict=True)
+            EliteTerrain(number, genes, "" if cause == UNCLEAR else cause, entry)
+            for number, (genes, entry), cause in zip(numbers, rows, causes, strict=True)
         ]
 
 

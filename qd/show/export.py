@@ -56,7 +56,7 @@ def export_elites(
         return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=timestep, ground=ground)
 
     about = {
-        name: describe_elite(ranking, row, archive)
+        name: _describe_elite(ranking, row, archive)
         | ({"minimal": terrain.minimal} if terrain.minimal else {})
         | {"terrain": space.describe(terrain.genes)}
         for row, (name, terrain) in enumerate(terrains.items())
@@ -89,8 +89,9 @@ def export_pack(
     rows = {pack.terrains[index]["name"]: index for index in indices}
 
     def build(name: str) -> ExportedTerrain:
-        heights, genes = pack.heights[rows[name]], pack.genes[rows[name]]
-        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=pack_robot.physics_dt)
+        row = rows[name]
+        timestep = pack_robot.physics_dt
+        return ExportedTerrain(heights=pack.heights[row], name=name, genes=pack.genes[row], timestep=timestep)
 
     about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
     keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")
@@ -140,7 +141,7 @@ def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwri
     print(f"Controller: {out}")
 
 
-def describe_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
+def _describe_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, Any]:
     """An elite's verdict, cause, ending and numbers as JSON values: as found, and by 40 fresh episodes, if any."""
     elite = int(ranking.numbers[row])
     names = ("fitness", "collision_rate", "goal_rate", "fallen_rate", "episodes")

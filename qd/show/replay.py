@@ -79,7 +79,7 @@ class ReplaySource:
         return files
 
 
-def select_elites(
+def source_from_run(
     opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
 ) -> ReplaySource:
     """Elites of a run or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
@@ -108,7 +108,7 @@ def select_elites(
     )
 
 
-def select_map(
+def source_from_map(
     file: Path,
     robot: RobotCfg,
     *,

@@ -21,7 +21,7 @@ from qd.show.crossed import find_typical_episode, make_title
 from qd.show.elites import open_run
 from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
-from qd.show.replay import ReplaySource, save, select_elites, select_map
+from qd.show.replay import ReplaySource, save, source_from_map, source_from_run
 from results.make.common import runs_of_today
 from results.make.docs import PAPER, ROBOTS, least_minimum, read
 from results.make.search_noise import DESIGNS
@@ -38,7 +38,7 @@ CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "h
 def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]:
     """Four seconds about the failure of a robot's typical episode: 1.5 s, one at half speed, and half a second."""
     robot = get_robot(named)
-    source = select_map(FOLDER / file, robot)
+    source = source_from_map(FOLDER / file, robot)
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", controllers_in(robot.panel)[beside])[0]) if beside else None
     episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
@@ -61,7 +61,7 @@ def payload_source() -> ReplaySource | None:
     least = least_minimum("anymal", "payload")
     if least is None:
         return None
-    return select_elites(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
+    return source_from_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
 
 def course_source() -> ReplaySource | None:
@@ -70,7 +70,7 @@ def course_source() -> ReplaySource | None:
     if not (run / "archive.npz").exists():
         print(f"{run} is not here: the picture of a course stays as it is.")
         return None
-    return select_elites(open_run("anymal", run))
+    return source_from_run(open_run("anymal", run))
 
 
 def draw_noise() -> Figure:

@@ -22,7 +22,7 @@ from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import preset
 from qd.show.elites import open_run
-from qd.show.replay import select_elites
+from qd.show.replay import source_from_run
 from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine
@@ -179,7 +179,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     if args.pictures:
         for name in set(args.only) & set(PICTURES):
             opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
-            take_still(select_elites(opened), name)
+            take_still(source_from_run(opened), name)
         return {}
     prepare_output(out)
     origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()

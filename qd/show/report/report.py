@@ -60,9 +60,7 @@ def write_report(
     compared = None
     if tables is not None:
         file = without_machine(str(tables))
-        compared = compare_controllers(
-            read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256
-        )
+        compared = compare_controllers(read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256)
     content = collect_content(opened_run, ranking, minima, controller, is_searched=not suffix)
     heads, others = _choose_elites(ranking, num_elites)
     cases: dict[int, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""What the address of a page says is shown: read when a tab opens, and kept up to date while it is used."""
+"""What a tab shows, in its address: read when the tab opens, and kept up to date while it is used."""
 
 import math
 from contextlib import suppress
@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qsl, quote, urlencode
 
-_POSITION, _LOOK_AT = "initialCameraPosition", "initialCameraLookAt"  # viser's own: its page starts with that camera
+_POSITION = "initialCameraPosition"  # viser reads these two: its page starts with that camera
+_LOOK_AT = "initialCameraLookAt"
 _MINIMAL = "minimal"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Address:
-    """What a tab shows; None or False where its address does not say it."""
+    """What a tab shows; None or False where its address lacks it."""
 
     elite: int | None = None
     controller: str | None = None
@@ -44,8 +45,9 @@ class Address:
 
 
 def read_address(query: str) -> tuple[Address, list[str]]:
-    """What the address of a page says behind its question mark, and which parts of it mean nothing, in words."""
-    values, refused = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True)), []
+    """The address of a page behind its question mark, and a sentence for each value that is no number."""
+    values = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True))
+    refused = []
 
     def read(name: str, kind: type[int] | type[float]) -> Any:
         if name not in values:
@@ -56,7 +58,8 @@ def read_address(query: str) -> tuple[Address, list[str]]:
         refused.append(f"{name}={values[name]} in the address is no number that makes sense: it is left out.")
         return None
 
-    position, look_at = values.get(_POSITION), values.get(_LOOK_AT)
+    position = values.get(_POSITION)
+    look_at = values.get(_LOOK_AT)
     return Address(
         elite=read("elite", int),
         controller=values.get("controller"),

@@ -13,7 +13,7 @@ import viser
 from qd.show.recordings import Recordings
 from qd.show.view.meshes import robot_parts
 from qd.show.view.player import PlayerBar
-from qd.show.view.recorder import Progress, Recorder
+from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.scene import SKY, compute_first_view
 from qd.show.view.shown import Shared
 from qd.show.view.tab import Tab
@@ -90,7 +90,7 @@ class App:
         if tab is not None:
             tab.leave()
 
-    def show_progress(self, progress: Progress) -> None:
+    def show_progress(self, progress: TaskProgress) -> None:
         """Store a recording, and show all tabs how far it is."""
         if isinstance(progress.result, Recording):
             self._shared.recordings.store(progress.task, progress.result)

@@ -1,4 +1,4 @@
-"""What the viewer shows, as triangles: a terrain coloured by height, a robot's bodies, and arrows.
+"""Triangles that the viewer shows: a terrain coloured by height, a robot's bodies, and arrows.
 
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
@@ -60,10 +60,10 @@ def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: ND
 
 
 def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """All in one."""
+    """One mesh of several."""
     mesh = trimesh.util.concatenate(meshes)
     assert isinstance(mesh, trimesh.Trimesh)
-    _ = mesh.vertex_normals  # computed now, an export has them
+    _ = mesh.vertex_normals  # once computed, an export has them
     return mesh
 
 
@@ -81,7 +81,7 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
 
 
 def robot_parts(skeleton: Skeleton, robot: RobotCfg) -> list[Part]:
-    """All that is to be seen of a robot."""
+    """The visible shapes of a robot."""
     groups = dict[tuple[int, tuple[int, ...]], list[trimesh.Trimesh]]()
     for geom, touches in skeleton.touches.items():
         body = int(skeleton.model.geom_bodyid[geom]) - 1

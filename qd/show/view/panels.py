@@ -150,10 +150,7 @@ class CrossingPanel:
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
         names = tab.shared.show.opened_run.archive.penalties
-        series = [
-            uplot.Series(label=PENALTIES[name].label, stroke=PENALTIES[name].color, width=2.0)
-            for name in names
-        ]
+        series = [uplot.Series(label=PENALTIES[name].label, stroke=PENALTIES[name].color, width=2.0) for name in names]
         with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):
             look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
             nothing = (np.zeros(2),) * (1 + len(names))

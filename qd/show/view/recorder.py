@@ -17,7 +17,7 @@ _PREPARING = "the simulation is built; the very first one compiles its kernels, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class TaskProgress:
     """How far a task is."""
 
     task: Any
@@ -34,7 +34,7 @@ class _CancelledError(Exception):
     """The task was cancelled."""
 
 
-class Simulator:
+class RecordingWorker:
     """Works in the process: it does the task that is put in, and drops it when ``cancelled`` is set."""
 
     def __init__(self, cancelled: Event, num_terrains: int) -> None:
@@ -73,11 +73,11 @@ class Simulator:
 class Recorder:
     """Does the last request of each key, the oldest first; requests that are not begun are replaced."""
 
-    def __init__(self, *, build: Callable[[Event, int], Any] = Simulator) -> None:
+    def __init__(self, *, build: Callable[[Event, int], Any] = RecordingWorker) -> None:
         """The process imports ``build`` by its name, and calls it for what works there."""
         self.robot: Any = None
         """Robot of all tasks; set before the first one."""
-        self.report: Callable[[Progress], None] = lambda progress: None
+        self.report: Callable[[TaskProgress], None] = lambda progress: None
         """Called in another thread, at every step forward."""
         self._build = build
         self._cancelled = get_context("spawn").Event()
@@ -141,14 +141,14 @@ class Recorder:
                 if result is not None:
                     self._withdraw(task)  # other keys may have requested the same meanwhile
             if isinstance(result, Exception):
-                self.report(Progress(task=task, text=str(result), failed=True))
+                self.report(TaskProgress(task=task, text=str(result), failed=True))
             elif result is not None:
-                self.report(Progress(task=task, share=1.0, result=result))
+                self.report(TaskProgress(task=task, share=1.0, result=result))
 
     def _work_on(self, task: Any) -> Any:
         """Result of a task, its error, or None if it was cancelled."""
         if not self._is_ready:
-            self.report(Progress(task=task, text=_PREPARING))
+            self.report(TaskProgress(task=task, text=_PREPARING))
             self._worker.receive()  # it is ready
             self._is_ready = True
         self._worker.send(task, self.robot)
@@ -156,4 +156,4 @@ class Recorder:
             message, value = self._worker.receive()
             if message == "result":
                 return value
-            self.report(Progress(task=task, share=float(value)))
+            self.report(TaskProgress(task=task, share=float(value)))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from qd.show.recordings import CrossingRequest, Recordings
 from qd.show.view.meshes import Part
 from qd.show.view.playing import Crossing, trace_crossing
-from qd.show.view.recorder import Progress, Recorder
+from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.viewed import ViewedRun
 from sim.recording.recorder import Recording
 from sim.robots.skeleton import Skeleton
@@ -47,7 +47,7 @@ class ShownController:
             self.recording = self._shared.recordings.read(self.request)
         self._shared.recorder.request(self.request if self.recording is None else None, key=self._key)
 
-    def take(self, progress: Progress) -> bool:
+    def take(self, progress: TaskProgress) -> bool:
         """Take the recording, if it is done; returns whether the progress is of this controller's request."""
         if self.request is None or progress.task != self.request or self.recording is not None:
             return False

@@ -19,7 +19,7 @@ from qd.show.view.listing import count_endings
 from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
 from qd.show.view.player import PlayerBar
 from qd.show.view.playing import group_episodes, trace_paths
-from qd.show.view.recorder import Progress
+from qd.show.view.recorder import TaskProgress
 from qd.show.view.scene import Scene, View, compute_first_view, compute_overview
 from qd.show.view.shown import Shared, ShownController
 from qd.show.view.viewed import SEARCHED
@@ -196,7 +196,7 @@ class Tab:
             self._film = None
             self.panel.show_film("Cancelled.")
 
-    def _show_film_progress(self, progress: Progress) -> None:
+    def _show_film_progress(self, progress: TaskProgress) -> None:
         """Show how far the film is, and offer it when it is made."""
         if progress.result is not None:
             self._film = None
@@ -305,7 +305,7 @@ class Tab:
         self.scene.set_follow(follow)
         self.bar.show({"follow": follow})
 
-    def show_progress(self, progress: Progress) -> None:
+    def show_progress(self, progress: TaskProgress) -> None:
         """Show how far a recording or film is, and what it made, if this tab requested it."""
         if self._film is not None and progress.task is self._film:
             self._show_film_progress(progress)
@@ -338,9 +338,7 @@ class Tab:
         facts = filter(None, (f"elite {elite} of {len(self._archive):,}", show.listing.verdict(elite), conditions))
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         self.panel.show_elite(
-            f"<b>{escape(name)}</b><br>{' · '.join(facts)}",
-            has_minimal=minimal_genes is not None,
-            minimal=self.minimal,
+            f"<b>{escape(name)}</b><br>{' · '.join(facts)}", has_minimal=minimal_genes is not None, minimal=self.minimal
         )
         heights, ground = make_terrains(genes[None], show.opened_run.space)
         self.scene.set_terrain(heights[0], ground)

@@ -1,7 +1,6 @@
 """Films: the right episode and its seconds about the failure, and files that play; crossings are made up."""
 
 import io
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from PIL import Image
 from kernels.episode import Outcome
 from qd.show.commands import FilmCommand
 from qd.show.crossed import find_failure_time, find_typical_episode, make_title
-from qd.show.film import Shot, as_gif, follow, interpolate_pose, render_pictures
+from qd.show.film import Shot, as_gif, follow, interpolate_pose
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import open_context
@@ -117,35 +116,6 @@ def test_the_camera_follows_and_rises_where_the_ground_would_hide_the_robot(reco
     away = -np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
     sight = np.array(camera.target) + np.linspace(0, 3.0, 50)[:, None] * away
     assert (sight[:, 2] > surface_heights(np.float64(recording.heights[0]), sight[:, 0], sight[:, 1])).all()
-
-
-def test_pictures_show_poses_ghosts_and_touch_of_their_times(recording, anymal, monkeypatch):
-    rendered = []
-
-    class Stub(nullcontext):
-        def __init__(self, robot, heights, *, width, height, **look):
-            super().__init__(self)
-            self.picture = np.full((height, width, 3), 200, np.uint8)
-
-        def render(self, qpos, camera, *, ghost, ghost_name, touching, foot_force):
-            rendered.append((qpos, camera, ghost, ghost_name, foot_force))
-            return self.picture
-
-    monkeypatch.setattr("qd.show.film.Renderer", Stub)
-    recording.foot_force[:] = np.random.default_rng(0).normal(size=recording.foot_force.shape)
-    recording.base_position[0, 4, :, 1] = 5.0
-    other = replace(recording, base_position=recording.base_position + 1.0)
-    for beside in (None, ("C-G", other)):
-        rendered.clear()
-        shot, times = shot_of(recording, beside=beside), np.array([0.0, 1.0, 1.01, 9.0])
-        pictures = list(render_pictures(shot, anymal, times, (160, 90)))
-        assert {picture.shape for picture in pictures} == {(90, 160, 3)} and len(pictures) == 4
-        for frame, (qpos, camera, ghost, name, forces) in zip((0, 50, 50.5, 250), rendered, strict=True):
-            np.testing.assert_allclose(qpos, interpolate_pose(recording.qpos(0, 4), frame))
-            np.testing.assert_array_equal(forces, recording.foot_force[0, 4, int(frame + 0.5)])
-            assert abs(camera.target[0] - qpos[0]) < 0.4 and name == ("C-G" if beside else "")
-            if beside:
-                np.testing.assert_allclose(ghost, interpolate_pose(other.qpos(0, 4), frame))
 
 
 def test_a_gif_has_as_many_colours_as_its_size_allows():

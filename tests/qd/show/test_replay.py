@@ -18,7 +18,7 @@ from qd.show.commands import ExportCommand, ReplayCommand
 from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import Recordings
-from qd.show.replay import compute_numbers, describe, replay, select_elites, select_map
+from qd.show.replay import compute_numbers, describe, replay, source_from_map, source_from_run
 from qd.show.view.viewed import open_viewed_run
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
@@ -66,7 +66,7 @@ def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_pa
 
 
 def lines_of(opened_run, recording, policy=None):
-    lines = describe(select_elites(opened_run, policy=policy), 0, recording).splitlines()
+    lines = describe(source_from_run(opened_run, policy=policy), 0, recording).splitlines()
     assert max(map(len, lines)) <= 80
     return [" ".join(line.split()) for line in lines]
 
@@ -144,15 +144,17 @@ def test_a_map_is_never_overwritten(anymal):
         Path(folder).mkdir()
         np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
         with pytest.raises(ValueError, match="size"):
-            select_map(Path(folder) / "hill.npz", anymal)
-        assert select_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [f"{folder}-hill.npz-anymal"]
+            source_from_map(Path(folder) / "hill.npz", anymal)
+        assert source_from_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
+            f"{folder}-hill.npz-anymal"
+        ]
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}
     with pytest.raises(ValueError, match="out"):
-        replay(select_map(Path("hill.png"), anymal), out=Path("hill.png"))
+        replay(source_from_map(Path("hill.png"), anymal), out=Path("hill.png"))
     with pytest.raises(ValueError, match=r"none\.pt"):
-        replay(select_map(Path("hill.png"), anymal, policy="none.pt"))
+        replay(source_from_map(Path("hill.png"), anymal, policy="none.pt"))
     assert {path.name: path.read_bytes() for path in Path().glob("hill.*")} == before
 
 
@@ -202,7 +204,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
         ]
 
     monkeypatch.setattr(Recordings, "record", record)
-    source = select_elites(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
+    source = source_from_run(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")
     (report,) = replay(source)
     np.testing.assert_array_equal(wanted[0].terrain.genes[0], genes[number])
     assert (wanted[0].policy, wanted[0].replicas, wanted[0].seed) == (str(opened_run.robot.policy_file), 2, 3)

@@ -13,7 +13,7 @@ from qd.faults.minimise.minimise import MinimalTerrains
 from qd.show.crossed import find_failure_time, find_typical_episode
 from qd.show.recordings import Recordings, request_elite
 from qd.show.view.app import App
-from qd.show.view.recorder import Progress
+from qd.show.view.recorder import TaskProgress
 from qd.show.view.tab import Tab
 from qd.show.view.viewed import open_viewed_run
 from sim.recording.file import read_recording
@@ -268,14 +268,14 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
     wanted = shown.asked[-1]
     assert (wanted.label, wanted.replicas) == ("elite 7 of anymal", 20)
     assert not tab.scene.robot.visible and not tab.bar.shown["enabled"]
-    shown.do((shown.app.show_progress, Progress(task=wanted, text="", share=0.4)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", share=0.4)))
     assert tab.bar.shown["task"] == "Recording 20 episodes of base: 40%" and tab.bar.shown["share"] == 0.4
     other = dataclasses.replace(wanted, replicas=8)
-    shown.do((shown.app.show_progress, Progress(task=other, text="no", failed=True)))
+    shown.do((shown.app.show_progress, TaskProgress(task=other, text="no", failed=True)))
     assert tab.bar.shown["share"] == 0.4  # of what is not shown nothing is said
-    shown.do((shown.app.show_progress, Progress(task=wanted, text="it <broke>", failed=True)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="it <broke>", failed=True)))
     assert status(tab) == "No crossing: it &lt;broke&gt;" and tab.bar.shown["share"] is None
-    shown.do((shown.app.show_progress, Progress(task=wanted, text="", result=recording)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", result=recording)))
     assert status(tab).startswith("base collision") and tab.scene.robot.visible
 
 
@@ -285,13 +285,13 @@ def test_a_film_is_made_and_offered_or_cancelled(shown, tmp_path, monkeypatch):
     shown.do((tab.film,))
     wanted = wanted_of(shown.recorder)[-1]
     assert wanted.keywords["out"].name == f"elite-0-base-episode-{tab.replica + 1}.mp4"
-    shown.do((shown.app.show_progress, Progress(task=wanted, text="", share=0.4)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", share=0.4)))
     assert "40%" in tab.panel.film_status.content
     shown.do((tab.cancel_film,), (tab.film,))
     shown.recorder.cancel.assert_called_once_with(wanted)
     made = tmp_path / "film.mp4"
     made.write_bytes(bytes(1_500_000))
-    shown.do((shown.app.show_progress, Progress(task=wanted_of(shown.recorder)[-1], text="", result=made)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted_of(shown.recorder)[-1], text="", result=made)))
     assert "film.mp4 (1.5 MB)" in tab.panel.film_status.content
 
 

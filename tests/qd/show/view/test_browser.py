@@ -99,8 +99,7 @@ def test_keys_and_the_bar_move_time(opened):
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "ratio"),
-    [(390, 844, 3), (390, 844, 1), (1100, 760, 2), (1366, 768, 1), (1920, 1080, 1)],
+    ("width", "height", "ratio"), [(390, 844, 3), (390, 844, 1), (1100, 760, 2), (1366, 768, 1), (1920, 1080, 1)]
 )
 def test_the_player_and_the_scene_are_in_sight_in_windows_of_all_sizes(opened, width, height, ratio):
     page = opened("?elite=0&t=1", width, height, ratio)
