@@ -29,7 +29,6 @@ from sim.terrains.terrains import Terrains
 
 _ENOUGH = 200  # failing episodes that scales are means over; if there are fewer, all episodes are
 _MAX_ROUNDS = 5  # how often as many terrains as at first are crossed
-_FEW = 30  # episodes with a penalty; fewer are said beside its scale
 _HEIGHTS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, MOST_HEIGHT)  # to choose from [m]
 _CROSSED = 0.8  # share of episodes that should reach the goal
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
@@ -94,7 +93,9 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
         print(f"{', '.join(absent)} never occurred: its scale is 1.")
         report["scales"] |= dict.fromkeys(absent, 1.0)
         absent = []
-    _print_scales(report)
+    print(f"Means over {report['scaled_by']} episodes, {report['failing_episodes']} of {report['episodes']} fail:")
+    for name, scale in report["scales"].items():
+        print(f"  {name:<14}{scale:12.4f}  (in {report['share_of_episodes_with'][name]:.1%} of them)")
     write_atomically(out, to_json(report))
     print(f"Written to {out}.")
     if absent:
@@ -126,16 +127,3 @@ def measure_scales(result: RolloutResult) -> dict[str, Any]:
         "scales": {name: mean for name, mean in means.items() if mean},
         "share_of_episodes_with": dict(zip(result.penalty_names, shares, strict=True)),
     }
-
-
-def _print_scales(report: dict[str, Any]) -> None:
-    failing = report["failing_episodes"]
-    valid = report["episodes"] - report["invalid_episodes"]
-    count = failing if report["scaled_by"] == "failing" else valid
-    print(
-        f"Means over {count} {report['scaled_by']} episodes on {report['terrains']} terrains ({failing} of {valid} "
-        "valid episodes did not reach the goal):"
-    )
-    for name, scale in report["scales"].items():
-        hits = round(report["share_of_episodes_with"][name] * count)
-        print(f"  {name:<14}{scale:12.4f}{f'  (in {hits} episodes only)' if hits < _FEW else ''}")

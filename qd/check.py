@@ -23,7 +23,6 @@ from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, stand, standing_mistakes
 from sim.robots.user import describe_inferred
-from sim.rollout import RolloutResult
 from sim.terrains.doses import parse_doses
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
@@ -91,21 +90,19 @@ def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, 
     while (standing := stand(larger, device=device, seconds=seconds)).overflowed:
         if larger.nconmax >= _MAX_CONTACTS:
             raise ValueError(
-                f"robot '{robot.name}' has more than {larger.nconmax} contacts, expected fewer: let fewer of its geoms "
-                "touch the ground"
+                f"robot '{robot.name}' has more than {larger.nconmax} contacts: let fewer geoms touch anything"
             )
         larger = replace(larger, nconmax=2 * larger.nconmax)
     if larger is robot:
         return robot, standing
     larger = replace(robot, nconmax=max(robot.nconmax, int(np.ceil(1.5 * standing.contacts))))
-    print(f"It had too little room for contacts: it needs nconmax = {larger.nconmax}", end="")
     file = robot.settings_file
     if file is None or file.suffix != ".toml":
-        print(": write it into its settings.", flush=True)
-        return larger, standing
-    text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
-    write_atomically(file, f"nconmax = {larger.nconmax}\n{text}".encode())
-    print(f", as {file} says now.", flush=True)
+        print(f"It has too little room for contacts: write nconmax = {larger.nconmax} into its settings.", flush=True)
+    else:
+        text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
+        write_atomically(file, f"nconmax = {larger.nconmax}\n{text}".encode())
+        print(f"It had too little room for contacts: {file} now has nconmax = {larger.nconmax}.", flush=True)
     return larger, standing
 
 
@@ -117,22 +114,16 @@ def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, fl
     """
     flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
     engines: dict[str, Engine] = {"searched": "search", "mujoco_c": "mujoco_c_search"}
-    return {
-        name: _walked(crosser.cross(policy, flat, replicas=_WALKS, engine=engine, label="flat ground", invalid_ok=True))
-        for name, engine in engines.items()
-    }
-
-
-def _walked(result: RolloutResult) -> dict[str, float]:
-    valid = ~result.invalid
-    distance = np.linalg.norm(result.final_position[valid][:, :2] - CrossingCfg.start, axis=1)
-    numbers = {
-        "goal": result.reached_goal[valid],
-        "speed": distance / result.duration_s[valid],
-        "height": result.final_position[valid][:, 2],
-    }
-    means = {name: float(values.mean()) if valid.any() else 0.0 for name, values in numbers.items()}
-    return {"episodes": int(valid.sum()), **means}
+    walks = {}
+    for name, engine in engines.items():
+        result = crosser.cross(policy, flat, replicas=_WALKS, engine=engine, label="flat ground", invalid_ok=True)
+        valid = ~result.invalid
+        end = result.final_position[valid]
+        speed = np.linalg.norm(end[:, :2] - CrossingCfg.start, axis=1) / result.duration_s[valid]
+        numbers = {"goal": result.reached_goal[valid], "speed": speed, "height": end[:, 2]}
+        means = {key: float(values.mean()) if valid.any() else 0.0 for key, values in numbers.items()}
+        walks[name] = {"episodes": int(valid.sum()), **means}
+    return walks
 
 
 def _report_walk(robot: RobotCfg, walks: dict[str, dict[str, float]]) -> bool:

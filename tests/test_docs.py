@@ -41,8 +41,8 @@ def test_pages_are_short_and_readme_leads_to_each():
 def test_commands_are_taken(line):
     program, *flags = pages.run_by_make(shlex.split(line)) if line.startswith("make") else shlex.split(line)
     if program.endswith("faultline") and "--help" not in flags:
-        module, _, name = COMMANDS[flags[0]].where.partition(":")
-        tyro.cli(getattr(importlib.import_module(module), name), args=flags[1:])
+        module = importlib.import_module(COMMANDS[flags[0]].module)
+        tyro.cli(getattr(module, f"{flags[0].capitalize()}Command"), args=flags[1:])
 
 
 @pytest.mark.parametrize("page", PAGES)

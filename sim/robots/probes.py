@@ -23,6 +23,7 @@ from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
 _BUNDLE = 8  # strips
+_vec3: Any = wp.vec3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,8 +299,7 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
 
 
 def _transform_points(pose: Any, strip: Strip) -> list[Any]:
-    vec3: Any = wp.vec3
-    return [wp.transform_point(pose, vec3(*centre)) for centre in strip.centres]
+    return [wp.transform_point(pose, _vec3(*centre)) for centre in strip.centres]
 
 
 def _bundle_strips(body: Sequence[int]) -> list[int]:

@@ -16,13 +16,12 @@ from kernels.penalties import PENALTIES
 from sim.controllers.spec import run_file
 from sim.device import host_device
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
-from sim.robots.compiled import PER_JOINT, file_problems
+from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, read_robot_file
 from sim.robots.elements import joint_names, mj
 from sim.robots.model import make_builder
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import RobotCfg
-from sim.robots.robot_file import RobotFile, read_robot_file
 from sim.robots.shipped import ROBOTS
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
