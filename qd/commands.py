@@ -102,9 +102,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:
             policy = None
-            cfg, robot = start_search(
-                self.robot, self.policy, compute=compute, size=self.preset, space=self.space, height=self.height
-            )
+            flags = {"size": self.preset, "height": self.height, "compute": compute}
+            cfg, robot = start_search(self.robot, self.policy, self.space, **flags)
         elif self.run_dir or self.height is not None:
             flag = "--run-dir" if self.run_dir else "--height"
             raise ValueError(f"--resume goes on with a run as it is, got {flag} too: leave it out")

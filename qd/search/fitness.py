@@ -125,7 +125,8 @@ def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Ev
     statistics of its valid episodes: it may turn out to be valid when it is crossed again. Without a valid episode
     there are equal ratios, no end position (NaN) and otherwise zeros.
     """
-    penalties = _scaled_penalties(result, cfg)
+    columns = [result.penalty_names.index(name) for name in cfg.penalties]
+    penalties = np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
     counted = ~invalid
     mean = _mean(penalties, counted)
@@ -135,9 +136,9 @@ def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Ev
         ratios=terrain_ratios(penalties, counted),
         penalty_mean=mean,
         penalty_std=np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted)),
-        collision_rate=_rate(result.base_collision, counted),
-        goal_rate=_rate(result.reached_goal, counted),
-        fallen_rate=_rate(result.fallen, counted),
+        collision_rate=_mean(result.base_collision, counted),
+        goal_rate=_mean(result.reached_goal, counted),
+        fallen_rate=_mean(result.fallen, counted),
         end_position=typical_ends(result, counted),
         invalid_episodes=invalid.sum(axis=1),
         episodes=np.full(len(invalid), invalid.shape[1]),
@@ -202,18 +203,7 @@ def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[n
     return np.where(count[:, None] > 0, ends, np.nan).astype(np.float32)
 
 
-def _scaled_penalties(result: RolloutResult, cfg: FitnessCfg) -> NDArray[np.float64]:
-    """Penalties of ``cfg`` divided by their scales, shape (T, R, P)."""
-    columns = [result.penalty_names.index(name) for name in cfg.penalties]
-    return np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
-
-
-def _mean(values: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Mean over the valid episodes of values of shape (T, R, P); zeros where there are none."""
-    counted = np.where(valid[:, :, None], values, 0.0)
-    return counted.sum(axis=1) / np.maximum(valid.sum(axis=1), 1)[:, None]
-
-
-def _rate(flags: NDArray[np.bool_], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Share of the valid episodes, shape (T, R), that have a flag; zeros where there are none."""
-    return (np.asarray(flags, dtype=bool) & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
+def _mean(values: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean over the valid episodes of values of shape (T, R, ...); zeros where there are none."""
+    valid = valid.reshape(*valid.shape, *[1] * (values.ndim - 2))
+    return np.where(valid, values, 0.0).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)

@@ -17,7 +17,8 @@ from sim.terrains.spaces.base import clipped
 _STATISTICS = ("ratios", "penalty_mean", "penalty_std")
 _RATES = ("collision_rate", "goal_rate", "fallen_rate")
 _COUNTS = ("invalid_episodes", "episodes", "iteration")
-_FIELDS = ("genes", *_STATISTICS, *_RATES, *_COUNTS, "end_position")
+FIELDS = ("genes", *_STATISTICS, *_RATES, *_COUNTS, "end_position")
+"""What an archive has of a terrain beside solution, objective and cell."""
 
 
 def make_grid(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:
@@ -46,7 +47,7 @@ def grid_rows(
     solutions: NDArray[np.float32], terrains: Evaluation, iteration: NDArray[np.int64] | int
 ) -> dict[str, NDArray[Any]]:
     """Terrains as an archive takes them, of unclipped genes (T, num_genes), with the iteration that found each."""
-    columns = {name: getattr(terrains, name) for name in _FIELDS if name not in ("genes", "iteration")}
+    columns = {name: getattr(terrains, name) for name in FIELDS if name not in ("genes", "iteration")}
     return columns | {
         "solution": solutions,
         "objective": terrains.fitness,
@@ -54,11 +55,3 @@ def grid_rows(
         "genes": clipped(solutions),
         "iteration": np.broadcast_to(iteration, len(solutions)),
     }
-
-
-def read_elites(grid: GridArchive) -> dict[str, NDArray[Any]]:
-    """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""
-    data: Any = grid.data()
-    order = np.lexsort((data["index"], -data["objective"]))
-    elites = {name: data[name][order] for name in _FIELDS}
-    return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}

@@ -1,10 +1,9 @@
 """The search: ask for terrains, let robots cross them, evaluate, tell the emitters, save."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +12,16 @@ from qd.search.archive import Archive
 from qd.search.directory import Metrics, RunDirectory, claimed
 from qd.search.fitness import evaluate_rollout
 from qd.search.progress import Bar, describe_iteration, describe_search
-from qd.search.results import build_archive, describe_metrics, read_written, write_results
+from qd.search.results import (
+    build_archive,
+    compute_last_tenth,
+    describe_metrics,
+    find_last_iteration,
+    read_written,
+    write_results,
+)
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg
-from qd.search.stopping import compute_last_tenth, find_last_iteration
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import refuse_all_invalid
@@ -26,7 +31,6 @@ from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import get_space, is_own
 from sim.terrains.terrains import Terrains
 
@@ -43,7 +47,7 @@ def search(
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
     It ends earlier once its last tenth brought a share of the elites below ``until``
-    (:func:`qd.search.stopping.compute_last_tenth`); robots then still cross what it asked for, and it settles. Nothing
+    (:func:`qd.search.results.compute_last_tenth`); robots then still cross what it asked for, and it settles. Nothing
     is written before the simulation is built. Whatever stops a search, all finished iterations are saved. ``robot`` is
     given if it is not shipped, ``policy`` if the controller lies elsewhere than ``cfg`` says. The archive is a judged
     one if it was judged and nothing was left to do.
@@ -81,7 +85,7 @@ def search(
                 with open_pipeline(crossing) as pipeline:
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
                     with Bar(f"iteration {done + 1}/{last}: compiling and evaluating", last, done) as bar:
-                        _run_iterations(cfg, space, run, scheduler, metrics, pipeline, bar, until)
+                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
                 again = _command_to_resume(path, robot, policy, space.name, until)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
@@ -104,27 +108,8 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, unt
     return command_line("archive", resume=path, until=until, **code)
 
 
-class _Stopwatch:
-    """Adds up the time of blocks of code."""
-
-    seconds = 0.0
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        began = time.perf_counter()
-        yield
-        self.seconds += time.perf_counter() - began
-
-
 def _run_iterations(
-    cfg: SearchCfg,
-    space: TerrainSpace,
-    run: RunDirectory,
-    scheduler: Scheduler,
-    metrics: Metrics,
-    pipeline: Pipeline,
-    bar: Bar,
-    until: float | None,
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar, until: Any
 ) -> None:
     """Runs the iterations that are left, and saves each.
 
@@ -132,6 +117,7 @@ def _run_iterations(
     those of the other groups. The order is fixed, and a checkpoint holds what each group has asked for: a search that
     goes on where it was stopped is the same as one that was not.
     """
+    space = get_space(cfg.space, cfg.space_sha256)
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 
@@ -150,16 +136,16 @@ def _run_iterations(
     for group in range(num_groups):
         put(ask(group, len(metrics) + 1), group, len(metrics) + 1)
     while (iteration := len(metrics) + 1) <= last:
-        emitters = _Stopwatch()
         results, evaluations = [], []
-        num_new = 0
+        num_new, search_s = 0, 0.0
         for group in range(num_groups):
             result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
             refuse_all_invalid(result)
             evaluation = evaluate_rollout(result, cfg.cells, cfg.fitness)
-            with emitters.running():
-                num_new += scheduler.tell(evaluation, iteration, group)
-                genes = ask(group, iteration + 1)
+            emitters_began = time.perf_counter()
+            num_new += scheduler.tell(evaluation, iteration, group)
+            genes = ask(group, iteration + 1)
+            search_s += time.perf_counter() - emitters_began
             put(genes, group, iteration + 1)
             results.append(result)
             evaluations.append(evaluation)
@@ -168,7 +154,7 @@ def _run_iterations(
         ended = time.perf_counter()
         wall_s = ended - began  # from the end of the iteration before, so saving counts
         began = ended
-        row |= {"search_s": emitters.seconds, "terrains": num_new, "wall_s": wall_s}
+        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s}
         row["episodes_per_s"] = row["episodes"] / wall_s
         if (status := pipeline.status()) is not None:
             row |= status._asdict()

@@ -1,4 +1,4 @@
-"""What a search leaves: rows of metrics, the archive, numbers and figures."""
+"""What a search has found, when it ends by that, and what it leaves: metrics, archive, numbers and figures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,6 +18,8 @@ from sim.files.atomic import to_json, write_atomically
 from sim.files.command import say
 from sim.rollout import RolloutResult
 
+UNTIL_FROM = 20
+"""Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
 _SETTINGS = (
     "robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
     "collision_bit",
@@ -64,6 +66,34 @@ def describe_metrics(
         "rollout_s": float(result.wall_s),
         "mean_duration_s": float(result.duration_s.mean()),
     }
+
+
+def find_last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -> int:
+    """The iteration that ends a search, by the metrics alone: so a search that goes on ends where it would have.
+
+    Behind the one whose last tenth brought too little, robots cross what it asked for, and then all settles. A search
+    that went on past that end is judged anew.
+    """
+    ends = (
+        row["iteration"] + 1 + cfg.scheduler.settling
+        for row in metrics
+        if until is not None and row["last_tenth"] is not None and row["last_tenth"] < until
+    )
+    return min(cfg.iterations, next((end for end in ends if end >= len(metrics)), cfg.iterations))
+
+
+def compute_last_tenth(archive: Archive, metrics: Metrics) -> float | None:
+    """Share of the elites to stay that were found in the last tenth of the iterations which crossed anything new.
+
+    Elites count by their chance to stay in their cells (:func:`qd.search.pool.chance_to_stay`). None without elites,
+    and of fewer than 20 such iterations.
+    """
+    exploring = [row["iteration"] for row in metrics if row["terrains"]]
+    if len(exploring) < UNTIL_FROM or not len(archive):
+        return None
+    chance = chance_to_stay(archive, archive.cells)
+    late = archive.iteration >= exploring[-(len(exploring) // 10)]
+    return float(chance[late].sum() / chance.sum())
 
 
 def read_written(run: RunDirectory, archive: Archive) -> Archive | None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, select_terrains
-from qd.search.grid import grid_rows, make_grid, read_elites
+from qd.search.grid import FIELDS, grid_rows, make_grid
 from qd.search.methods.base import Method, Setup, Told
 from qd.search.methods.registry import METHODS
 from qd.search.pool import Pool
@@ -151,4 +151,7 @@ class Scheduler:
 
     def elites(self) -> dict[str, NDArray[Any]]:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""
-        return read_elites(self._archive)
+        data: Any = self._archive.data()
+        order = np.lexsort((data["index"], -data["objective"]))
+        elites = {name: data[name][order] for name in FIELDS}
+        return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}

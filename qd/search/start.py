@@ -9,23 +9,12 @@ from sim.terrains.spaces.registry import at_height, load_space, space_at
 
 
 def start_search(
-    robot: str | None,
-    policy: str | None = None,
-    *,
-    compute: Compute,
-    size: str = "small",
-    space: str | None = None,
-    height: float | None = None,
+    robot: str | None, policy: str | None, space: str | None, *, size: str, height: float | None, compute: Compute
 ) -> tuple[SearchCfg, RobotCfg]:
-    """Settings of a new search, and its robot, which is checked and has penalty scales then.
+    """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
 
-    Args:
-        robot: Name or settings file, as ``--robot`` takes it.
-        policy: Controller, as ``--policy`` takes it; the robot's own if None.
-        compute: Where a robot without penalty scales is calibrated.
-        size: Name of a preset.
-        space: Terrain space, as ``--space`` takes it; the paper's if None.
-        height: Largest height of a bump [m]; the one that fits the robot if None.
+    Robot, controller and space are as flags take them. ``height`` is the largest one of a bump [m]; None is that which
+    fits the robot.
     """
     terrain_space = load_space(space)
     if height is not None:

@@ -72,11 +72,6 @@ class Setup:
         """A stream of the search's seed: 0 and 1 are those of archives, 2 and up of emitters, then the surrogate's."""
         return np.random.SeedSequence(self.seed, spawn_key=(index,))
 
-    @property
-    def streams(self) -> dict[int, np.random.SeedSequence]:
-        """The stream of each of the method's emitters by its number."""
-        return {emitter: self.stream(2 + emitter) for emitter in self.emitters}
-
 
 class Told(NamedTuple):
     """Terrains that robots have crossed for one group of emitters, whichever method asked for them."""
@@ -108,7 +103,7 @@ class Method:
         """``cfg`` has all settings of the search, those of :attr:`Cfg` among them."""
         self.batch_size, self.emitters = int(cfg.batch_size), setup.emitters
         self._space = setup.space.name, setup.space.sha256  # a checkpoint holds no code
-        self.sources = {emitter: self._make_source(cfg, setup, stream) for emitter, stream in setup.streams.items()}
+        self.sources = {number: self._make_source(cfg, setup, setup.stream(2 + number)) for number in setup.emitters}
 
     def _make_source(self, cfg: Any, setup: Setup, stream: np.random.SeedSequence) -> Any:
         """What asks for one emitter; None if the method asks for all of them itself."""
