@@ -47,10 +47,7 @@ def test_every_reachable_cell_is_hit_by_a_point_in_its_middle(num_ratios, interv
         # 1.0 is in the last interval, so this one is reachable as it is
         ([0.0, 0.0, 1.0, 0.0, 0.0], [0, 0, 9, 0, 0]),
         # every ratio one rounding step below its upper edge, indices sum to 5: up on the ratio nearest its edge
-        (
-            [np.nextafter(0.2, 0), np.nextafter(0.2, 0) - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12],
-            [2, 1, 1, 1, 1],
-        ),
+        ([np.nextafter(0.2, 0), np.nextafter(0.2, 0) - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12, 0.2 - 1e-12], [2, 1, 1, 1, 1]),
         # a knife edge inside the set stays where it is: .3 opens its interval
         ([0.3, 0.25, 0.15, 0.15, 0.15], [3, 2, 1, 1, 1]),
     ],
