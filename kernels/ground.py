@@ -18,9 +18,9 @@ NUM_PATCHES = ROWS * COLS
 """Genes of a map: the first row of patches, at y = 0 m to 2 m, comes first."""
 PATCHES = (ROWS, COLS)
 """Shape of a map."""
-LEAST_FRICTION = wp.constant(0.15)
+MIN_FRICTION = wp.constant(0.15)
 """Factor of a gene of -1; a gene of 1 changes nothing."""
-LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.06)
+MIN_TIME_CONSTANT_S, MAX_TIME_CONSTANT_S = wp.constant(0.01), wp.constant(0.06)
 """Limits of a soft patch [s]: of a gene just above -1, and of 1. A gene of -1 is firm ground."""
 FIRM = wp.constant(0.0)
 """Time constant of ground that leaves contacts as stiff as the robot's file has them."""
@@ -56,7 +56,7 @@ def _decode_friction_kernel(genes: wp.array2d[float], friction_out: wp.array3d[f
     """Grid (num_terrains, 4, 8)."""
     t, row, col = wp.tid()
     missing = 1.0 - _share(genes[t, row * COLS + col])
-    friction_out[t, row, col] = 1.0 - missing * (1.0 - LEAST_FRICTION)
+    friction_out[t, row, col] = 1.0 - missing * (1.0 - MIN_FRICTION)
 
 
 @wp.kernel
@@ -66,7 +66,7 @@ def _decode_softness_kernel(genes: wp.array2d[float], time_constant_out: wp.arra
     share = _share(genes[t, row * COLS + col])
     tau = FIRM
     if share > 0.0:
-        tau = LEAST_TIME_CONSTANT_S * wp.pow(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S, share)
+        tau = MIN_TIME_CONSTANT_S * wp.pow(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S, share)
     time_constant_out[t, row, col] = tau
 
 

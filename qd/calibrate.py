@@ -22,14 +22,14 @@ from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.base import MOST_HEIGHT
+from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
 _ENOUGH = 200  # failing episodes that scales are means over; if there are fewer, all episodes are
 _MAX_ROUNDS = 5  # how often as many terrains as at first are crossed
-_HEIGHTS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, MOST_HEIGHT)  # to choose from [m]
+_HEIGHTS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, MAX_HEIGHT)  # to choose from [m]
 _CROSSED = 0.8  # share of episodes that should reach the goal
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
 

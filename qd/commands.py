@@ -55,8 +55,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Directory of a new run; runs/<robot>-<preset>-<seed>, numbered if that exists."""
     space: str | None = None
     """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
-    file.py:CLASS; behind any of them +friction, +softness, and conditions: +payload, +motors, +delay, +lag, +noise,
-    +push, +grip. super_gaussian if left out."""
+    file.py:CLASS; behind any of them +friction, +softness, and conditions: {conditions}. super_gaussian if left
+    out."""
     height: float | None = None
     """Lowers the terrains: the largest height of a bump [m], at most 0.25, and everything else alike. If left out, 0.25
     for shipped robots; for yours the height of the penalty scales: about 80 % of hard-random terrains are crossed."""
@@ -72,6 +72,13 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Weight of u in the fitness, the share of episodes without base collision; u is 0 if none collided."""
     intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
     """Intervals of each ratio."""
+
+    @staticmethod
+    def help_values() -> dict[str, str]:
+        """Names of conditions."""
+        from sim.terrains.conditions.base import CONDITIONS
+
+        return {"conditions": ", ".join(f"+{name}" for name in CONDITIONS)}
 
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:
@@ -329,10 +336,9 @@ class DoseCommand(RobotFlag, WorkerFlags):
     """Controllers, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; base=shipped if left
     out."""
     elements: tuple[str, ...] = ()
-    """Obstacles: stairs_up, stairs_down, step_up, step_down, sill, rail, pallet, ramp_up, ramp_down, cross_slope,
-    ditch, beam, stones, rubble; grounds: friction, softness; conditions on level ground: payload, motors, delay, lag,
-    noise, push. All but the conditions if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond
-    what the space course has."""
+    """Obstacles: {obstacles}; grounds: friction, softness; conditions on level ground: {conditions}. All but the
+    conditions if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond what the space course
+    has."""
     at: tuple[str, ...] = ()
     """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
     resolved: bool = False
@@ -346,6 +352,16 @@ class DoseCommand(RobotFlag, WorkerFlags):
     out: Path | None = None
     """File for the numbers; runs/<robot>-dose/dose.json, with contact resolved dose-resolved.json. The figure is
     written beside it as .png."""
+
+    @staticmethod
+    def help_values() -> dict[str, str]:
+        """Names of doses."""
+        from sim.terrains.conditions.base import CONDITIONS
+        from sim.terrains.elements.base import ELEMENTS
+
+        obstacles = (name for element in ELEMENTS.values() for name in element.doses)
+        conditions = (name for name, condition in CONDITIONS.items() if condition.dose)
+        return {"obstacles": ", ".join(obstacles), "conditions": ", ".join(conditions)}
 
     def execute(self) -> None:
         """Measures."""

@@ -19,7 +19,7 @@ from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import identity, load_space, space_at
+from sim.terrains.spaces.registry import load_space, space_at, space_key
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
@@ -61,7 +61,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     settings = {
         **dump_settings(cfg, robot),
         "elites": elites.archives,
-        "spaces": list(dict.fromkeys(identity(space.name, space.sha256) for space in elites.spaces)),
+        "spaces": list(dict.fromkeys(space_key(space.name, space.sha256) for space in elites.spaces)),
     }
     if saved is not None:
         check_resumed(run_dir, saved, settings)

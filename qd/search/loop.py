@@ -31,7 +31,7 @@ from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import get_space, is_own
+from sim.terrains.spaces.registry import get_space, is_user_space
 from sim.terrains.terrains import Terrains
 
 
@@ -103,7 +103,7 @@ def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, unt
     code = {
         "robot": robot.spec if robot.settings_file else None,
         "policy": policy if ControllerSpec.parse(policy).runs_code else None,
-        "space": space if is_own(space) else None,
+        "space": space if is_user_space(space) else None,
     }
     return command_line("archive", resume=path, until=until, **code)
 

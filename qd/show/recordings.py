@@ -24,7 +24,7 @@ from sim.recording.recorder import Recording, make_recording
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.terrains.ground import GroundMaps
-from sim.terrains.spaces.registry import get_space, identity
+from sim.terrains.spaces.registry import get_space, space_key
 from sim.terrains.terrains import Terrains
 
 FOLDER = RUNS / "recordings"
@@ -49,7 +49,7 @@ class CrossingRequest:
     def __post_init__(self) -> None:
         (digest,) = self.terrain.digests()
         space = self.terrain.space
-        object.__setattr__(self, "terrain_key", f"{identity(space.name, space.sha256)} {digest.hex()}")
+        object.__setattr__(self, "terrain_key", f"{space_key(space.name, space.sha256)} {digest.hex()}")
 
     @property
     def lot_key(self) -> tuple[Any, ...]:

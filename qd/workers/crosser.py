@@ -29,7 +29,7 @@ from sim.robots.find import get_robot
 from sim.robots.identity import robot_identity
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import identity
+from sim.terrains.spaces.registry import space_key
 from sim.terrains.terrains import Terrains
 
 _LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under way
@@ -150,7 +150,7 @@ class Crosser:
         if self._cache is None or controller is None:
             return None
         settings = [robot_identity(self.robot), self.robot.penalties, controller]
-        settings += [identity(terrains.space.name, terrains.space.sha256)]
+        settings += [space_key(terrains.space.name, terrains.space.sha256)]
         settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
         settings += [repr(self.robot.training) if cfg.reward else None]  # whose terms the reward has
         content = json.dumps([*settings, code_fingerprint(("kernels", "sim"))])

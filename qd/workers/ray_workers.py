@@ -29,8 +29,8 @@ from sim.files.provenance import code_fingerprint
 from sim.robots.find import get_robot
 from sim.robots.user import PackedRobot, pack_robot
 from sim.rollout import RolloutResult
-from sim.terrains.ground import joined_name, split_name
-from sim.terrains.spaces.registry import is_own
+from sim.terrains.spaces.names import join_name, split_name
+from sim.terrains.spaces.registry import is_user_space
 from sim.terrains.terrains import Terrains
 
 _ROOMS = ("kernels", "sim", "qd")
@@ -95,7 +95,7 @@ class RayWorker:
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
             if self._space is not None:
                 code = self._space.unpacked(folder / "space")
-                cfg = replace(cfg, space=joined_name(code, split_name(cfg.space)[1]))
+                cfg = replace(cfg, space=join_name(code, split_name(cfg.space)[1]))
             cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
             self._simulator = self._build(cfg, num_terrains)
 
@@ -125,7 +125,7 @@ class RayWorkers(Pipeline):
         self._count = parse_workers(cfg.compute.workers).count
         self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
-        space = PackedCode.of(split_name(cfg.space)[0]) if is_own(cfg.space) else None
+        space = PackedCode.of(split_name(cfg.space)[0]) if is_user_space(cfg.space) else None
         packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
         compute = replace(cfg.compute, device="cuda:0" if gpus else "cpu")
         self._arguments = replace(cfg, compute=compute, robot=""), *packed, build

@@ -24,14 +24,14 @@ from qd.workers.seeds import Stream
 from results.make.common import Script, parse
 from results.make.spaces import COUNTS, causes_of
 from sim.terrains.conditions.base import CONDITIONS
-from sim.terrains.ground import joined_name
+from sim.terrains.spaces.names import join_name
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from sim.terrains.terrains import Terrains
 
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
-SPACE = joined_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
+SPACE = join_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
 _PUBLISHED = ("archive.npz", "archive.json", "config.json", "minimal.npz", "minimal.json")
 
 

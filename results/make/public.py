@@ -38,7 +38,7 @@ from sim.files.settings import read_toml
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.doses import parse_doses
-from sim.terrains.spaces.base import MOST_HEIGHT
+from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
 from sim.terrains.terrains import Terrains
 from train.cfg import FinetuneCfg, RunCfg
@@ -119,7 +119,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     return {
         "contract": {key: value for key, value in read_toml(Path(policy)).items() if key != "policy"},
         "space": named,
-        "height": float(named.partition("@")[2] or MOST_HEIGHT),
+        "height": float(named.partition("@")[2] or MAX_HEIGHT),
         "check": checked,
         "hand_crafted": rates["hand_crafted"],
         "agreement": agreed,

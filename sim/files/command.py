@@ -195,7 +195,7 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
             prog=f"faultline {name}",
             args=list(argv),
             description="",
-            registry=_plain_help(),
+            registry=_plain_help(cls),
             config=(tyro.conf.DisallowNone,),
             **defaults,
         )
@@ -203,8 +203,11 @@ def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -
         sys.stdout.flush()
 
 
-def _plain_help() -> ConstructorRegistry:
-    """Makes the help of flags plain: no default where it is None, and lines broken by the terminal alone."""
+def _plain_help(cls: Any) -> ConstructorRegistry:
+    """Makes the help of flags plain: no default where it is None, and lines broken by the terminal alone.
+
+    Names in braces are filled with the values of the command's ``help_values()``.
+    """
     registry = ConstructorRegistry()
     hint = tyro.conf.arg(help_behavior_hint=lambda text: "" if text in ("", "None") else f"(default: {text})")
     busy = False
@@ -220,7 +223,7 @@ def _plain_help() -> ConstructorRegistry:
         if not isinstance(spec, StructConstructorSpec):
             return None
         fields = [
-            replace(field, type=Annotated[field.type, hint], helptext=partial(_join_lines, field.helptext))
+            replace(field, type=Annotated[field.type, hint], helptext=partial(_plain_text, cls, field.helptext))
             for field in spec.fields
         ]
         return replace(spec, fields=tuple(fields))
@@ -228,8 +231,10 @@ def _plain_help() -> ConstructorRegistry:
     return registry
 
 
-def _join_lines(helptext: Any) -> str | None:
+def _plain_text(cls: Any, helptext: Any) -> str | None:
     text: Any = helptext() if callable(helptext) else helptext
+    if "{" in (text or ""):
+        text = text.format_map(cls.help_values())
     return " ".join((text or "").split()) or None
 
 

@@ -18,7 +18,7 @@ from sim.files.npz import npz_bytes, read_arrays
 from sim.recording.recorder import FRAME_ARRAYS, Recording
 from sim.terrains.bank import make_heights
 from sim.terrains.ground import GroundMaps
-from sim.terrains.spaces.registry import get_space, is_own
+from sim.terrains.spaces.registry import get_space, is_user_space
 
 FORMAT = "faultline recording 3"
 """Name and version in every file."""
@@ -30,7 +30,7 @@ def write_recording(path: Path, recording: Recording) -> None:
     values = {field.name: getattr(recording, field.name) for field in fields(Recording)}
     values |= {} if recording.ground is None else vars(recording.ground)
     del values["ground"]
-    if recording.genes is not None and not is_own(recording.origin["space"]):
+    if recording.genes is not None and not is_user_space(recording.origin["space"]):
         del values["heights"]
     values |= {"format": FORMAT, "origin": json.dumps(recording.origin)}
     content = {name: np.asarray(value, FRAME_ARRAYS.get(name)) for name, value in values.items() if value is not None}

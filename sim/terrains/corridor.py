@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.ground import COLS, MOST_TIME_CONSTANT_S, ROWS, make_ground
+from kernels.ground import COLS, MAX_TIME_CONSTANT_S, ROWS, make_ground
 from sim.terrains.conditions.base import condition_genes
 from sim.terrains.ground import patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
@@ -73,7 +73,7 @@ def _ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
         space.lay_ground(wp.from_torch(genes.contiguous()), ground)
     maps = {
         "friction": 1.0 - wp.to_torch(ground.friction),
-        "softness": wp.to_torch(ground.time_constant) / float(MOST_TIME_CONSTANT_S),
+        "softness": wp.to_torch(ground.time_constant) / float(MAX_TIME_CONSTANT_S),
     }
     row = patch_index(_nodes(Y), NUM_ROWS - 1, ROWS)
     col = patch_index(_nodes(X), NUM_COLS - 1, COLS)

@@ -13,12 +13,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels import course
-from kernels.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, NUM_PATCHES
+from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, NUM_PATCHES
 from sim.device import host_device
 from sim.terrains.conditions.base import CONDITIONS, Condition, ConditionDose
 from sim.terrains.elements.base import CourseElement, ElementDose, Quantity, all_elements
-from sim.terrains.ground import joined_name
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.spaces.names import join_name
 from sim.terrains.spaces.on_ground import ground_genes
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
@@ -116,7 +116,7 @@ def _dose_level(title: str, name: str, quantity: Quantity, values: tuple[float, 
         flat = np.zeros((len(genes), SUPER_GAUSSIAN.num_genes))  # bumps of no height
         return np.tile(np.concatenate([flat, genes], axis=1).astype(np.float32), (count, 1))
 
-    space = joined_name(SUPER_GAUSSIAN.name, (name,))
+    space = join_name(SUPER_GAUSSIAN.name, (name,))
     return Dose(title=title, parameter=name, values=values, quantities={name: quantity}, make=make, space=space)
 
 
@@ -134,9 +134,9 @@ def _dose_condition(condition: Condition, dose: ConditionDose) -> Dose:
 
 
 _GROUND = {
-    "friction": (Quantity(low=LEAST_FRICTION, high=1.0, unit=""), (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)),
+    "friction": (Quantity(low=MIN_FRICTION, high=1.0, unit=""), (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)),
     "softness": (
-        Quantity(low=1.1 * LEAST_TIME_CONSTANT_S, high=MOST_TIME_CONSTANT_S, unit="s"),
+        Quantity(low=1.1 * MIN_TIME_CONSTANT_S, high=MAX_TIME_CONSTANT_S, unit="s"),
         (0.015, 0.02, 0.03, 0.04, 0.05, 0.06),
     ),
 }

@@ -1,17 +1,13 @@
-"""Friction and softness of the ground on the host: maps of patches, and the names of spaces that have them.
+"""Friction and softness of the ground on the host: maps of patches, with the conditions of a crossing."""
 
-The conditions of a crossing go with them.
-"""
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.ground import FIRM, LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, PATCHES
-from sim.terrains.conditions.base import CONDITIONS, check_conditions, nominal_row
+from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
+from sim.terrains.conditions.base import check_conditions, nominal_row
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
@@ -85,27 +81,11 @@ def check_map(kind: str, values: NDArray[np.floating]) -> None:
     if values.ndim != 3 or values.shape[1:] != PATCHES:
         raise ValueError(f"a map of {kind} must have shape (terrains, {PATCHES[0]}, {PATCHES[1]}), got {values.shape}")
     if kind == "friction":
-        allowed = (values >= LEAST_FRICTION - 1e-6) & (values <= 1.0)
-        words = f"{LEAST_FRICTION} to 1"
+        allowed = (values >= MIN_FRICTION - 1e-6) & (values <= 1.0)
+        words = f"{MIN_FRICTION} to 1"
     else:
-        soft = (values >= LEAST_TIME_CONSTANT_S - 1e-6) & (values <= MOST_TIME_CONSTANT_S + 1e-6)
+        soft = (values >= MIN_TIME_CONSTANT_S - 1e-6) & (values <= MAX_TIME_CONSTANT_S + 1e-6)
         allowed = soft | (values == FIRM)
-        words = f"{FIRM:g} (firm), or {LEAST_TIME_CONSTANT_S} to {MOST_TIME_CONSTANT_S} s"
+        words = f"{FIRM:g} (firm), or {MIN_TIME_CONSTANT_S} to {MAX_TIME_CONSTANT_S} s"
     if not allowed.all():
         raise ValueError(f"{kind} must be {words}, got {values[~allowed][0]:g} in one of the patches")
-
-
-def split_name(name: str) -> tuple[str, tuple[str, ...]]:
-    """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
-    kinds = (*GROUND_KINDS, *CONDITIONS)
-    base = name
-    named = set[str]()
-    while (head := base.rpartition("+"))[0] and head[2] in kinds:
-        base = head[0]
-        named.add(head[2])
-    return base, tuple(kind for kind in kinds if kind in named)
-
-
-def joined_name(name: str, kinds: Sequence[str]) -> str:
-    """The name of a space with ground or conditions of some kinds."""
-    return "+".join((name, *kinds))

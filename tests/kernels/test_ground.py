@@ -6,9 +6,9 @@ import warp as wp
 
 from kernels.ground import (
     FIRM,
-    LEAST_FRICTION,
-    LEAST_TIME_CONSTANT_S,
-    MOST_TIME_CONSTANT_S,
+    MAX_TIME_CONSTANT_S,
+    MIN_FRICTION,
+    MIN_TIME_CONSTANT_S,
     PATCHES,
     decode_friction,
     decode_softness,
@@ -26,10 +26,10 @@ def decoded(decode, genes):
 def test_genes_by_hand():
     # Friction: -1 is 0.15, 0 is 0.575, 1 exactly 1. Softness: -1 is firm, 0 the geometric mean of 0.01 s and 0.06 s.
     genes = np.tile(np.repeat([-1.0, 0.0, 1.0, 5.0], 8), (2, 1))
-    np.testing.assert_allclose(decoded(decode_friction, genes)[1, :, 3], [LEAST_FRICTION, 0.575, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(decoded(decode_friction, genes)[1, :, 3], [MIN_FRICTION, 0.575, 1, 1], rtol=1e-6)
     assert (decoded(decode_friction, genes)[:, 2:] == 1.0).all()
-    middle = (LEAST_TIME_CONSTANT_S * MOST_TIME_CONSTANT_S) ** 0.5
-    expected = [FIRM, middle, MOST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S]
+    middle = (MIN_TIME_CONSTANT_S * MAX_TIME_CONSTANT_S) ** 0.5
+    expected = [FIRM, middle, MAX_TIME_CONSTANT_S, MAX_TIME_CONSTANT_S]
     np.testing.assert_allclose(decoded(decode_softness, genes)[0, :, 7], expected, rtol=1e-5)
 
 

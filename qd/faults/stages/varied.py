@@ -14,8 +14,7 @@ from qd.workers.compute import Compute
 from qd.workers.pipeline import PipelineCfg, build_simulator
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
-from sim.terrains.spaces.registry import load_space
-from sim.terrains.spaces.under_conditions import varied_genes, varied_name
+from sim.terrains.spaces.under_conditions import varied_genes, varied_space
 from sim.terrains.terrains import Terrains
 
 
@@ -35,7 +34,7 @@ class Varied(Stage):
             search = judging.search
             compute = judging.crosser.compute
             local = Compute(compute.device if compute.on_gpu else "cpu")
-            sizes: dict[str, Any] = {"num_terrains": 1, "replicas": 1, "space": varied_name(search.space)}
+            sizes: dict[str, Any] = {"num_terrains": 1, "replicas": 1, "space": varied_space(search.space).name}
             build_simulator(PipelineCfg(compute=local, robot=search.robot, policy=search.policy, **sizes), 1)
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
@@ -43,7 +42,7 @@ class Varied(Stage):
         _check_certifiers(archive, judging)
         search = judging.search
         rows = np.flatnonzero(archive.is_fault)
-        space = load_space(varied_name(search.space))
+        space = varied_space(search.space)
         seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
         drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]
         genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, space.num_genes)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sim.crossing import CrossingCfg
 from sim.terrains.ground import (
-    LEAST_FRICTION,
-    LEAST_TIME_CONSTANT_S,
-    MOST_TIME_CONSTANT_S,
+    MAX_TIME_CONSTANT_S,
+    MIN_FRICTION,
+    MIN_TIME_CONSTANT_S,
     PATCHES,
     GroundMaps,
     patch_index,
@@ -55,9 +55,9 @@ def ground_lines(ground: GroundMaps, rows: int, columns: int, margin: int = 0) -
         patch_index(np.arange(count) - margin, nodes - 1, patches)
         for count, patches, nodes in zip((rows, columns), PATCHES, (NUM_ROWS, NUM_COLS), strict=True)
     )
-    slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - LEAST_FRICTION)
-    tau = np.maximum(ground.time_constant_s[0].astype(np.float64), LEAST_TIME_CONSTANT_S)
-    soft = np.log(tau / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S)
+    slippery = (1.0 - ground.friction[0].astype(np.float64)) / (1.0 - MIN_FRICTION)
+    tau = np.maximum(ground.time_constant_s[0].astype(np.float64), MIN_TIME_CONSTANT_S)
+    soft = np.log(tau / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S)
     strength = np.stack([slippery, soft], axis=-1)[patch_row[:, None], patch_column]
     row, column = np.ogrid[:rows, :columns]
     on_line = np.stack([(row + column) % _LINES_EVERY < _LINE, (0 * row + column) % _LINES_EVERY < _LINE], axis=-1)

@@ -9,22 +9,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
 from sim.terrains.conditions.base import nominal_row
-from sim.terrains.ground import joined_name
 from sim.terrains.hand_crafted import Seed
+from sim.terrains.spaces.names import join_height, join_name
 
-MOST_HEIGHT = 0.25
+MAX_HEIGHT = 0.25
 """Heights of the shipped spaces are for robots half a metre high: Table I's w [m]."""
 
 
 class TerrainSpace:
-    """What a search needs of its terrains; what a space does not say itself, it has as it stands here."""
+    """What a search needs of its terrains. Attributes and methods below are the defaults of a space."""
 
     name: str
     """What files and command lines call the space."""
     num_genes: int
     """Length of one row of genes."""
     sha256: str | None = None
-    """Hash of the code of a space of a user's own, which records name beside it; None of a shipped one."""
+    """Hash of the code of a user's space, which records hold beside its name; None of a shipped space."""
     sigma0: float = 2.0
     """First step size of a search whose command line names none. So wide a start asks for terrains at the genes'
     limits, which are the hard ones of most spaces."""
@@ -33,11 +33,11 @@ class TerrainSpace:
     genes_per_part: int | None = None
     """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
     ground: tuple[str, ...] = ()
-    """What its terrains have maps of beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
+    """Maps that its terrains have beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
     conditions: tuple[str, ...] = ()
     """Conditions that it has genes of, some of :data:`sim.terrains.conditions.base.CONDITIONS`."""
     height_share: float = 1.0
-    """Its highest terrain over that of the shipped heights; 1 of a space of a user's own."""
+    """Its highest terrain over that of the shipped heights; 1 of a user's space."""
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.
@@ -62,7 +62,7 @@ class TerrainSpace:
         ...
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """The parts of a terrain that can be taken away, each in words, of one row of genes (num_genes,)."""
+        """Texts of the parts of a terrain that can be taken away, of one row of genes (num_genes,)."""
         ...
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
@@ -77,11 +77,11 @@ class TerrainSpace:
         return None
 
     def describe(self, genes: ArrayLike) -> str:
-        """A terrain in words, one part a line, of one row of genes (num_genes,)."""
+        """A terrain as text, one part a line, of one row of genes (num_genes,)."""
         return "\n".join(self.parts(genes))
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
-        """What lies across the whole way, in words, with the x at which it begins and ends [m]; none of most spaces."""
+        """What lies across the whole way: text, and x at which it begins and ends [m]. Most spaces have none."""
         return ()
 
     def uniform_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
@@ -104,29 +104,24 @@ class TerrainSpace:
 
 
 class WiderSpace(TerrainSpace):
-    """The terrains of another space, whose genes come first, with genes of its own behind them.
-
-    Attributes:
-        inner: The other space.
-        kinds: What its own genes are of.
-    """
+    """The terrains of another space, ``inner``, whose genes come first, and genes of some ``kinds`` behind them."""
 
     def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
-        """``kinds`` are what its own genes are of, in their order; a class sets :attr:`num_genes`."""
-        self.inner, self.kinds, self.name = inner, kinds, joined_name(inner.name, kinds)
+        """``kinds`` are in their order; a class sets :attr:`num_genes`."""
+        self.inner, self.kinds, self.name = inner, kinds, join_name(inner.name, kinds)
         for name in ("sha256", "sigma0", "any_spacing", "height_share"):
             setattr(self, name, getattr(inner, name))
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
-        """Turns genes into heights on the device, by the other space."""
+        """Turns genes into heights on the device, by the inner space."""
         self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
 
     def absent(self, part: int) -> tuple[slice, Any]:
-        """Columns of a part of its own, by its number among these, and genes of it that change nothing."""
+        """Columns of a part behind those of the inner space, counted from 0, and genes of it that change nothing."""
         raise NotImplementedError
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes without some parts, those of the other space first; one of its own becomes :meth:`absent`."""
+        """Genes without some parts: those of the inner space come first, the others become :meth:`absent`."""
         changed = self.validate(genes).copy()
         first = self.inner.num_genes
         if len(changed):
@@ -139,7 +134,7 @@ class WiderSpace(TerrainSpace):
         return changed
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes with heights scaled by the other space; its own stay as they are."""
+        """Genes with heights scaled by the inner space; the others stay as they are."""
         rows, first = clipped(self.validate(genes)), self.inner.num_genes
         heights = self.inner.scaled(rows[:, :first], scale)
         return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
@@ -147,22 +142,22 @@ class WiderSpace(TerrainSpace):
 
 @dataclass(frozen=True, kw_only=True)
 class ShippedSpace(TerrainSpace):
-    """A space whose heights are for robots half a metre high, and can be lowered for others."""
+    """A space with heights for robots half a metre high, which can be lowered for smaller ones."""
 
     base_name: ClassVar[str]
     """Its name at its usual height."""
-    height: float = MOST_HEIGHT
+    height: float = MAX_HEIGHT
     """Largest height [m]: a smaller one lowers all terrains alike."""
 
     @property
     def name(self) -> str:
         """``course``, with another height ``course@0.06``."""
-        return self.base_name if self.height == MOST_HEIGHT else f"{self.base_name}@{self.height:g}"
+        return self.base_name if self.height == MAX_HEIGHT else join_height(self.base_name, self.height)
 
     @property
     def height_share(self) -> float:
         """Heights over the usual ones."""
-        return self.height / MOST_HEIGHT
+        return self.height / MAX_HEIGHT
 
 
 def clipped(genes: ArrayLike) -> NDArray[np.float32]:

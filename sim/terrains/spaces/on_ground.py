@@ -1,4 +1,4 @@
-"""Any terrain space, and 32 genes more for the friction of its ground, 32 for its softness, or both."""
+"""Any terrain space, and genes more for its ground: 32 for friction, 32 for softness, or both."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.ground import LEAST_FRICTION, LEAST_TIME_CONSTANT_S, MOST_TIME_CONSTANT_S, patch_index
+from sim.terrains.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 from sim.terrains.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 ABSENT = {"friction": 1.0, "softness": -1.0}
 """The gene of ground that changes nothing."""
-_BESIDE_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
-_MOST_FRICTION = 0.995  # rounded, what is above is 1.00
+_ROWS_OF_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
+_MAX_SLIPPERY = 0.995  # rounded, what is above is 1.00
 
 
 class OnGround(WiderSpace):
@@ -45,42 +45,42 @@ class OnGround(WiderSpace):
         return np.concatenate([heights, maps.astype(np.float32)], axis=1)
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """Those of the space, then each patch of each map in words."""
+        """Those of the space, then each patch of each map."""
         row = clipped(genes)
-        values = [(kind, patch) for kind in self.ground for patch in enumerate(self._values(row, kind))]
-        words = [_patch_words(kind, value, patch) for kind, (patch, value) in values]
-        return (*self.inner.parts(row[: self.inner.num_genes]), *words)
+        patches = [(kind, patch) for kind in self.ground for patch in enumerate(self._values(row, kind))]
+        texts = [_patch_text(kind, value, patch) for kind, (patch, value) in patches]
+        return (*self.inner.parts(row[: self.inner.num_genes]), *texts)
 
     def absent(self, part: int) -> tuple[slice, Any]:
-        """A patch without friction or softness of its own is as ground always is."""
+        """The gene of a patch that changes nothing."""
         first = self.inner.num_genes + part
         return slice(first, first + 1), ABSENT[self.ground[part // NUM_PATCHES]]
 
     def describe(self, genes: ArrayLike) -> str:
-        """The terrain of the space in words, and of each map the patches on both sides of the way, a line each.
+        """The terrain of the space, and of each map the patches on both sides of the way, a line each.
 
         What lies across the way has its ground behind it: ``kerb 0.15 m up (friction 0.25)``.
         """
         row = clipped(genes)
         heights = row[: self.inner.num_genes]
-        across = [words + self._ground_words(row, begin, end) for words, begin, end in self.inner.spans(heights)]
+        across = [text + self._ground_text(row, begin, end) for text, begin, end in self.inner.spans(heights)]
         lines = [", ".join(across) or self.inner.describe(heights)]
         for kind in self.ground:
-            right, left = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY]
+            right, left = self._values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY]
             lines.append(f"{_TITLES[kind]}: left of the way {_numbers(left)}, right of it {_numbers(right)}")
         return "\n".join(lines)
 
-    def _ground_words(self, row: NDArray[np.float32], begin: float, end: float) -> str:
+    def _ground_text(self, row: NDArray[np.float32], begin: float, end: float) -> str:
         """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
         first, last = patch_index((begin, end), PATCH * COLS, COLS)
-        words = []
+        texts = []
         for kind in self.ground:
-            values = self._values(row, kind).reshape(ROWS, COLS)[_BESIDE_THE_WAY, first : last + 1]
-            if kind == "friction" and values.min() < _MOST_FRICTION:
-                words.append(f"friction {values.min():.2f}")
+            values = self._values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY, first : last + 1]
+            if kind == "friction" and values.min() < _MAX_SLIPPERY:
+                texts.append(f"friction {values.min():.2f}")
             if kind == "softness" and values.max() > 0.0:
-                words.append(f"soft, {values.max():.3f} s")
-        return f" ({', '.join(words)})" if words else ""
+                texts.append(f"soft, {values.max():.3f} s")
+        return f" ({', '.join(texts)})" if texts else ""
 
     def _columns(self, kind: str) -> slice:
         first = self.inner.num_genes + NUM_PATCHES * self.ground.index(kind)
@@ -90,16 +90,16 @@ class OnGround(WiderSpace):
         """Frictions, or time constants [s], of one terrain, shape (32,)."""
         share = (row[self._columns(kind)].astype(np.float64) + 1.0) / 2.0
         if kind == "friction":
-            return 1.0 - (1.0 - share) * (1.0 - LEAST_FRICTION)
-        tau = LEAST_TIME_CONSTANT_S * (MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) ** share
+            return 1.0 - (1.0 - share) * (1.0 - MIN_FRICTION)
+        tau = MIN_TIME_CONSTANT_S * (MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) ** share
         return np.where(share > 0.0, tau, 0.0)
 
 
 def ground_genes(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Genes of frictions, or of time constants [s] above the least, which is what its gene of -1 does not have."""
+    """Genes of frictions, or of time constants [s] above the least; a gene of -1 is firm ground."""
     if kind == "friction":
-        return 1.0 - 2.0 * (1.0 - values) / (1.0 - LEAST_FRICTION)
-    return 2.0 * np.log(values / LEAST_TIME_CONSTANT_S) / np.log(MOST_TIME_CONSTANT_S / LEAST_TIME_CONSTANT_S) - 1.0
+        return 1.0 - 2.0 * (1.0 - values) / (1.0 - MIN_FRICTION)
+    return 2.0 * np.log(values / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
 
 
 _TITLES = {
@@ -112,9 +112,9 @@ def _numbers(values: NDArray[np.float64]) -> str:
     return " ".join(f"{value:.2f}" for value in values)
 
 
-def _patch_words(kind: str, value: float, patch: int) -> str:
+def _patch_text(kind: str, value: float, patch: int) -> str:
     row, col = divmod(patch, COLS)
-    place = f"at x = {PATCH * col:.0f} to {PATCH * (col + 1):.0f} m, y = {PATCH * row:.0f} to {PATCH * (row + 1):.0f} m"
+    where = f"at x = {PATCH * col:.0f} to {PATCH * (col + 1):.0f} m, y = {PATCH * row:.0f} to {PATCH * (row + 1):.0f} m"
     if kind == "friction":
-        return f"friction {value:.2f} {place}"
-    return f"soft ground of {value:.3f} s {place}" if value else f"firm ground {place}"
+        return f"friction {value:.2f} {where}"
+    return f"soft ground of {value:.3f} s {where}" if value else f"firm ground {where}"

@@ -1,6 +1,5 @@
 """Terrain spaces by name: the shipped ones, and those of a user that the command line named."""
 
-import re
 import shlex
 from dataclasses import replace
 
@@ -8,77 +7,88 @@ from sim.controllers.spec import ControllerSpec, controller_hash
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
 from sim.terrains.conditions.base import CONDITIONS
-from sim.terrains.ground import GROUND_KINDS, joined_name, split_name
-from sim.terrains.spaces.base import MOST_HEIGHT, ShippedSpace, TerrainSpace, WiderSpace
+from sim.terrains.ground import GROUND_KINDS
+from sim.terrains.spaces.base import MAX_HEIGHT, ShippedSpace, TerrainSpace, WiderSpace
 from sim.terrains.spaces.course import COURSE
+from sim.terrains.spaces.names import join_name, split_height, split_name
 from sim.terrains.spaces.on_ground import OnGround
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.under_conditions import UnderConditions
-from sim.terrains.spaces.user import load_own
+from sim.terrains.spaces.user import load_user_space
 
-SPACES: dict[str, ShippedSpace] = {space.name: space for space in (SUPER_GAUSSIAN, COURSE)}
-"""Every shipped space by its name. Another one is one more class, and its place here."""
-_HEIGHT = re.compile(r"0?\.\d+")
+SPACES: dict[str, ShippedSpace] = {}
+"""Every shipped space by its name."""
 _loaded: list[TerrainSpace] = []
-"""A user's own spaces that this process was told to run, the latest first."""
+"""User spaces that this process was told to run, the latest first."""
 
 
-def is_own(name: str) -> bool:
-    """Whether a space is code of a user's own."""
+def register_space(space: ShippedSpace) -> None:
+    """Adds a space."""
+    SPACES[space.name] = space
+
+
+register_space(SUPER_GAUSSIAN)
+register_space(COURSE)
+
+
+def is_user_space(name: str) -> bool:
+    """Whether a space is a user's code."""
     base, _ = split_name(name)
     return base not in SPACES and ControllerSpec.parse(base).runs_code
 
 
-def identity(name: str, sha256: str | None) -> str:
+def space_key(name: str, sha256: str | None) -> str:
     """What terrains depend on: the space's name, or the hash of its code if it has one, and its ground."""
     base, kinds = split_name(name)
-    return joined_name(sha256 or base, kinds)
+    return join_name(sha256 or base, kinds)
 
 
 def load_space(name: str | None) -> TerrainSpace:
-    """A space that the command line names; a user's own is run, and :func:`get_space` finds it from then on.
+    """A space that the command line names; a user's code is run, and :func:`get_space` finds it from then on.
 
-    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, and behind it the maps of its ground, as in
-    ``course+friction+softness``; None is the paper's space.
+    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, and behind it ground and conditions, as in
+    ``course+friction+push``; None is the paper's space.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
-    once = joined_name(base, kinds)
+    once = join_name(base, kinds)
     if name and len(once) < len(name):
         raise ValueError(f"a space must have each kind of ground and condition once, got {name}: give {once}")
-    if is_own(base):
+    if is_user_space(base):
         sha256 = controller_hash(base)
         if sha256 is None or not any((space.name, space.sha256) == (base, sha256) for space in _loaded):
-            _loaded.insert(0, load_own(base))
+            _loaded.insert(0, load_user_space(base))
     return get_space(once)
 
 
 def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     """A space that a record names; no code runs that :func:`load_space` did not run.
 
-    By the hash of its code in the record, code that has moved is known.
+    By the hash of its code in the record, code that has moved is found.
     """
     base, kinds = split_name(name)
-    root, _, height = base.rpartition("@")
-    lower = root in SPACES and _HEIGHT.fullmatch(height)
-    space = at_height(SPACES[root], float(height)) if lower else SPACES.get(base) or _find_loaded(base, sha256)
+    root, height = split_height(base)
+    if height is not None and root in SPACES:
+        space = at_height(SPACES[root], height)
+    else:
+        space = SPACES.get(base) or _find_loaded(base, sha256)
     ground = tuple(kind for kind in kinds if kind in GROUND_KINDS)
-    conditions = tuple(kind for kind in kinds if kind not in GROUND_KINDS)
+    conditions = tuple(kind for kind in kinds if kind in CONDITIONS)
     if ground and space.ground:
-        raise ValueError(f"the space {base} has ground of its own, got {name}: leave +{'+'.join(ground)} out")
+        raise ValueError(f"the space {base} has its ground already, got {name}: leave +{'+'.join(ground)} out")
     space = OnGround(space, ground) if ground else space
     return UnderConditions(space, conditions) if conditions else space
 
 
 def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:
-    """A space at a height [m], or, without one, at the height that fits the robot; says so if that is not its own."""
+    """A space at a height [m], or, without one, at the height that fits the robot; prints it if it is another one."""
     if height is not None:
         return at_height(space, height)
-    fits = MOST_HEIGHT * get_space(fitting_space(robot) or SUPER_GAUSSIAN.name).height_share
-    if fits == MOST_HEIGHT or "@" in space.name or is_own(space.name):
+    fits = MAX_HEIGHT * get_space(fitting_space(robot) or SUPER_GAUSSIAN.name).height_share
+    if fits == MAX_HEIGHT or split_height(split_name(space.name)[0])[1] is not None or is_user_space(space.name):
         return space
     print(
         f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} (--height, or --space "
-        f"{SUPER_GAUSSIAN.name}@{MOST_HEIGHT:g}, says otherwise)."
+        f"{SUPER_GAUSSIAN.name}@{MAX_HEIGHT:g}, says otherwise)."
     )
     return at_height(space, fits)
 
@@ -88,17 +98,18 @@ def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     if isinstance(space, WiderSpace):
         return type(space)(at_height(space.inner, height), space.kinds)
     if not isinstance(space, ShippedSpace):
-        raise ValueError(f"height is for shipped spaces, got {space.name}: a space of your own has its own heights")
-    if not 0.0 < height <= MOST_HEIGHT:
-        raise ValueError(f"height must lie above 0 and at most at {MOST_HEIGHT:g} m, got {height:g}")
+        raise ValueError(f"height is for shipped spaces, got {space.name}: a user's space has its own heights")
+    if not 0.0 < height <= MAX_HEIGHT:
+        raise ValueError(f"height must lie above 0 and at most at {MAX_HEIGHT:g} m, got {height:g}")
     return replace(space, height=height)
 
 
 def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
-    if not is_own(name):
+    if not is_user_space(name):
+        kinds = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS))
         raise ValueError(
             f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
-            f"some of {', '.join(f'+{kind}' for kind in (*GROUND_KINDS, *CONDITIONS))}"
+            f"some of {kinds}"
         )
     for space in _loaded:
         if space.name == name if sha256 is None else space.sha256 == sha256:

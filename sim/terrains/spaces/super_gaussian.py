@@ -35,11 +35,11 @@ class SuperGaussian(ShippedSpace):
         return genes
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """Each bump in words."""
+        """Each bump."""
         bumps = clipped(genes).reshape(-1, GENES_PER_BUMP)
         values = LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)
         values[:, _HEIGHT] *= self.height_share
-        return tuple(map(_in_words, values))
+        return tuple(map(_format_bump, values))
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes with the heights of some bumps at zero."""
@@ -54,7 +54,7 @@ class SuperGaussian(ShippedSpace):
         return lower
 
 
-def _in_words(bump: NDArray[np.float64]) -> str:
+def _format_bump(bump: NDArray[np.float64]) -> str:
     x, y, sigma_x, sigma_y, _, _, theta, height = bump
     kind = "bump" if height >= 0.0 else "hollow"
     return (

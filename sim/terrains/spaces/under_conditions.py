@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
 from sim.terrains.conditions.base import CONDITIONS, condition_genes, condition_rows, condition_texts
-from sim.terrains.ground import joined_name, split_name
 from sim.terrains.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 
@@ -72,15 +71,14 @@ class UnderConditions(WiderSpace):
         return self.inner.spans(self._split(genes)[0])
 
 
-def varied_name(space: TerrainSpace) -> str:
-    """The name of the space whose terrains are those of another one under varied conditions."""
-    base, kinds = split_name(space.name)
-    ground = [kind for kind in kinds if kind not in CONDITIONS]
-    return joined_name(base, [*ground, *(name for name in CONDITIONS if name in kinds or CONDITIONS[name].varied)])
+def varied_space(space: TerrainSpace) -> TerrainSpace:
+    """The space whose terrains are those of another one under varied conditions."""
+    names = tuple(name for name in CONDITIONS if name in space.conditions or CONDITIONS[name].varied)
+    return UnderConditions(space.inner if isinstance(space, UnderConditions) else space, names)
 
 
 def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Genes of a terrain, (num_genes,), under conditions drawn by each seed, for the space of :func:`varied_name`.
+    """Genes of a terrain, (num_genes,), under conditions drawn by each seed, for :func:`varied_space`.
 
     The first value of a condition is drawn uniformly from its ``varied`` limits, what controllers are usually trained
     for; others are nominal. Conditions that the space has genes of stay as they are. Shape (number of seeds, its

@@ -17,8 +17,8 @@ from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 
 
-class OwnSpace(TerrainSpace):
-    """A space of a user's own, with what it returns checked.
+class UserSpace(TerrainSpace):
+    """A user's space; what its code returns is checked.
 
     Args:
         spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
@@ -29,7 +29,8 @@ class OwnSpace(TerrainSpace):
     """
 
     def __init__(self, spec: str, code: Any) -> None:
-        self.name, self._code, self.sha256 = spec, code, controller_hash(spec)
+        self.name, self._code = spec, code
+        self.sha256 = controller_hash(spec)
         self.num_genes = self._setting("num_genes", 0, lambda value: isinstance(value, int) and value > 0)
         self.sigma0 = float(self._setting("sigma0", self.sigma0, lambda value: 0.0 < value < np.inf))
         self.genes_per_part = self._setting(
@@ -60,12 +61,13 @@ class OwnSpace(TerrainSpace):
             self._fill(kind, genes, PATCH, 0.5, maps[kind])
 
     def _fill(self, method: str, genes: Any, step: float, first: float, values_out: Any) -> None:
-        """Fills a Warp array (num_terrains, y, x) by a method of the user's; places are ``step * (first + index)``."""
-        rows, out = wp.to_torch(genes).clamp(-1.0, 1.0), wp.to_torch(values_out)
+        """Fills a Warp array (num_terrains, y, x) by a user's method, at x and y = ``step * (first + index)``."""
+        rows = wp.to_torch(genes).clamp(-1.0, 1.0)
+        out = wp.to_torch(values_out)
         stream: Any = None if rows.device.type == "cpu" else wp.stream_to_torch(wp.get_stream(genes.device))
         with torch.no_grad(), torch.cuda.stream(stream):
-            places = (step * (torch.arange(count, device=rows.device) + first) for count in out.shape[1:])
-            y, x = torch.meshgrid(*places, indexing="ij")
+            axes = (step * (torch.arange(count, device=rows.device) + first) for count in out.shape[1:])
+            y, x = torch.meshgrid(*axes, indexing="ij")
             returned = self._call(method, rows, x, y)
             try:
                 values = torch.as_tensor(returned, dtype=torch.float32, device=rows.device)
@@ -136,15 +138,16 @@ class OwnSpace(TerrainSpace):
         return ValueError(f"space '{self.name}': {what} {text}: docs/terrains.md")
 
 
-def load_own(spec: str) -> OwnSpace:
+def load_user_space(spec: str) -> UserSpace:
     """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains."""
-    place = ControllerSpec.parse(spec)
+    parsed = ControllerSpec.parse(spec)
     try:
-        code: Any = import_object(str(place.module), str(place.name))
+        code: Any = import_object(str(parsed.module), str(parsed.name))
         code = code() if inspect.isclass(code) else code
     except Exception as error:  # a user's code can fail with anything
         raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}") from error
-    space, device = OwnSpace(spec, code), host_device()
+    space = UserSpace(spec, code)
+    device = host_device()
     hard = space.hard_random(2, 0)
     genes = np.concatenate([np.zeros((1, space.num_genes), np.float32), hard])
     with wp.ScopedDevice(device):

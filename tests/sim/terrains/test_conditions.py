@@ -18,7 +18,7 @@ from sim.terrains.conditions.base import CONDITIONS, condition_column, condition
 from sim.terrains.conditions.noise import noise_widths
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
-from sim.terrains.spaces.registry import get_space, identity, load_space
+from sim.terrains.spaces.registry import get_space, load_space, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 from tests.sim.dogs import write_dog
@@ -268,7 +268,7 @@ def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
 def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing():
     rows = SPACE.uniform_random(3, 1)
     words = SPACE.parts(rows[0])
-    assert len(words) == 8 + len(CONDITIONS) and SPACE.num_genes == 64 + 11
+    assert len(words) == 8 + len(CONDITIONS) and SPACE.num_genes == 64 + len(condition_genes())
     without = SPACE.without(rows, range(8, 8 + len(CONDITIONS)))
     assert (SPACE.condition_rows(without) == nominal_row()).all() and (without[:, :64] == rows[:, :64]).all()
     only = SPACE.without(rows, [8 + list(CONDITIONS).index("push")])
@@ -286,7 +286,7 @@ def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing()
     assert SPACE.condition_text(genes(delay=0.0126, lag=0.033)) == "actions 15 ms late, observations 40 ms old"
     on_ice = get_space("course+friction+push")
     assert (on_ice.ground, on_ice.conditions, on_ice.num_genes) == (("friction",), ("push",), 36 + 32 + 3)
-    assert identity("course+push", None) == "course+push"
+    assert space_key("course+push", None) == "course+push"
     with pytest.raises(ValueError, match=r"each .* once, got course\+push\+push: give course\+push$"):
         load_space("course+push+push")
 

@@ -7,7 +7,7 @@ import pytest
 
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces import registry
-from sim.terrains.spaces.registry import get_space, is_own, load_space
+from sim.terrains.spaces.registry import get_space, is_user_space, load_space
 from tests.sim.terrains.spaces.spaces import write_ridges
 
 LEAST = """
@@ -44,7 +44,7 @@ def write(tmp_path):
 def test_a_space_from_a_file(ridges):
     space = load_space(ridges)
     assert (space.name, space.num_genes, space.sigma0) == (ridges, 3, 0.4)
-    assert is_own(ridges) and not is_own("course")
+    assert is_user_space(ridges) and not is_user_space("course")
     # Height .3 m, ridges 0.9 m apart, not turned: a crest at x = 8 m, the next at 8.9 m; a hollow half way is flat.
     heights = make_heights(np.array([[1.0, 0.0, 0.0]]), space)[0]
     assert heights[[0, 80, 160], 160] == pytest.approx(0.3) and heights[80, 178] == pytest.approx(0.3, abs=1e-6)

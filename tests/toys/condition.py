@@ -1,0 +1,31 @@
+"""A condition in one file: wind along the way."""
+
+import warp as wp
+
+from kernels.conditions import DisturbedStep
+from sim.terrains.conditions.base import Condition, ConditionDose, Gene, register
+
+
+@wp.func
+def _blow(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
+    if column == 0 and row[first] != 0.0:
+        step.joint_qd[env, 0] += row[first] * float(step.every) * step.dt
+
+
+class Wind(Condition):
+    name, cause = "wind", "headwind"
+    genes = (Gene(name="wind", low=-5.0, middle=0.0, high=5.0, unit="m/s^2"),)
+    dose = ConditionDose(title="wind from behind", values=(0.0, 1.0, 2.0))
+    disturb = _blow
+
+    def text(self, values):
+        return f"wind of {values[0]:.1f} m/s^2" if abs(values[0]) >= 0.05 else ""
+
+    def disturb_plain(self, episodes, values, rows, running, step):
+        for k in running:
+            episodes.data[k].qvel[0] += values[0] * episodes.robot.control_dt
+            episodes.qvel[k] = episodes.data[k].qvel
+        return rows
+
+
+register(Wind())

@@ -1,0 +1,38 @@
+"""An element of courses in one file: a hump, and the space of courses that have it."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import warp as wp
+
+from kernels.course import Element
+from sim.terrains.elements.base import LENGTH, CourseElement, ElementDose, Quantity, hard, register_element, whole
+from sim.terrains.spaces.course import Course
+from sim.terrains.spaces.registry import register_space
+
+
+@wp.func
+def _hump_relief(element: Element, s: int, row: int) -> float:
+    share = float(s) / float(element.cells)
+    return 4.0 * element.size * share * (1.0 - share)
+
+
+HUMP = CourseElement(
+    name="hump",
+    size=hard(0.05, 0.5),
+    length=whole(10, 40),
+    relief=_hump_relief,
+    text=lambda e: f"hump of {e['size']:.2f} m",
+    quantities={"height": Quantity(parameter="size", low=0.01, high=1.0), "length": LENGTH},
+    doses={"hump": ElementDose(title="hump", quantity="height", values=(0.1, 0.2, 0.4), others={"length": 1.0})},
+)
+register_element(HUMP)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Humps(Course):
+    base_name: ClassVar[str] = "humps"
+    kinds: ClassVar[tuple[str, ...]] = ("flat", "hump")
+
+
+register_space(Humps())
