@@ -47,11 +47,11 @@ def measure_dose(
     seed: int = 0,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Lets every controller cross every value of every dose; prints, writes and draws what came of it.
+    """Lets every controller cross every value of every dose; prints, writes and draws the rates.
 
     Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
     the file lies under runs/. The figure is beside it. The report has a row for each value and controller under
-    ``dose`` (:func:`rows_of`) and one for each dose and controller under ``half`` (:func:`half_of`).
+    ``dose`` (:func:`measure_rates`) and one for each dose and controller under ``half`` (:func:`find_half`).
     """
     count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
     for policy in controllers.values():
@@ -65,7 +65,7 @@ def measure_dose(
             engine="resolved" if resolved else "search", cache=crossings_folder(robot),
         )  # fmt: skip
         rows = {
-            (name, controller): rows_of(name, dose, controller, results[name][controller])
+            (name, controller): measure_rates(name, dose, controller, results[name][controller])
             for name, dose in doses.items()
             for controller in controllers
         }
@@ -78,8 +78,8 @@ def measure_dose(
             "episodes": episodes,
             "controllers": describe_controllers(controllers, robot),
             "titles": {name: dose.describe() for name, dose in doses.items()},
-            "dose": [{**row, "resolved": resolved} for of_dose in rows.values() for row in of_dose],
-            "half": [half_of(doses[name], of_dose, results[name][by]) for (name, by), of_dose in rows.items()],
+            "dose": [{**row, "resolved": resolved} for dosed in rows.values() for row in dosed],
+            "half": [find_half(doses[name], dosed, results[name][by]) for (name, by), dosed in rows.items()],
         }
 
     return publish(out, measure, show_dose, draw=lambda report: as_png(draw_dose(report)))
@@ -100,22 +100,21 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     )
 
 
-def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:
-    """What came of a dose for one controller, a row a value, the easiest first.
+def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:
+    """Rates of one controller on a dose, a row a value, the easiest first.
 
     A value with more than a quarter of invalid episodes has no rates.
     """
+    num_values = len(dose.values)
 
-    def by_value(array: NDArray[Any]) -> NDArray[Any]:
-        return array.reshape(-1, len(dose.values), array.shape[1]).swapaxes(0, 1).reshape(len(dose.values), -1)
+    def group(array: NDArray[Any]) -> NDArray[Any]:
+        """Episodes by value, shape (num_values, ...)."""
+        return array.reshape(-1, num_values, array.shape[1]).swapaxes(0, 1).reshape(num_values, -1)
 
-    outcome = by_value(result.outcome)
+    outcome = group(result.outcome)
     counted = counted_episodes(outcome == Outcome.INVALID)
-    hits = {
-        "goal": (outcome == Outcome.GOAL) & counted,
-        "success": (outcome != Outcome.BASE_COLLISION) & counted,
-        "fallen": by_value(result.fallen) & counted,
-    }
+    hits = {"goal": outcome == Outcome.GOAL, "fallen": group(result.fallen)}
+    hits["success"] = outcome != Outcome.BASE_COLLISION
     rows = []
     for number, value in enumerate(dose.values):
         count = int(counted[number].sum())
@@ -123,43 +122,43 @@ def rows_of(name: str, dose: Dose, controller: str, result: RolloutResult) -> li
             "element": name, "parameter": dose.parameter, "value": value, "unit": dose.unit, "at": dict(dose.others),
             "controller": controller, "episodes": count, "left_out": outcome.shape[1] - count,
         }  # fmt: skip
-        for rate, of_rate in hits.items():
-            number_of_hits, interval = int(of_rate[number].sum()), "interval" if rate == "goal" else f"{rate}_interval"
-            row[f"{rate}_rate"] = number_of_hits / count if count else None
-            row[interval] = list(wilson_interval(number_of_hits, count)) if count else None
+        for rate, is_hit in hits.items():
+            num_hits = int((is_hit & counted)[number].sum())
+            row[f"{rate}_rate"] = num_hits / count if count else None
+            interval = "interval" if rate == "goal" else f"{rate}_interval"
+            row[interval] = list(wilson_interval(num_hits, count)) if count else None
         rows.append(row)
     return rows
 
 
-def half_of(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
+def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
     """Where under half of the robots begin to reach the goal, by straight lines between the values.
 
-    The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None stands
-    for what lies beyond the values: ``beyond`` the ``first`` or the ``last``.
+    The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None is
+    beyond the values: ``beyond`` the ``first`` or the ``last``.
     """
-    known = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
-    values = [rows[number]["value"] for number in known]
-    about = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    if not known:
-        return {**about, "value": None, "beyond": None, "interval": [None, None]}
+    crossed = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
+    half: dict[str, Any] = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
+    if not crossed:
+        return {**half, "value": None, "beyond": None, "interval": [None, None]}
     counted = counted_episodes(result.outcome == Outcome.INVALID)
     hits, counts = (
-        of_episodes.sum(axis=1).reshape(-1, len(rows))[:, known]
-        for of_episodes in ((result.outcome == Outcome.GOAL) & counted, counted)
+        mask.sum(axis=1).reshape(-1, len(rows))[:, crossed]
+        for mask in ((result.outcome == Outcome.GOAL) & counted, counted)
     )
     drawn = resamples(len(hits), 0, _RESAMPLES)
     with np.errstate(invalid="ignore"):
-        places = [_half_at(rates) for rates in (drawn @ hits) / (drawn @ counts)]
-    place = _half_at(hits.sum(axis=0) / counts.sum(axis=0))
-    ends = np.quantile(places, [0.025, 0.975], method="inverted_cdf")
-    value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None
-                      for at in (place, *ends))  # fmt: skip
-    beyond = None if value is not None else "last" if place > 0 else "first"
-    return {**about, "value": value, "beyond": beyond, "interval": limits if dose.harder_up else limits[::-1]}
+        drawn_steps = [_find_crossing(rates) for rates in (drawn @ hits) / (drawn @ counts)]
+    step = _find_crossing(hits.sum(axis=0) / counts.sum(axis=0))
+    steps = (step, *np.quantile(drawn_steps, [0.025, 0.975], method="inverted_cdf"))
+    values = [rows[number]["value"] for number in crossed]
+    value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None for at in steps)
+    beyond = None if value is not None else "last" if step > 0 else "first"
+    return {**half, "value": value, "beyond": beyond, "interval": limits if dose.harder_up else limits[::-1]}
 
 
-def _half_at(rates: NDArray[np.floating]) -> float:
-    """Where along the places of rates they fall below a half; infinite if nowhere, -infinite if the first is below."""
+def _find_crossing(rates: NDArray[np.floating]) -> float:
+    """Index with a fraction where rates fall below a half: infinite if nowhere, -infinite if the first is below."""
     below = np.flatnonzero(rates < FAILING_GOAL_RATE)
     if not len(below) or below[0] == 0:
         return -np.inf if len(below) else np.inf
@@ -191,18 +190,18 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
     figure = new_figure(max(6.0, 3.3 * columns), 1.0 + 2.5 * rows)
     contact = "contact resolved" if report["resolved"] else "at the search's settings"
     figure.suptitle(f"{report['robot']}: robots that reach the goal, {contact}, with 95 % intervals")
-    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(len(elements))]
+    panels = [figure.add_subplot(rows, columns, number) for number in range(1, 1 + len(elements))]
     for axes, element in zip(panels, elements, strict=True):
-        of_element = [row for row in report["dose"] if row["element"] == element]
+        element_rows = [row for row in report["dose"] if row["element"] == element]
         for number, controller in enumerate(report["controllers"]):
-            known = [row for row in of_element if row["controller"] == controller and row["goal_rate"] is not None]
-            values = [row["value"] for row in known]
+            rated = [row for row in element_rows if row["controller"] == controller and row["goal_rate"] is not None]
+            values = [row["value"] for row in rated]
             colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
-            rates = [100.0 * row["goal_rate"] for row in known]
+            rates = [100.0 * row["goal_rate"] for row in rated]
             axes.plot(values, rates, label=controller, color=colour, marker=marker, markersize=4)
-            low, high = ([100.0 * row["interval"][end] for row in known] for end in (0, 1))
+            low, high = ([100.0 * row["interval"][end] for row in rated] for end in (0, 1))
             axes.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
-        first, last = of_element[0], of_element[-1]
+        first, last = element_rows[0], element_rows[-1]
         title, _, others = report["titles"][element].partition(", ")
         axes.set_title(f"{title}\n{others}", fontsize=9)
         axes.set_xlabel(f"{first['parameter']} [{first['unit']}]" if first["unit"] else first["parameter"], fontsize=8)

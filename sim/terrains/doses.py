@@ -85,7 +85,7 @@ class Dose:
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
 
-def _dose_element(element: CourseElement, dose: ElementDose) -> Dose:
+def _dose_element(name: str, element: CourseElement, dose: ElementDose) -> Dose:
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         record: Any = course.Element  # Warp makes its dtype
         laid: Any = np.zeros((count, len(quantities[dose.quantity])), record.numpy_dtype())
@@ -103,7 +103,7 @@ def _dose_element(element: CourseElement, dose: ElementDose) -> Dose:
             return np.array(heights.numpy(), np.float32)
 
     return Dose(
-        title=dose.title, parameter=dose.quantity, values=dose.values, others=dose.others, make=make,
+        title=name.replace("_", " "), parameter=dose.quantity, values=dose.values, others=dose.others, make=make,
         quantities=element.quantities,
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ def _dose_ground(kind: str) -> Dose:
 
 def all_doses() -> dict[str, Dose]:
     """Every dose by its name: obstacles, then grounds, then conditions."""
-    elements = {name: _dose_element(kind, dose) for kind in all_elements() for name, dose in kind.doses.items()}
+    elements = {name: _dose_element(name, kind, dose) for kind in all_elements() for name, dose in kind.doses.items()}
     conditions = {
         name: _dose_condition(condition, condition.dose)
         for name, condition in CONDITIONS.items()

@@ -24,7 +24,7 @@ HUMP = CourseElement(
     relief=_hump_relief,
     text=lambda e: f"hump of {e['size']:.2f} m",
     quantities={"height": Quantity(parameter="size", low=0.01, high=1.0), "length": LENGTH},
-    doses={"hump": ElementDose(title="hump", quantity="height", values=(0.1, 0.2, 0.4), others={"length": 1.0})},
+    doses={"hump": ElementDose("height", (0.1, 0.2, 0.4), others={"length": 1.0})},
 )
 register_element(HUMP)
 

@@ -40,11 +40,10 @@ def cells(parameter: str, low: float, high: float, every: int = 1) -> Quantity:
 LENGTH = cells("length", 0.20, 4.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ElementDose:
     """An element alone on flat ground, of which one quantity grows."""
 
-    title: str
     quantity: str
     values: tuple[float, ...]
     """The easiest first."""
@@ -52,6 +51,11 @@ class ElementDose:
     """1 up, -1 down."""
     others: Mapping[str, float] = field(default_factory=dict)
     """The other quantities."""
+
+
+def both_ways(name: str, *dose: Any, **others: float) -> dict[str, ElementDose]:
+    """Doses of an element that leads up and down."""
+    return {f"{name}_{way}": ElementDose(*dose, turn, others) for way, turn in (("up", 1.0), ("down", -1.0))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

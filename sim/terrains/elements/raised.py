@@ -10,6 +10,7 @@ from sim.terrains.elements.base import (
     CourseElement,
     ElementDose,
     Quantity,
+    both_ways,
     cells,
     hard,
     metres,
@@ -24,7 +25,6 @@ _LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)
 _RISES = (0.05, 0.10, 0.14, 0.17, 0.20, 0.22, 0.24, 0.26, 0.28, 0.30, 0.35)
 _STEPS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.50)
 _HEIGHT = Quantity(parameter="size", low=0.01, high=1.0)
-_DIRECTIONS = (("up", 1.0), ("down", -1.0))
 
 
 @wp.func
@@ -79,7 +79,7 @@ SILL = CourseElement(
     fit=fit_top,
     text=lambda e: f"sill {e['size']:.3f} m high and {metres(e['length'])} wide",
     quantities={"height": _HEIGHT, "width": cells("length", 0.05, 0.50)},
-    doses={"sill": ElementDose(title="sill", quantity="height", values=_LOW, others={"width": 0.10})},
+    doses={"sill": ElementDose("height", _LOW, others={"width": 0.10})},
 )
 RAIL = CourseElement(
     name="rail",
@@ -88,7 +88,7 @@ RAIL = CourseElement(
     fit=fit_top,
     text=lambda e: f"rail {e['size']:.3f} m high" + (f" and {metres(e['length'])} wide" if e["length"] else ""),
     quantities={"height": _HEIGHT},
-    doses={"rail": ElementDose(title="rail", quantity="height", values=_LOW)},
+    doses={"rail": ElementDose("height", _LOW)},
 )
 KERB = CourseElement(
     name="kerb",
@@ -106,10 +106,7 @@ STEP = CourseElement(
     rise=_face_rise,
     text=lambda e: f"step {e['size']:.2f} m {up_or_down(e)}",
     quantities={"height": _HEIGHT},
-    doses={
-        f"step_{way}": ElementDose(title=f"kerb or step {way}", quantity="height", values=_STEPS, turn=turn)
-        for way, turn in _DIRECTIONS
-    },
+    doses=both_ways("step", "height", _STEPS),
 )
 STAIRS = CourseElement(
     name="stairs",
@@ -126,12 +123,7 @@ STAIRS = CourseElement(
         "tread": Quantity(parameter="length", low=0.10, high=0.60),
         "flight": Quantity(parameter="detail", low=2, high=_MAX_STEPS, unit="steps", step=1.0),
     },
-    doses={
-        f"stairs_{way}": ElementDose(
-            title=f"stairs {way}", quantity="rise", values=_RISES, turn=turn, others={"tread": 0.30, "flight": 5.0}
-        )
-        for way, turn in _DIRECTIONS
-    },
+    doses=both_ways("stairs", "rise", _RISES, tread=0.30, flight=5.0),
 )
 PALLET = CourseElement(
     name="pallet",
@@ -142,5 +134,5 @@ PALLET = CourseElement(
     relief=_pallet_relief,
     text=_pallet_text,
     quantities={"height": _HEIGHT, "length": LENGTH},
-    doses={"pallet": ElementDose(title="pallet", quantity="height", values=_STEPS, others={"length": 1.0})},
+    doses={"pallet": ElementDose("height", _STEPS, others={"length": 1.0})},
 )

@@ -11,6 +11,7 @@ from sim.terrains.elements.base import (
     CourseElement,
     ElementDose,
     Quantity,
+    both_ways,
     cells,
     hard,
     metres,
@@ -66,12 +67,7 @@ RAMP = CourseElement(
     relief=_ramp_relief,
     text=lambda e: _slope_text("ramp", e, up_or_down(e)),
     quantities={"slope": _SLOPE, "length": LENGTH},
-    doses={
-        f"ramp_{way}": ElementDose(
-            title=f"ramp {way}", quantity="slope", values=_SLOPES, turn=turn, others={"length": 2.0}
-        )
-        for way, turn in (("up", 1.0), ("down", -1.0))
-    },
+    doses=both_ways("ramp", "slope", _SLOPES, length=2.0),
 )
 CROSS_SLOPE = CourseElement(
     name="cross_slope",
@@ -81,6 +77,6 @@ CROSS_SLOPE = CourseElement(
     relief=_cross_slope_relief,
     text=lambda e: _slope_text("cross slope", e, f"{'left' if e['turn'] >= 0.0 else 'right'} side up"),
     quantities={"slope": _SLOPE, "length": cells("length", 0.60, 4.0)},
-    doses={"cross_slope": ElementDose(title="cross slope", quantity="slope", values=_SLOPES, others={"length": 3.0})},
+    doses={"cross_slope": ElementDose("slope", _SLOPES, others={"length": 3.0})},
     draw_turns=lambda count, rng: rng.permutation(np.resize([-1.0, 1.0], count)),
 )

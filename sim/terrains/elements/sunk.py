@@ -9,6 +9,7 @@ from sim.terrains.elements.base import LENGTH, CourseElement, ElementDose, Quant
 
 _LOW = (0.05, 0.08, 0.10, 0.12, 0.15, 0.18, 0.20, 0.25, 0.30)
 _WIDTHS = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
+_GAPS = (0.10, 0.15, 0.20, 0.25, 0.30, 0.40)
 _DEPTH = Quantity(parameter="size", low=0.05, high=2.0)
 
 
@@ -73,7 +74,7 @@ DITCH = CourseElement(
     relief=_ditch_relief,
     text=_ditch_text,
     quantities={"depth": _DEPTH, "width": cells("length", 0.10, 4.0)},
-    doses={"ditch": ElementDose(title="ditch", quantity="width", values=_WIDTHS, others={"depth": 0.50})},
+    doses={"ditch": ElementDose("width", _WIDTHS, others={"depth": 0.50})},
 )
 BRIDGE = CourseElement(
     name="bridge",
@@ -84,11 +85,7 @@ BRIDGE = CourseElement(
     relief=_bridge_relief,
     text=_bridge_text,
     quantities={"depth": _DEPTH, "length": LENGTH, "width": cells("detail", 0.10, 4.0, every=2)},
-    doses={
-        "beam": ElementDose(
-            title="beam over a ditch", quantity="width", values=_WIDTHS[::-1], others={"depth": 0.50, "length": 1.50}
-        )
-    },
+    doses={"beam": ElementDose("width", _WIDTHS[::-1], others={"depth": 0.50, "length": 1.50})},
 )
 STONES = CourseElement(
     name="stones",
@@ -102,10 +99,7 @@ STONES = CourseElement(
         "depth": _DEPTH, "length": LENGTH, "side": cells("detail", 0.10, 1.0), "gap": cells("turn", 0.10, 1.0),
     },
     doses={
-        "stones": ElementDose(
-            title="stepping stones", quantity="gap", values=(0.10, 0.15, 0.20, 0.25, 0.30, 0.40),
-            others={"side": 0.30, "depth": 0.40, "length": 2.00},
-        )
+        "stones": ElementDose("gap", _GAPS, others={"side": 0.30, "depth": 0.40, "length": 2.00})
     },
 )  # fmt: skip
 RUBBLE = CourseElement(
@@ -120,7 +114,7 @@ RUBBLE = CourseElement(
         "height": Quantity(parameter="size", low=0.01, high=1.0), "length": LENGTH, "side": cells("detail", 0.05, 1.0),
     },
     doses={
-        "rubble": ElementDose(title="rubble", quantity="height", values=_LOW, others={"side": 0.20, "length": 2.00})
+        "rubble": ElementDose("height", _LOW, others={"side": 0.20, "length": 2.00})
     },
     draw_turns=lambda count, rng: rng.uniform(-0.5, 0.5, count),
 )  # fmt: skip

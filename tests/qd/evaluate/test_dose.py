@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.evaluate.dose import dose_set, half_of, measure_dose, rows_of
+from qd.evaluate.dose import dose_set, find_half, measure_dose, measure_rates
 from sim.terrains.doses import parse_doses
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
@@ -57,12 +57,12 @@ def test_rows_are_by_value():
     dose = parse_doses(["ditch=0.2,0.4"], [])["ditch"]
     # Two places of two values each, two episodes: the first value at both places comes first.
     result = result_of([[GOAL, GOAL], [HIT, LATE], [GOAL, BAD], [BAD, BAD]], fallen=[[0, 0], [1, 0], [0, 0], [0, 0]])
-    first, second = rows_of("ditch", dose, "base", result)
+    first, second = measure_rates("ditch", dose, "base", result)
     assert (first["value"], first["goal_rate"], first["episodes"], first["left_out"]) == (0.2, 1.0, 3, 1)
     assert (first["success_rate"], first["fallen_rate"]) == (1.0, 0.0)
     # Half of the second's episodes are invalid, more than a quarter.
     assert (second["goal_rate"], second["interval"], second["episodes"]) == (None, None, 0)
-    half = half_of(dose, [first, second], result)
+    half = find_half(dose, [first, second], result)
     assert (half["value"], half["beyond"], half["interval"]) == (None, "last", [None, None])
 
 
@@ -81,6 +81,6 @@ def test_rows_are_by_value():
 def test_where_under_half_begin_to_reach_the_goal(name, hits, value, beyond, interval):
     dose = parse_doses([f"{name}=0.2,0.4"], [])[name]
     result = result_of([[GOAL] * hit + [HIT] * (2 - hit) for place in hits for hit in place])
-    half = half_of(dose, rows_of(name, dose, "a", result), result)
+    half = find_half(dose, measure_rates(name, dose, "a", result), result)
     assert half["value"] == (None if value is None else pytest.approx(value)) and half["beyond"] == beyond
     assert half["interval"] == [None if limit is None else pytest.approx(limit) for limit in interval]
