@@ -1,9 +1,8 @@
 """Terrain spaces by name: the shipped ones, and those of a user that the command line named."""
 
-import shlex
 from dataclasses import replace
 
-from sim.controllers.spec import ControllerSpec, controller_hash
+from sim.controllers.spec import ControllerSpec
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
 from sim.terrains.conditions.base import CONDITIONS
@@ -14,12 +13,10 @@ from sim.terrains.spaces.names import join_name, split_height, split_name
 from sim.terrains.spaces.on_ground import OnGround
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.under_conditions import UnderConditions
-from sim.terrains.spaces.user import load_user_space
+from sim.terrains.spaces.user import find_user_space, load_user_space
 
 SPACES: dict[str, ShippedSpace] = {}
 """Every shipped space by its name."""
-_loaded: list[TerrainSpace] = []
-"""User spaces that this process was told to run, the latest first."""
 
 
 def register_space(space: ShippedSpace) -> None:
@@ -54,9 +51,7 @@ def load_space(name: str | None) -> TerrainSpace:
     if name and len(once) < len(name):
         raise ValueError(f"a space must have each kind of ground and condition once, got {name}: give {once}")
     if is_user_space(base):
-        sha256 = controller_hash(base)
-        if sha256 is None or not any((space.name, space.sha256) == (base, sha256) for space in _loaded):
-            _loaded.insert(0, load_user_space(base))
+        load_user_space(base)
     return get_space(once)
 
 
@@ -67,10 +62,19 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     """
     base, kinds = split_name(name)
     root, height = split_height(base)
+    space: TerrainSpace
     if height is not None and root in SPACES:
         space = at_height(SPACES[root], height)
+    elif base in SPACES:
+        space = SPACES[base]
+    elif is_user_space(base):
+        space = find_user_space(base, sha256)
     else:
-        space = SPACES.get(base) or _find_loaded(base, sha256)
+        kinds_text = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS))
+        raise ValueError(
+            f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
+            f"some of {kinds_text}"
+        )
     ground = tuple(kind for kind in kinds if kind in GROUND_KINDS)
     conditions = tuple(kind for kind in kinds if kind in CONDITIONS)
     if ground and space.ground:
@@ -102,18 +106,3 @@ def at_height(space: TerrainSpace, height: float) -> TerrainSpace:
     if not 0.0 < height <= MAX_HEIGHT:
         raise ValueError(f"height must lie above 0 and at most at {MAX_HEIGHT:g} m, got {height:g}")
     return replace(space, height=height)
-
-
-def _find_loaded(name: str, sha256: str | None) -> TerrainSpace:
-    if not is_user_space(name):
-        kinds = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS))
-        raise ValueError(
-            f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
-            f"some of {kinds}"
-        )
-    for space in _loaded:
-        if space.name == name if sha256 is None else space.sha256 == sha256:
-            return space
-    if any(space.name == name for space in _loaded):
-        raise ValueError(f"the code of the space {name} has changed since: put it back, or search anew")
-    raise ValueError(f"the space {name} is code, which runs only if named: give --space {shlex.quote(name)}")

@@ -1,6 +1,7 @@
 """Terrain spaces of a user: code that the command line names, tried before any long work."""
 
 import inspect
+import shlex
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -40,6 +41,10 @@ class UserSpace(TerrainSpace):
         for name in ("rasterise", *(["without"] if hasattr(code, "parts") else [])):
             if not callable(getattr(code, name, None)):
                 raise self._wrong(name, "must be a method, got none")
+
+    def __reduce__(self) -> tuple[Any, tuple[str, str | None]]:
+        """Pickles by name and hash: a process that unpickles it has loaded its code before."""
+        return find_user_space, (self.name, self.sha256)
 
     def _setting(self, name: str, default: Any, allowed: Callable[[Any], bool]) -> Any:
         value = getattr(self._code, name, default)
@@ -138,8 +143,29 @@ class UserSpace(TerrainSpace):
         return ValueError(f"space '{self.name}': {what} {text}: docs/terrains.md")
 
 
+LOADED: list[UserSpace] = []
+"""Spaces that this process was told to run, the latest first."""
+
+
+def find_user_space(name: str, sha256: str | None) -> UserSpace:
+    """A space that :func:`load_user_space` loaded, by the hash of its code if there is one."""
+    for space in LOADED:
+        if space.name == name if sha256 is None else space.sha256 == sha256:
+            return space
+    if any(space.name == name for space in LOADED):
+        raise ValueError(f"the code of the space {name} has changed since: put it back, or search anew")
+    raise ValueError(f"the space {name} is code, which runs only if named: give --space {shlex.quote(name)}")
+
+
 def load_user_space(spec: str) -> UserSpace:
-    """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains."""
+    """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains.
+
+    Code that was loaded before, and has not changed, is not run again.
+    """
+    sha256 = controller_hash(spec)
+    for space in LOADED:
+        if sha256 is not None and (space.name, space.sha256) == (spec, sha256):
+            return space
     parsed = ControllerSpec.parse(spec)
     try:
         code: Any = import_object(str(parsed.module), str(parsed.name))
@@ -157,4 +183,5 @@ def load_user_space(spec: str) -> UserSpace:
     space.without(hard, range(len(space.parts(hard[0]))))
     space.scaled(hard, 0.5)
     space.describe(hard[0])
+    LOADED.insert(0, space)
     return space

@@ -9,7 +9,7 @@ import torch
 from qd.commands import ArchiveCommand, DoseCommand
 from qd.faults.causes import find_effects
 from sim.rollout import Rollout
-from sim.terrains.bank import heights_of, terrains_of
+from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_texts, nominal_row
 from sim.terrains.corridor import corridor_maps, num_maps
 from sim.terrains.doses import all_doses, parse_doses
@@ -17,6 +17,7 @@ from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.spaces.registry import SPACES, get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.under_conditions import varied_space
+from sim.terrains.terrains import Terrains
 from tests.sim.terrains.spaces.spaces import write_ridges
 
 
@@ -58,16 +59,15 @@ def test_an_element_appears_wherever_elements_do(name):
     records = space.elements(genes)[0]
     assert {list(ELEMENTS)[number] for number in records["kind"][:1]} == {name}
     assert space.parts(genes[0])[0] == element.text(records[0])
-    assert heights_of(genes, space).any() == (name != "flat")
+    assert make_heights(genes, space).any() == (name != "flat")
 
 
 def test_a_toy_condition_blows_the_robot_forward(anymal):
     space, robot = get_space("super_gaussian+wind"), dataclasses.replace(anymal, max_duration_s=0.4)
     genes = np.zeros((2, 65), np.float32)
     genes[1, 64] = 1.0
-    result = Rollout(robot, anymal.policy_file, num_terrains=2, num_replicas=2, device="cpu", space=space).evaluate(
-        genes, np.array([1, 1], np.uint32)
-    )
+    rollout = Rollout(robot, anymal.policy_file, num_terrains=2, replicas=2, device="cpu", space=space)
+    result = rollout.evaluate(Terrains(genes=genes, seeds=np.array([1, 1], np.uint32), space=space))
     # 5 m/s^2 for 0.4 s without friction would be 0.4 m.
     gain = result.final_position[1, :, 0] - result.final_position[0, :, 0]
     assert (gain > 0.05).all() and (gain < 0.5).all()
@@ -80,8 +80,8 @@ def test_a_terrain_without_all_of_its_parts_is_flat_and_nominal(name, tmp_path):
     space = load_space(name.replace("ridges", write_ridges(tmp_path)))
     genes = space.uniform_random(20, 1) * 1.5
     parts = space.parts(genes[0])
-    heights, ground = terrains_of(space.without(genes, range(len(parts))), space)
-    assert not heights.any() and heights_of(genes, space).any()
+    heights, ground = make_terrains(space.without(genes, range(len(parts))), space)
+    assert not heights.any() and make_heights(genes, space).any()
     if ground is not None:
         assert (ground.friction == 1.0).all() and not ground.time_constant_s.any()
         np.testing.assert_array_equal(ground.rows, np.tile(nominal_row(), (20, 1)))
