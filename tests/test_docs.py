@@ -1,6 +1,5 @@
 """README and docs/ are true: commands are taken, code works, links lead somewhere, numbers are those of their files."""
 
-import importlib
 import re
 import runpy
 import shlex
@@ -41,8 +40,7 @@ def test_pages_are_short_and_readme_leads_to_each():
 def test_commands_are_taken(line):
     program, *flags = pages.run_by_make(shlex.split(line)) if line.startswith("make") else shlex.split(line)
     if program.endswith("faultline") and "--help" not in flags:
-        module = importlib.import_module(COMMANDS[flags[0]].module)
-        tyro.cli(getattr(module, f"{flags[0].capitalize()}Command"), args=flags[1:])
+        tyro.cli(faultline.load_command(flags[0]), args=flags[1:])
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
-from qd.evaluate.sets import elites_sha256, read_elites, read_space, split_elites
+from qd.evaluate.sets import elites_sha256, read_space, split_elites
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.faults.searches import CERTIFIERS_FOLDER
-from qd.search.directory import RunDirectory, find_directory, find_run
+from qd.search.directory import RunDirectory, find_directory, find_run, read_robot_archive
 from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_actor
 from sim.controllers.spec import SHIPPED, controller_hash
@@ -57,7 +57,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         noise = read_start(Path(cfg.recipe.noise_of), robot).actor
         start = replace(start, actor=start.actor | {key: noise[key] for key in noise if key == STD})
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
-    elites = select_elites(robot, cfg)
+    elites = find_training_elites(robot, cfg)
     settings = {
         **dump_settings(cfg, robot),
         "elites": elites.archives,
@@ -97,7 +97,7 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     certificate is a proof of existence, so a certifier may have trained on its terrain. The training works in
     ``<run>/specialist``.
     """
-    archive = read_elites(run, robot, cfg.space)
+    archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)
     if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
@@ -124,13 +124,13 @@ class TrainingElites:
     """Sizes and hash of each archive, for the record."""
 
 
-def select_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
+def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     """The elites to train on, without those that any archive holds out."""
     if cfg.mix != "generated":
         space = space_at(load_space(cfg.space), None, robot)
         return TrainingElites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
-    archives = [read_elites(path, robot, cfg.space) for path in paths]
+    archives = [read_robot_archive(robot, path, cfg.space) for path in paths]
     splits = [split_elites(archive, held_out=cfg.recipe.held_out) for archive in archives]
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):

@@ -16,12 +16,12 @@ import numpy as np
 
 from qd.evaluate.evaluate import cross_sets, evaluate, fill_sizes
 from qd.evaluate.measures import terrain_rates
-from qd.evaluate.sets import MIN_ELITES, Purpose, TerrainSet, generated_set, make_sets, paper_terrains, read_elites
+from qd.evaluate.sets import MIN_ELITES, Purpose, TerrainSet, generated_set, make_sets, paper_terrains
 from qd.evaluate.show import show_table
 from qd.faults.judge import judge
 from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive
-from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed
+from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed, read_robot_archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, differences, preset
 from qd.workers.compute import Compute, check_policy
@@ -176,7 +176,7 @@ class _Hardening:
         terrains = self.cfg.evaluation.terrains
         sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, purpose=purpose))
         for run in searches:
-            archive = read_elites(run, self.robot, self.space.name)
+            archive = read_robot_archive(self.robot, run, self.space.name)
             sets[run.name] = generated_set(archive, terrains, 0, purpose)
         return sets
 

@@ -9,14 +9,13 @@ import numpy as np
 
 from qd.evaluate.labels import COMPARED, HELD_OUT, SetsCfg
 from qd.evaluate.marks import check_untrained, read_trained_on
-from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise, terrain_rates, velocity_error
+from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise_crossings, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     TerrainSet,
     make_sets,
     paper_terrains,
     plain_set,
     random_elites,
-    read_elites,
     read_independent,
     split_elites,
 )
@@ -24,7 +23,7 @@ from qd.evaluate.show import show_comparison, show_rates, show_tables
 from qd.evaluate.tables import Tables, check_seeds, make_tables
 from qd.faults.numbers import EPISODES
 from qd.search.archive import ARCHIVE_FILE, Archive
-from qd.search.directory import RUNS, search_seed
+from qd.search.directory import RUNS, read_robot_archive, search_seed
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine
@@ -139,7 +138,7 @@ def evaluate_tables(
     archive = independent = None
     origin: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
     if cfg.archive is not None:
-        archive = read_elites(cfg.archive, robot, cfg.space)
+        archive = read_robot_archive(robot, cfg.archive, cfg.space)
         sizes = {name: len(rows) for name, rows in vars(split_elites(archive)).items()}
         origin["archive"] = _describe_archive(cfg.archive, archive) | sizes
         origin["archive_sha256"] = _hash_archive(cfg.archive)
@@ -224,8 +223,8 @@ def evaluate_rates(
             **compute.origin(seed),
             **controller_identity(robot, policy),
             "space": terrain_space.name,
-            "hand_crafted": summarise(hand_crafted, seed, types=types, levels=levels),
-            "hard_random": summarise(hard_random, seed),
+            "hand_crafted": summarise_crossings(hand_crafted, seed, types=types, levels=levels),
+            "hard_random": summarise_crossings(hard_random, seed),
             "flat": velocity_error(flat, seed),
         }
 

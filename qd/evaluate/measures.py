@@ -138,7 +138,7 @@ def _summarise_group(rates: dict[str, np.ndarray], mask: np.ndarray) -> dict[str
     return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
 
 
-def summarise(
+def summarise_crossings(
     result: RolloutResult, seed: int, *, types: np.ndarray | None = None, levels: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Rates over a set of terrains, with 95 % intervals and, where known, by type and level."""

@@ -144,21 +144,13 @@ def elites_sha256(archive: Archive) -> str:
     return hashlib.sha256(np.ascontiguousarray(genes).tobytes()).hexdigest()
 
 
-def read_elites(path: Path, robot: RobotCfg, space: str | None = None) -> Archive:
-    """The archive of a search against a robot."""
-    archive = read_robot_archive(robot, path, space)
-    if archive.robot != robot.name:
-        raise ValueError(f"archive {path} must be of robot {robot.name}, got {archive.robot}: give one of that robot")
-    return archive
-
-
 def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, space: str | None = None) -> Archive:
     """The archive of another search, which shares no elite and no ancestor with that of ``archive_path``, if given."""
-    independent = read_elites(path, robot, space)
+    independent = read_robot_archive(robot, path, space)
     if not len(independent):
         raise ValueError(f"independent must be a search that found something, got {path} without elites")
     if archive_path is not None:
-        archive = read_elites(archive_path, robot, space)
+        archive = read_robot_archive(robot, archive_path, space)
         seed = search_seed(path)
         shared = len({*hash_elites(independent.genes)} & {*hash_elites(archive.genes)})
         other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)

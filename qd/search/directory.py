@@ -95,14 +95,15 @@ def search_seed(run: Path) -> int | None:
 
 
 def read_robot_archive(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
-    """An archive whose terrains a robot can cross; one of the robot's own must be of the robot as it is now.
+    """The archive of a search against a robot as it is now.
 
     ``space`` is the terrain space that the command line names, for one of a user's own.
     """
     archive = read_archive(run)
     check_space(archive, space)
-    if archive.robot == robot.name:
-        check_robot_identity(archive.named(), robot, run, "search again, or give another archive")
+    if archive.robot != robot.name:
+        raise ValueError(f"archive {run} must be of robot {robot.name}, got {archive.robot}: give one of that robot")
+    check_robot_identity(archive.named(), robot, run, "search again, or give another archive")
     return archive
 
 

@@ -9,7 +9,7 @@ import pytest
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from train.cfg import FinetuneCfg
-from train.finetune import FineTuning, select_elites
+from train.finetune import FineTuning, find_training_elites
 from train.ppo.checkpoint import read_start
 from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
@@ -37,5 +37,5 @@ def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> FineTuning:
     """A fine-tuning on the CPU that has not iterated yet."""
     start = read_start(Path(cfg.policy or robot.policy_file), robot)
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
-    elites = select_elites(robot, cfg)
+    elites = find_training_elites(robot, cfg)
     return FineTuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)

@@ -23,7 +23,7 @@ from tests.train.conftest import begun
 from tests.train.starts import PPO, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import FinetuneCommand
-from train.finetune import finetune, select_elites, train_specialist
+from train.finetune import find_training_elites, finetune, train_specialist
 from train.ppo import training
 from train.ppo.checkpoint import STD, read_checkpoint, read_start
 from train.task.task import CommandTask
@@ -189,7 +189,7 @@ def test_archives_are_trained_on_together_but_for_what_any_of_them_holds_out(pla
     }
     for name, archive in made.items():
         write_archive(places / f"{name}.npz", archive)
-    elites = select_elites(ROBOT, cfg_of(places, archive=tuple(str(places / f"{name}.npz") for name in made)))
+    elites = find_training_elites(ROBOT, cfg_of(places, archive=tuple(str(places / f"{name}.npz") for name in made)))
     assert [space.name for space in elites.spaces] == ["super_gaussian", "super_gaussian", "course"]
     assert len(elites.genes[2]) == 7  # two of ten are in the test and one validates
     split = split_elites(whole)
@@ -223,12 +223,12 @@ def test_which_elites_are_trained_on(places, searched):
     train = set(hash_elites(genes[split_elites(make_archive(10)).train]))
     for only, count in (("all", 10), ("failing", 8)):
         whole, held = (
-            select_elites(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held_out)).genes[0]
+            find_training_elites(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held_out)).genes[0]
             for held_out in (False, True)
         )
         assert set(hash_elites(whole)) == set(hash_elites(genes[:count]))
         assert set(hash_elites(held)) == train & set(hash_elites(whole))
-    elites = select_elites(ROBOT, cfg_of(places, archive=archive, only="failing"))
+    elites = find_training_elites(ROBOT, cfg_of(places, archive=archive, only="failing"))
     assert elites.goal_rate is not None and set(elites.goal_rate) == {0.1}
     made = make_archive(10)
     write_archive(places / "crossed.npz", replace(made, fresh=replace(fresh_values(made), goal_rate=np.ones(10))))
@@ -236,9 +236,9 @@ def test_which_elites_are_trained_on(places, searched):
     own = replace(ROBOT, settings_file=Path("/mine/robot.toml"))
     for robot, named in ((ROBOT, ""), (own, "--robot /mine/robot.toml ")):
         with pytest.raises(ValueError, match=f"`faultline judge {named}--run {unjudged}`"):
-            select_elites(robot, cfg_of(places, archive=(str(unjudged),), only="failing"))
+            find_training_elites(robot, cfg_of(places, archive=(str(unjudged),), only="failing"))
     with pytest.raises(ValueError, match="elites to train on"):
-        select_elites(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
+        find_training_elites(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
 
 
 def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, searched):

@@ -24,7 +24,7 @@ _HEADER = (
 )
 
 
-class Progress:
+class TrainingProgress:
     """Collects iterations into rows, which are printed, written to TensorBoard and recorded."""
 
     def __init__(

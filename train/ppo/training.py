@@ -27,7 +27,7 @@ from sim.robots.robot import RobotCfg
 from train.cfg import TrainCfg
 from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, read_checkpoint, write_checkpoint
 from train.ppo.learner import Learner, Ranks
-from train.ppo.progress import Progress
+from train.ppo.progress import TrainingProgress
 from train.task.curriculum import Tiles
 from train.task.task import CommandTask
 from train.task.vec_env import CommandVecEnv
@@ -172,7 +172,7 @@ class Training:
         self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=tiles is None)
         if saved is not None:
             self.learner.resume(saved)
-        self.progress = Progress(
+        self.progress = TrainingProgress(
             run_dir,
             self.learner,
             cfg.iterations,

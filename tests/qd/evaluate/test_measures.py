@@ -8,7 +8,7 @@ import pytest
 from qd.evaluate.measures import (
     kind_mean,
     measure,
-    summarise,
+    summarise_crossings,
     terrain_rates,
     valid_interval,
     valid_mean,
@@ -37,7 +37,7 @@ def test_everything_is_a_mean_over_valid_episodes():
     assert measured.penalties["vel_x"] == pytest.approx([1.5, np.nan], nan_ok=True)  # (1 + 2 + 6) / 3 by the scale of 2
     assert measured.episodes.tolist() == [3, 0] and measured.goals.tolist() == [2, 0]
     assert measured.valid.tolist() == [True, False]
-    summary = summarise(result, 0)
+    summary = summarise_crossings(result, 0)
     assert summary["success_rate"] == pytest.approx(2 / 3)
     assert (summary["terrains"], summary["invalid_terrains"], summary["outcomes"]["invalid"]) == (2, 1, 3)
     with pytest.raises(ValueError, match="reward"):
@@ -83,7 +83,7 @@ def test_intervals_of_kinds_cover_the_truth():
 
 def test_groups():
     result = result_of([[GOAL], [HIT], [GOAL], [LATE]])
-    summary = summarise(result, 0, types=np.array([0, 0, 4, 4]), levels=np.array([1, 9, 9, 9]))
+    summary = summarise_crossings(result, 0, types=np.array([0, 0, 4, 4]), levels=np.array([1, 9, 9, 9]))
     assert summary["by_type"]["slope"] == {"terrains": 2, "success_rate": 0.5, "goal_rate": 0.5, "fallen_rate": 0.0}
     assert summary["by_type"]["boxes"]["success_rate"] == 1.0
     assert summary["by_level"]["9"]["goal_rate"] == pytest.approx(1 / 3)
