@@ -127,12 +127,12 @@ def count_faults(archive: Archive) -> int | None:
 
 def best_certifier(archive: Archive, number: int, among: Container[str] | None = None) -> str | None:
     """Name of the certifier that crosses an elite most often, of all or of some; None if none has a certificate."""
-    if not archive.certified[number]:
+    if not archive.failing[number]:
         return None
     rates = goal_rates(archive.certifier_outcomes[number]) * archive.certificates[number]
-    rate_by_name = dict(zip(archive.certifiers, rates.tolist(), strict=True))
-    names = [name for name, rate in rate_by_name.items() if rate > 0.0 and (among is None or name in among)]
-    return max(names, key=rate_by_name.__getitem__, default=None)
+    certifiers = dict(zip(archive.certifiers, rates.tolist(), strict=True))
+    names = [name for name, rate in certifiers.items() if rate > 0.0 and (among is None or name in among)]
+    return max(names, key=certifiers.__getitem__, default=None)
 
 
 def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
