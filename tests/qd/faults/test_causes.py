@@ -17,10 +17,14 @@ from qd.faults.causes import (
     list_kinds,
     measure_shape,
 )
+from qd.faults.searches import Search
+from qd.faults.stages.fresh import with_families
+from sim.robots.shipped import ROBOTS
 from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import bump
+from tests.builders import bump, fresh_values, small_archive
+from tests.qd.searches import CFG
 
 Y, X = np.meshgrid(SPACING * np.arange(NUM_ROWS), SPACING * np.arange(NUM_COLS), indexing="ij")
 HALF_WIDTH = 0.4
@@ -106,8 +110,14 @@ def test_effects_of_parts_add_up():
 
 
 @pytest.mark.parametrize(("half_width", "cause"), [(0.1, "unclear"), (0.6, "ridge end")])
-def test_causes_depend_on_the_width_of_the_robot(half_width, cause):
+def test_causes_depend_on_the_width_of_the_robot_that_was_searched(half_width, cause):
     # It begins half a metre left of the way, where a narrow robot does not step.
     beside = bump(x=8.0, y=4.9, sigma_x=0.5, sigma_y=0.5, height=0.25)
     genes = np.concatenate([beside, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 7])[None]
-    assert find_causes(genes, np.array([[8.0, 4.0]]), SUPER_GAUSSIAN, half_width) == [cause]
+    ends = np.array([[8.0, 4.0]])
+    assert find_causes(genes, ends, SUPER_GAUSSIAN, half_width) == [cause]
+    archive = dataclasses.replace(small_archive(1), genes=genes, end_position=ends, goal_rate=np.zeros(1))
+    archive = dataclasses.replace(archive, fresh=fresh_values(archive))
+    robot = dataclasses.replace(ROBOTS["anymal"], name="mine", footprint=(0.5, half_width))
+    search = Search(run=Path("run"), cfg=CFG, robot=robot, policy="", space=SUPER_GAUSSIAN)
+    assert with_families(archive, search).cause.tolist() == [cause]
