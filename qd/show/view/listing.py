@@ -13,11 +13,11 @@ from qd.faults.minimise.minimise import MinimalTerrains
 from qd.faults.numbers import best_certifier, describe_judgement
 from qd.search.archive import Archive
 from qd.show.crossed import ARRIVED, FAILED, count_rates
+from qd.show.elites import OpenedRun
 from sim.crossing import CrossingCfg
 from sim.files.intervals import format_rate
 from sim.files.templates import open_templates
 from sim.recording.recorder import Recording
-from sim.terrains.spaces.base import TerrainSpace
 
 TEMPLATES = open_templates(Path(__file__).parent / "templates")
 """HTML of the page."""
@@ -42,19 +42,21 @@ Column = tuple[str, int, Mapping[str, int]]
 
 @dataclass(frozen=True, kw_only=True)
 class Listing:
-    """All elites of an archive."""
+    """All elites of a run, at least one."""
 
-    archive: Archive
-    """It has at least one."""
-    space: TerrainSpace
-    half_width: float
-    """Of the robot's stance [m]."""
+    opened_run: OpenedRun
     minima: MinimalTerrains | None = None
+
+    @property
+    def archive(self) -> Archive:
+        """The elites."""
+        return self.opened_run.archive
 
     @cached_property
     def ranking(self) -> Ranking:
         """All elites, their causes and families."""
-        return rank(self.archive, self.space, self.minima, half_width=self.half_width)
+        run = self.opened_run
+        return rank(run.archive, run.space, self.minima, half_width=run.robot.half_width)
 
     @cached_property
     def _orders(self) -> dict[str, NDArray[np.int64]]:

@@ -334,7 +334,7 @@ class Tab:
         name = show.listing.ranking.name(elite)
         minimal_genes = show.minimal_genes(elite)
         genes = minimal_genes if self.minimal and minimal_genes is not None else self._archive.genes[elite]
-        conditions = show.listing.space.condition_text(genes)
+        conditions = show.opened_run.space.condition_text(genes)
         facts = filter(None, (f"elite {elite} of {len(self._archive):,}", show.listing.verdict(elite), conditions))
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         self.panel.show_elite(

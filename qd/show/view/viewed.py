@@ -39,10 +39,7 @@ class ViewedRun:
     @cached_property
     def listing(self) -> Listing:
         """All elites, and the orders to list them in."""
-        return Listing(
-            archive=self.opened_run.archive, space=self.opened_run.space, minima=self.minima,
-            half_width=self.robot.half_width,
-        )  # fmt: skip
+        return Listing(opened_run=self.opened_run, minima=self.minima)
 
     @property
     def robot(self) -> RobotCfg:

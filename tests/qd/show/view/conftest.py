@@ -1,12 +1,13 @@
 """What tests of the page share."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from qd.show.elites import OpenedRun
 from qd.show.view.listing import Listing
-from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import small_archive
 
 
@@ -17,7 +18,7 @@ def run(published):
 
 
 @pytest.fixture
-def listing():
+def listing(anymal):
     """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
     numbers = np.arange(20)
     archive = dataclasses.replace(
@@ -27,4 +28,4 @@ def listing():
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return Listing(archive=archive, space=SUPER_GAUSSIAN, half_width=0.4)
+    return Listing(opened_run=OpenedRun(path=Path(), archive=archive, robot=anymal))

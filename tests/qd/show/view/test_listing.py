@@ -1,13 +1,18 @@
 import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 
+from qd.show.elites import OpenedRun
 from qd.show.view.listing import Listing, count_endings, render_rates
 from qd.show.view.panels import Clock, Selection
-from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
+
+
+def list_archive(archive, robot):
+    return Listing(opened_run=OpenedRun(path=Path(), archive=archive, robot=robot))
 
 
 def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(listing):
@@ -34,8 +39,8 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(lis
     assert rows == [("12", "crossed, 12 of 20"), ("0", listing.ranking.name(0))]
 
 
-def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
-    listing = Listing(archive=judged_archive(), space=SUPER_GAUSSIAN, half_width=0.4)
+def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
+    listing = list_archive(judged_archive(), anymal)
     assert "It is a fault" in listing.details(0)
     fresh, resolved, certifier = listing.columns(0)
     assert all(len(listing.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
@@ -52,10 +57,10 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way():
     assert "<b>45%</b> <small>26 to 66%</small>" in table
 
 
-def test_an_elite_whose_fresh_episodes_are_invalid_is_listed_as_found():
+def test_an_elite_whose_fresh_episodes_are_invalid_is_listed_as_found(anymal):
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 0, 39]))
-    listing = Listing(archive=dataclasses.replace(archive, fresh=fresh), space=SUPER_GAUSSIAN, half_width=0.4)
+    listing = list_archive(dataclasses.replace(archive, fresh=fresh), anymal)
     ((head, count, hits),) = listing.columns(2)
     assert (head, count, hits["collision_rate"]) == ("as found", 4, 4)
 
