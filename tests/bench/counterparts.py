@@ -107,6 +107,10 @@ def observation(
     return torch.cat(row, dim=1).clamp_(-columns.OBSERVATION_LIMIT, columns.OBSERVATION_LIMIT)
 
 
+PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
+"""Columns of :func:`penalties`."""
+
+
 def penalties(
     joint_q: Tensor, joint_qd: Tensor, base_com: Tensor, command: Tensor, geom_force: Tensor, feet: Tensor,
     base_and_limbs: Tensor, counted: Tensor, sums: Tensor, force_limit: float, dt: float,

@@ -7,7 +7,6 @@ import pytest
 import torch
 import warp as wp
 
-from tests.bench import __main__ as bench
 from tests.bench.__main__ import file_name, main
 from tests.bench.cases import build_scene, make_cases
 from tests.bench.ceiling import CHAINS, UNROLLED, Ceiling, Work, chains_of, exponential, launch, multiply_add
@@ -63,21 +62,6 @@ CEILING = Ceiling(
 )
 def test_what_bounds_a_kernel(work, seconds, share, bound_by):
     assert CEILING.judge(work, seconds) == (pytest.approx(share), bound_by)
-
-
-@pytest.mark.parametrize(
-    ("words", "folder"),
-    [([], "results"), (["--num-envs", "16"], "results"), (["--num-envs", "3"], "runs/make"),
-     (["--robot", "cassie"], "runs/make"), (["--small"], "runs/make/small")],
-)  # fmt: skip
-def test_only_the_usual_robot_and_number_are_published(tmp_path, monkeypatch, words, folder):
-    """Without a kernel: nothing is timed."""
-    for name in ("build_scene", "measure_ceiling", "print_table"):
-        monkeypatch.setattr(bench, name, lambda *given, **named: None)
-    monkeypatch.setattr(bench, "make_cases", lambda scene: {})
-    monkeypatch.chdir(tmp_path)
-    main(["--device", "cpu", *words])
-    assert [str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*.json")] == [f"{folder}/bench/cpu.json"]
 
 
 def test_command(tmp_path, device, capsys, monkeypatch):

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.heightfield import (
-    Terrain,
-    ceiling_over,
-    max_blocks,
-    nearest_surface_point,
-)
+from kernels.heightfield import Terrain, ceiling_over, max_blocks, nearest_surface_point
 from tests.kernels import oracle
 from tests.kernels.states import SPACING, make_terrain, rough
 
