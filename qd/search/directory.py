@@ -193,8 +193,9 @@ class RunDirectory:
         try:
             return from_settings(config["settings"], config["iterations"])
         except ValueError as error:
-            of = f"{self.path / CONFIG_FILE}: {error}"
-            raise ValueError(f"{of}: another version wrote it, or it is damaged; {_REMEDY}") from None
+            raise ValueError(
+                f"{self.path / CONFIG_FILE} is damaged or of another version: {error}; {_REMEDY}"
+            ) from None
 
     def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
         """Writes what the run is asked to do from now on, after ``done`` iterations.

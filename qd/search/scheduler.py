@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, select_terrains
 from qd.search.grid import FIELDS, grid_rows, make_grid
-from qd.search.methods.base import Method, Setup, Told
+from qd.search.methods.base import Columns, Method, Setup
 from qd.search.methods.registry import METHODS
 from qd.search.pool import Pool
 from qd.search.presets import SchedulerCfg
@@ -129,10 +129,10 @@ class Scheduler:
         size = num_new // max(1, len(emitters))
         batches = {emitter: slice(k * size, (k + 1) * size) for k, emitter in enumerate(emitters)}
         for method in self.methods:
-            method.tell(Told(evaluation, rows, added, batches))
+            method.tell(evaluation, rows, added, batches)
         return num_new
 
-    def _add(self, rows: dict[str, NDArray[Any]], accepted: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    def _add(self, rows: Columns, accepted: NDArray[np.bool_]) -> Columns:
         """Adds accepted terrains to the archive; status and value of each as pyribs gives them to its emitters."""
         added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
         if accepted.any():
@@ -149,7 +149,7 @@ class Scheduler:
             terrains = select_terrains(pool.terrains, rows)
             self._archive.add(**grid_rows(pool.solutions[rows], terrains, pool.iteration[rows]))
 
-    def elites(self) -> dict[str, NDArray[Any]]:
+    def elites(self) -> Columns:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""
         data: Any = self._archive.data()
         order = np.lexsort((data["index"], -data["objective"]))

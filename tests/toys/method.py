@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.search.methods.base import Method, MethodCfg, Setup, Told
+from qd.search.methods.base import Columns, Method, MethodCfg, Setup
 from qd.search.methods.registry import METHODS
 
 
@@ -30,8 +30,8 @@ class Toy(Method):
         rows = [self.first[self.emitters.index(emitter) * self.batch_size :][: self.batch_size] for emitter in emitters]
         return np.concatenate(rows) + np.float32(self.step * self.num_crossed)
 
-    def tell(self, told: Told) -> None:
-        self.num_crossed += len(told.evaluation.fitness)
+    def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:
+        self.num_crossed += len(evaluation.fitness)
 
 
 METHODS["toy"] = Toy

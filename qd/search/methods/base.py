@@ -5,7 +5,7 @@ Settings are shown by ``--help``, so these files load nothing heavy before a met
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from qd.search.fitness import Evaluation
     from sim.terrains.spaces.base import TerrainSpace
 
+Columns = dict[str, NDArray[Any]]
+"""Arrays with one row a terrain."""
 Sigma = Annotated[float, Meta(ge=0, le=1e3)]
 """A standard deviation of changes of genes."""
 
@@ -73,19 +75,6 @@ class Setup:
         return np.random.SeedSequence(self.seed, spawn_key=(index,))
 
 
-class Told(NamedTuple):
-    """Terrains that robots have crossed for one group of emitters, whichever method asked for them."""
-
-    evaluation: "Evaluation"
-    """What is known of T terrains."""
-    rows: dict[str, NDArray[Any]]
-    """The same as a pyribs archive takes it; ``solution`` has the unclipped genes, shape (T, num_genes)."""
-    added: dict[str, NDArray[Any]]
-    """Status and value of each by the search's archive, as pyribs gives them to its emitters, shape (T,)."""
-    batches: dict[int, slice]
-    """Rows of the new terrains of each emitter by its number; none where all were crossed again."""
-
-
 class Method:
     """A source of new terrains for some of a search's emitters; a checkpoint holds it as it is.
 
@@ -123,8 +112,15 @@ class Method:
         """
         return np.concatenate([self.sources[emitter].ask() for emitter in emitters])
 
-    def tell(self, told: Told) -> None:
-        """Learns from crossed terrains; a method that learns nothing leaves this out."""
+    def tell(self, evaluation: "Evaluation", rows: Columns, added: Columns, batches: dict[int, slice]) -> None:
+        """Learns from T terrains that robots have crossed for a group of emitters, whichever method asked for them.
+
+        Args:
+            evaluation: What is known of them.
+            rows: The same as a pyribs archive takes it; ``solution`` has unclipped genes, shape (T, num_genes).
+            added: Status and value of each by the search's archive, as pyribs gives them to its emitters, shape (T,).
+            batches: Rows of the new terrains of each emitter by its number; none where all were crossed again.
+        """
 
     def compute_on(self, device: str) -> None:
         """Moves what it computes to a Warp device."""

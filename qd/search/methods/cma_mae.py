@@ -3,9 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from numpy.typing import NDArray
-
-from qd.search.methods.base import Setup, Told
+from qd.search.methods.base import Columns, Setup
 from qd.search.methods.cma_me import CmaMe, CmaMeCfg
 from sim.files.settings import PositiveInt, Share
 
@@ -36,5 +34,5 @@ class CmaMae(CmaMe):
     def _rules(self, cfg: Any) -> dict[str, Any]:
         return {"ranker": "imp", "selection_rule": "mu", "restart_rule": cfg.restart_rule}
 
-    def _add(self, told: Told) -> dict[str, NDArray[Any]]:
-        return self.archive.add(**told.rows)
+    def _add(self, rows: Columns, added: Columns) -> Columns:
+        return self.archive.add(**rows)

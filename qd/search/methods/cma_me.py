@@ -5,9 +5,8 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from qd.search.methods.base import Method, MethodCfg, Setup, Told
+from qd.search.methods.base import Columns, Method, MethodCfg, Setup
 
 Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
 """A first step size that evolution strategies can reckon with; genes are float32 in [-1, 1]."""
@@ -51,18 +50,18 @@ class CmaMe(Method):
         """How a strategy ranks, selects and restarts."""
         return {"ranker": "2imp", "selection_rule": "filter", "restart_rule": "no_improvement"}
 
-    def _add(self, told: Told) -> dict[str, NDArray[Any]]:
+    def _add(self, rows: Columns, added: Columns) -> Columns:
         """Status and value of each terrain by the archive that strategies are judged by."""
-        return told.added
+        return added
 
-    def tell(self, told: Told) -> None:
+    def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:
         """Tells each strategy what became of its own terrains."""
-        added = self._add(told)
+        added = self._add(rows, added)
         if self.archive.empty:  # a strategy that restarts now would have no elite to start from
             return
-        for emitter, batch in told.batches.items():
+        for emitter, batch in batches.items():
             if emitter in self.sources:
                 self.sources[emitter].tell(
-                    **{name: values[batch] for name, values in told.rows.items()},
+                    **{name: values[batch] for name, values in rows.items()},
                     add_info={name: values[batch] for name, values in added.items()},
                 )

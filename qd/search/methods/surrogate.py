@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.search.methods.base import Method, Setup, Told
+from qd.search.methods.base import Columns, Method, Setup
 from qd.search.surrogate.cfg import SurrogateCfg
 
 
@@ -29,9 +29,9 @@ class SurrogateSearch(Method):
         count = len(emitters) * self.batch_size
         return self.surrogate.propose(count, elites["genes"], elites["index"], elites["objective"], pending)
 
-    def tell(self, told: Told) -> None:
+    def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:
         """Trains the networks on what became of all terrains."""
-        self.surrogate.learn(told.rows["solution"], told.evaluation)
+        self.surrogate.learn(rows["solution"], evaluation)
 
     def compute_on(self, device: str) -> None:
         """Moves the networks to a Warp device."""

@@ -27,7 +27,7 @@ MIN_TERRAINS = 64
 """Valid terrains that must be known before the networks are asked."""
 MAX_TERRAINS = 200_000
 """Terrains that are learned from, the newest ones; fewer where their maps would take more than 8 GB."""
-MAX_BYTES = 8 << 30
+MAX_MAP_BYTES = 8 << 30
 """Memory of the maps of these."""
 _CHUNK = {"cpu": 1024, "cuda": 8192}  # terrains that are judged in one pass
 _GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
@@ -99,7 +99,7 @@ class Surrogate:
     @property
     def _capacity(self) -> int:
         """Terrains that it learns from at most."""
-        return min(MAX_TERRAINS, MAX_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
+        return min(MAX_TERRAINS, MAX_MAP_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
 
     def __len__(self) -> int:
         """Terrains that it learns from."""

@@ -230,7 +230,7 @@ def test_before_it_knows_enough_it_draws_and_varies():
     assert 0.0 < np.abs(later - first[0]).max() < 0.2  # one elite, varied by .02
 
 
-@pytest.mark.parametrize(("name", "value"), [("MAX_TERRAINS", 70), ("MAX_BYTES", 70 * 41 * 121 * 2 + 1)])
+@pytest.mark.parametrize(("name", "value"), [("MAX_TERRAINS", 70), ("MAX_MAP_BYTES", 70 * 41 * 121 * 2 + 1)])
 def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name, value):
     monkeypatch.setattr(module, name, value)
     search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=1))
