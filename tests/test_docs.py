@@ -23,8 +23,6 @@ from tests.docs import PAGES, ROOT, code_of, text_of
 from tests.qd.stand_in import open_stand_in
 from tests.sim.dogs import urdf
 
-COMMANDS = {word: command for group in faultline.COMMANDS.values() for word, command in group.items()}
-
 
 def test_pages_are_short_and_readme_leads_to_each():
     assert len(text_of("README.md").splitlines()) <= 130
