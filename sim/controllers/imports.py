@@ -4,19 +4,21 @@ import os
 import re
 import shutil
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from sim.controllers.formats import isaac_lab, mjlab, rl_sar, unitree_rl_gym, weights
+from sim.controllers.formats.isaac_lab import IsaacLab
+from sim.controllers.formats.mjlab import Mjlab
+from sim.controllers.formats.rl_sar import RlSar
 from sim.controllers.formats.source import Source
+from sim.controllers.formats.unitree_rl_gym import UnitreeRlGym
+from sim.controllers.formats.weights import Weights
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
 from sim.robots.user import NEW_NAME, is_new_name
 
-FORMATS: tuple[ModuleType, ...] = (isaac_lab, unitree_rl_gym, rl_sar, mjlab, weights)
-"""Formats of sources: the first whose ``matches(path)`` is true has ``read(path, source)``, which returns the file of
-the weights. A path that a format cannot read is a ValueError."""
+FORMATS = (IsaacLab(), UnitreeRlGym(), RlSar(), Mjlab(), Weights())
+"""Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
 _SETTINGS_BY_FILE = {
     "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
                    "max_duration_s"),
@@ -50,7 +52,7 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         raise ValueError(f"{copy} must be a copy of {weights_file}, got other weights: move them away first")
     out.mkdir(parents=True, exist_ok=True)
     source.set(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights_file.name)
-    print(f"{path} is read as {source_format.LABEL}; its weights are {weights_file}.")
+    print(f"{path} is read as {source_format.label}; its weights are {weights_file}.")
     if not copy.exists():
         shutil.copyfile(weights_file, copy)
     for file, names in _SETTINGS_BY_FILE.items():
@@ -65,14 +67,14 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         print(f"  {command_line(name, robot=out / 'robot.toml')}")
 
 
-def _find_format(path: Path) -> ModuleType:
+def _find_format(path: Path) -> Any:
     for source_format in FORMATS:
         if source_format.matches(path):
             return source_format
-    raise ValueError(f"{path} must be {', or '.join(source_format.LABEL for source_format in FORMATS)}")
+    raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
 
 
-def _read(source_format: ModuleType, path: Path, source: Source) -> Path:
+def _read(source_format: Any, path: Path, source: Source) -> Path:
     """The file of the weights; errors name the source and its format."""
     try:
         return source_format.read(path, source)
@@ -82,7 +84,7 @@ def _read(source_format: ModuleType, path: Path, source: Source) -> Path:
         problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         if not isinstance(error, KeyError | ValueError):
             problem = f"it is laid out otherwise ({type(error).__name__}: {error})"
-        raise ValueError(f"{path} must be {source_format.LABEL}, but {problem}") from None
+        raise ValueError(f"{path} must be {source_format.label}, but {problem}") from None
 
 
 def _format_setting(name: str, source: Source) -> str:

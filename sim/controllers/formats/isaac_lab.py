@@ -14,8 +14,6 @@ from sim.robots.compiled import PER_JOINT
 from sim.robots.robot import RobotCfg
 from sim.robots.user import per_joint
 
-LABEL: str = "a run of Isaac Lab (a folder with params/env.yaml)"
-
 _TERMS = {
     "base_lin_vel": "lin_vel",
     "base_ang_vel": "ang_vel",
@@ -30,44 +28,48 @@ _TERMS = {
 _IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
 
 
-def matches(path: Path) -> bool:
-    """Whether it is a folder with params/env.yaml."""
-    return (path / "params" / "env.yaml").is_file()
+class IsaacLab:
+    """Reads env.yaml and agent.yaml of a run."""
 
+    label = "a run of Isaac Lab (a folder with params/env.yaml)"
 
-def read(path: Path, source: Source) -> Path:
-    """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
-    source.file = path / "params" / "env.yaml"
-    env = read_yaml(source.file)
-    articulation = env["scene"]["robot"]
-    pose = articulation["init_state"]["joint_pos"]
-    pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
-    source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
-    _read_actuators(articulation["actuators"], source)
-    source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
-    _read_speed(env, source)
-    joint_order = _read_action(env["actions"], path, source)
-    group = env["observations"]["policy"]
-    terms = {name: term for name, term in group.items() if isinstance(term, dict)}
-    common = group.get("history_length")
-    lengths = [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
-    rows = [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
-    source.set_history(rows, lengths)
-    reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
-    source.set(observation=rows, reason=reason)
-    agent_file = path / "params" / "agent.yaml"
-    agent = read_yaml(agent_file) if agent_file.is_file() else {}
-    if agent.get("clip_actions") is not None:
-        source.set(action_clip=agent["clip_actions"])
-    exported = [file for name in ("policy.pt", "policy.onnx") if (file := path / "exported" / name).is_file()]
-    if exported:
-        return exported[0]
-    checkpoints = sorted(path.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
-    if not checkpoints:
-        raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
-    if (activation := read_activation(agent)) is not None:
-        source.set(activation=activation)
-    return checkpoints[-1]
+    def matches(self, path: Path) -> bool:
+        """Whether it is a folder with params/env.yaml."""
+        return (path / "params" / "env.yaml").is_file()
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
+        source.file = path / "params" / "env.yaml"
+        env = read_yaml(source.file)
+        articulation = env["scene"]["robot"]
+        pose = articulation["init_state"]["joint_pos"]
+        pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+        source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
+        _read_actuators(articulation["actuators"], source)
+        source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
+        _read_speed(env, source)
+        joint_order = _read_action(env["actions"], path, source)
+        group = env["observations"]["policy"]
+        terms = {name: term for name, term in group.items() if isinstance(term, dict)}
+        common = group.get("history_length")
+        lengths = [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
+        rows = [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
+        source.set_history(rows, lengths)
+        reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
+        source.set(observation=rows, reason=reason)
+        agent_file = path / "params" / "agent.yaml"
+        agent = read_yaml(agent_file) if agent_file.is_file() else {}
+        if agent.get("clip_actions") is not None:
+            source.set(action_clip=agent["clip_actions"])
+        exported = [file for name in ("policy.pt", "policy.onnx") if (file := path / "exported" / name).is_file()]
+        if exported:
+            return exported[0]
+        checkpoints = sorted(path.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
+        if not checkpoints:
+            raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
+        if (activation := read_activation(agent)) is not None:
+            source.set(activation=activation)
+        return checkpoints[-1]
 
 
 def _read_actuators(groups: dict[str, Any], source: Source) -> None:

@@ -10,8 +10,6 @@ import onnx
 from sim.controllers.formats.network import load_network
 from sim.controllers.formats.source import TERM_NAMES, Source, make_term
 
-LABEL: str = "a controller of mjlab (an ONNX file with its metadata)"
-
 _SETTINGS = {
     "default_joint_pos": "default_joint_pos",
     "joint_stiffness": "stiffness",
@@ -27,34 +25,38 @@ def _read_metadata(file: Path) -> Mapping[str, str]:
         raise ValueError(f"{file} is no ONNX file: {error}") from None
 
 
-def matches(path: Path) -> bool:
-    """Whether it is an ONNX file that names its observations."""
-    return path.suffix == ".onnx" and path.is_file() and "observation_names" in _read_metadata(path)
+class Mjlab:
+    """Reads the metadata of an ONNX file."""
 
+    label = "a controller of mjlab (an ONNX file with its metadata)"
 
-def read(path: Path, source: Source) -> Path:
-    """Settings of the metadata; the file is also that of the weights."""
-    load_network(path, "cpu", None, label="it")  # refuses a damaged file
-    content: dict[str, Any] = {key: text.split(",") for key, text in _read_metadata(path).items() if text}
-    names = content.pop("observation_names")
-    joints = content.pop("joint_names")
-    source.refuse_unknown(names, TERM_NAMES)
-    source.move({key: [*map(float, content.pop(key))] for key in _SETTINGS}, _SETTINGS, joints)
-    source.set_joints(joints)
-    source.set(physics_dt=0.005, decimation=4, reason="the metadata do not say it; mjlab's own tasks are like this")
-    scales, clips, lengths = (
-        content.pop(f"observation_terms_{name}", [""] * len(names)) for name in ("scale", "clip", "history_length")
-    )
-    source.refuse_unknown(content, ("run_path", "command_names", "observation_terms_flatten_history_dim"))
-    terms = []
-    reason = ""
-    for name, scale, clip in zip(names, scales, clips, strict=True):
-        imu = source.find_imu() if TERM_NAMES[name] == "lin_vel" else None
-        if imu is not None:
-            reason = "the velocity is that of the IMU's site"
-        limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
-        limits = np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None
-        terms.append(make_term(TERM_NAMES[name], float(scale or 1.0), clip=limits, at=imu))
-    source.set_history(terms, [max(1, round(float(length or 0))) for length in lengths])
-    source.set(observation=terms, reason=reason)
-    return path
+    def matches(self, path: Path) -> bool:
+        """Whether it is an ONNX file that names its observations."""
+        return path.suffix == ".onnx" and path.is_file() and "observation_names" in _read_metadata(path)
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of the metadata; the file is also that of the weights."""
+        load_network(path, "cpu", None, label="it")  # refuses a damaged file
+        content: dict[str, Any] = {key: text.split(",") for key, text in _read_metadata(path).items() if text}
+        names = content.pop("observation_names")
+        joints = content.pop("joint_names")
+        source.refuse_unknown(names, TERM_NAMES)
+        source.move({key: [*map(float, content.pop(key))] for key in _SETTINGS}, _SETTINGS, joints)
+        source.set_joints(joints)
+        source.set(physics_dt=0.005, decimation=4, reason="the metadata do not say it; mjlab's own tasks are like this")
+        scales, clips, lengths = (
+            content.pop(f"observation_terms_{name}", [""] * len(names)) for name in ("scale", "clip", "history_length")
+        )
+        source.refuse_unknown(content, ("run_path", "command_names", "observation_terms_flatten_history_dim"))
+        terms = []
+        reason = ""
+        for name, scale, clip in zip(names, scales, clips, strict=True):
+            imu = source.find_imu() if TERM_NAMES[name] == "lin_vel" else None
+            if imu is not None:
+                reason = "the velocity is that of the IMU's site"
+            limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
+            limits = np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None
+            terms.append(make_term(TERM_NAMES[name], float(scale or 1.0), clip=limits, at=imu))
+        source.set_history(terms, [max(1, round(float(length or 0))) for length in lengths])
+        source.set(observation=terms, reason=reason)
+        return path
