@@ -7,6 +7,7 @@ import pytest
 
 from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg
+from qd.workers.compute import Compute
 from qd.workers.crosser import open_pipeline
 from sim.crossing import CrossingCfg
 from sim.robots.find import get_robot
@@ -19,7 +20,7 @@ ROBOT = get_robot("anymal")
 def short_rollout(cfg, num_terrains):
     return Rollout(
         dataclasses.replace(ROBOT, max_duration_s=1.6),
-        cfg.policy, num_terrains=num_terrains, replicas=cfg.replicas, num_envs=4, device=cfg.device,
+        cfg.policy, num_terrains=num_terrains, replicas=cfg.replicas, num_envs=4, device=cfg.compute.device,
         cfg=CrossingCfg(start=(12.5, 4.0), poll_every_s=0.2),
     )  # fmt: skip
 
@@ -35,8 +36,8 @@ def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_num
 
     def searched(path, iterations, *, workers="1"):
         def opened(cfg):
-            on_cpu = {"workers": workers} if device == "cpu" else {"workers": None, "device": device}
-            return open_pipeline(dataclasses.replace(cfg, **on_cpu), build=short_rollout)
+            compute = Compute(device, workers=workers if device == "cpu" else None)
+            return open_pipeline(dataclasses.replace(cfg, compute=compute), build=short_rollout)
 
         return run(path, iterations=iterations, **settings, opener=opened)
 

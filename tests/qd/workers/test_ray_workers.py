@@ -46,19 +46,19 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
     def interrupt(share: float) -> None:
         raise KeyboardInterrupt
 
-    with open_pipeline(dataclasses.replace(CFG, workers="ray:3"), build=crossers.Crosser) as evaluate:
+    with open_pipeline(dataclasses.replace(CFG, compute=Compute(workers="ray:3")), build=crossers.Crosser) as evaluate:
         for count in (1, 8, 21):
-            assert_crossed(evaluate(GENES[:count], SEEDS[:count]), slice(count))
+            assert_crossed(evaluate(TERRAINS[:count]), slice(count))
         with pytest.raises(KeyboardInterrupt):
-            evaluate(GENES[:8], SEEDS[:8], interrupt)
+            evaluate(TERRAINS[:8], interrupt)
         evaluate.clear()
         for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
-            evaluate.put(GENES[lot], SEEDS[lot])
+            evaluate.put(TERRAINS[lot])
         for lot in (slice(0, 5), slice(5, 7), slice(7, 21)):
             assert_crossed(evaluate.take(), lot)
         until = time.monotonic() + PATIENCE_S
         while evaluate.status() != (3, 0) and time.monotonic() < until:  # on a busy machine one began later
-            evaluate(GENES[:1], SEEDS[:1])
+            evaluate(TERRAINS[:1])
         assert evaluate.status() == (3, 0)
 
 
@@ -67,14 +67,14 @@ def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, h
     cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:3")
     with open_pipeline(cfg, build=crossers.Failing) as evaluate:
         for _ in range(3):
-            assert_crossed(evaluate(GENES, SEEDS), slice(21))
+            assert_crossed(evaluate(TERRAINS), slice(21))
         assert evaluate.status().retries == 3
 
 
 def test_what_every_worker_refuses_ends_the_evaluation(cluster, tmp_path):
     cfg = dataclasses.replace(CFG, policy=f"refuse:{tmp_path}:99")
     with pytest.raises(ValueError, match="terrains"), open_pipeline(cfg, build=crossers.Failing) as evaluate:
-        evaluate(GENES[:8], SEEDS[:8])
+        evaluate(TERRAINS[:8])
 
 
 def test_a_worker_of_other_code_is_refused(cluster, monkeypatch):
