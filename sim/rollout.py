@@ -24,6 +24,7 @@ from sim.recording.frames import Frames
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
 from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.registry import space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
@@ -301,7 +302,8 @@ class Rollout:
         idle = not self._lots
         if not 1 <= count <= self.num_free:
             raise ValueError(f"terrains must be 1 to {self.num_free} at once here, got {count}")
-        if terrains.genes is not None and terrains.space.name != self.space.name:
+        spaces = [space_key(space.name, space.sha256) for space in (terrains.space, self.space)]
+        if terrains.genes is not None and spaces[0] != spaces[1]:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
         first = 0 if idle else self._next_slot
         slots = ring_slices(first, count, self.num_terrains)
@@ -323,11 +325,11 @@ class Rollout:
         first = 0
         with wp.ScopedDevice(self.sim.device):
             for run in slots:
-                part = terrains[first : first + run.stop - run.start]
-                self.sim.bank.set(part, run)
-                self._queue.seed[run].assign(part.seeds.astype(np.uint32))
+                lot = terrains[first : first + run.stop - run.start]
+                self.sim.bank.set(lot, run)
+                self._queue.seed[run].assign(lot.seeds.astype(np.uint32))
                 self._queue.num_ended[run].zero_()
-                first += len(part)
+                first += len(lot)
 
     def _release(self, *, begin: bool) -> None:
         """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
@@ -397,7 +399,7 @@ class Rollout:
         rows = [slice(slots.start * self.replicas, slots.stop * self.replicas) for slots in lot.slots]
 
         def read(array: Any) -> np.ndarray:
-            values = np.concatenate([array[part].numpy() for part in rows])  # a copy: on the CPU numpy() is a view
+            values = np.concatenate([array[run].numpy() for run in rows])  # a copy: on the CPU numpy() is a view
             return values.reshape(-1, self.replicas, *values.shape[1:])
 
         outcome = read(queue.outcome).astype(np.uint8)

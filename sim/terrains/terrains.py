@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 Rows = slice | NDArray[Any]
@@ -39,13 +38,6 @@ class Terrains:
             raise ValueError(f"seeds must have shape ({len(self.values)},), one a terrain, got {self.seeds.shape}")
         if self.ground is not None and (self.heights is None or len(self.ground) != len(self.heights)):
             raise ValueError(f"ground must belong to as many heights, got ground of {len(self.ground)} terrains")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles a space as its name and hash: a process that unpickles a user's has loaded its code before."""
-        return vars(self) | {"space": (self.space.name, self.space.sha256)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state | {"space": get_space(*state["space"])})
 
     @property
     def values(self) -> NDArray[np.float32]:
