@@ -13,10 +13,12 @@ import numpy as np
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.episode import Outcome
+from kernels.episode import Outcome, make_episodes
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
+from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions.base import condition_column
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 
@@ -69,18 +71,22 @@ def record_segments(rollout: Rollout, terrains: Terrains) -> list[Segment]:
 class Motion:
     """Recorded segments that are replayed in one simulation, by a captured graph of the physics of a control step."""
 
-    def __init__(self, sim: Simulation, segments: list[Segment]) -> None:
-        """Captures the graph and replays two segments, so that the kernels are loaded."""
-        self.sim = sim
-        self.segments = segments
-        self.robot_steps = sim.robot.decimation * sum(
-            segment.num_running * len(segment.targets) for segment in segments
-        )
+    def __init__(self, sim: Simulation, segments: list[Segment], beside: Callable[[], None] | None = None) -> None:
+        """Captures the graph and replays two segments, so that the kernels are loaded.
+
+        ``beside`` launches what a control step has beside its physics.
+        """
+        self.sim, self.segments = sim, segments
+        self.beside = beside
+        """Kept, since the graph works on its arrays."""
+        self.robot_steps = sim.robot.decimation * sum(part.num_running * len(part.targets) for part in segments)
         """Physics steps of the robots that are not left out, in one replay of all segments."""
 
         def control_step() -> None:
             for _ in range(sim.robot.decimation):
                 sim.physics_step()
+            if beside is not None:
+                beside()
 
         with wp.ScopedDevice(sim.device):
             self._graph: Any = sim.capture(control_step)
@@ -118,20 +124,52 @@ def seconds_of(work: Callable[[], object], device: str) -> float:
         return time.perf_counter() - began
 
 
-def replay_rate(motion: Motion, rounds: int) -> float:
-    """Physics steps a second over the robots of a motion; the median of ``rounds`` replays."""
-    return motion.robot_steps / float(np.median([motion.replay() for _ in range(rounds)]))
+def replay_rates(motions: list[Motion], rounds: int) -> list[float]:
+    """Physics steps a second over the robots of each motion, replayed in turns; the median of ``rounds``."""
+    seconds = np.median([[motion.replay() for motion in motions] for _ in range(rounds)], axis=0)
+    return [motion.robot_steps / float(s) for motion, s in zip(motions, seconds, strict=True)]
 
 
 def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, float]:
     """Physics steps a second, over all robots that have an episode, of contacts and solver alone.
 
     Returns:
-        ``walking``, in the motion of the crossings, and ``standing``, holding the default pose at their start.
+        ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
+        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and
+        ``conditions``, under conditions on such ground: noise and lag of observations, and others that change nothing.
     """
-    motion = Motion(rollout.sim, record_segments(rollout, terrains))
-    walking = replay_rate(motion, rounds)
-    return {"walking": walking, "standing": standing_rate(rollout, motion, terrains)}
+    sim, robot = rollout.sim, rollout.robot
+    segments = record_segments(rollout, terrains)
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_ground=True)
+    bank.set_heights(sim.bank.heights.numpy())
+    motion = Motion(sim, segments)
+    with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
+    walking, ground, conditions = replay_rates([motion, with_maps, motion_under_conditions(sim, segments)], rounds)
+    standing = standing_rate(rollout, motion, terrains)
+    return {"walking": walking, "standing": standing, "ground": ground, "conditions": conditions}
+
+
+def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
+    """The same motion of robots that have conditions, of which none but noise and lag of what nobody reads acts."""
+    robot = sim.robot
+    bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
+    bank.set_heights(sim.bank.heights.numpy())
+    rows = bank.conditions.numpy()
+    rows[:, condition_column("noise")] = 1.0
+    rows[:, condition_column("lag")] = robot.control_dt
+    bank.conditions.assign(rows)
+    with wp.ScopedDevice(sim.device):
+        varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
+        varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
+        episodes.outcome.fill_(int(Outcome.RUNNING))
+        nobody = wp.zeros(sim.num_envs, dtype=int)
+        observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
+
+    def beside() -> None:
+        varied.begin_conditions(nobody)
+        varied.disturb(episodes, robot.physics_dt, observation)
+
+    return Motion(varied, segments, beside)
 
 
 def standing_rate(rollout: Rollout, motion: Motion, terrains: Terrains) -> float:

@@ -8,12 +8,14 @@ On a GPU it measures everything but ``cpu``, which it measures on a CPU. Each ke
 """
 
 import shutil
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -46,7 +48,18 @@ REPLICAS = 20
 PROFILED = 22_400
 """Robots whose kernels are timed, as in a search of preset wide."""
 PAPER_EPISODES = 4_000_000
-KEYS = ("iteration_s_median", "bare_physics_ratio", "world_steps_per_s", "envs_curve", "wide", "flat", "kernels", "cpu")
+KEYS = (
+    "iteration_s_median",
+    "bare_physics_ratio",
+    "world_steps_per_s",
+    "ground_step_ratio",
+    "conditions_step_ratio",
+    "envs_curve",
+    "wide",
+    "flat",
+    "kernels",
+    "cpu",
+)
 """Keys that readers expect: null until measured."""
 
 
@@ -74,7 +87,10 @@ def make_rollout(script: Script, num_terrains: int, num_envs: int, replicas: int
 
 
 def time_iteration(script: Script) -> dict[str, Any]:
-    """The paper's iteration, and bare physics on the same crossings."""
+    """The paper's iteration, and bare physics on the same crossings.
+
+    ``conditions_step_ratio`` is the time of a search's step with conditions over that of one without.
+    """
     cfg = script.search_cfg() if script.small else preset("paper", script.robot)
     metrics, terrains = time_search(script, "iteration", cfg, 1 if script.small else 10)
     rate = float(np.median([(1.0 - row["idle_share"]) * row["robot_steps"] / row["wall_s"] for row in metrics]))
@@ -91,6 +107,8 @@ def time_iteration(script: Script) -> dict[str, Any]:
         "bare_world_steps_per_s_standing": bare["standing"],
         "bare_physics_ratio": rate / bare["walking"],
         "bare_physics_ratio_standing": rate / bare["standing"],
+        "ground_step_ratio": bare["walking"] / bare["ground"],
+        "conditions_step_ratio": 1.0 + rate * (1.0 / bare["conditions"] - 1.0 / bare["ground"]),
     }
 
 
@@ -200,9 +218,43 @@ def time_cpu(script: Script) -> dict[str, Any]:
         wall_s = time.perf_counter() - began
         if compiled == set(kernels.iterdir()):
             break  # else the first run compiled kernels
+    view = time_view(script.robot.name, script.runs / "speed")
     archive = read_archive(run)
     counts = {"elites": len(archive), "failing_as_found": int((archive.goal_rate < FAILING_GOAL_RATE).sum())}
-    return {"cpu": {**script.origin, "archive_wall_s": wall_s, **counts}}
+    return {"cpu": {**script.origin, "archive_wall_s": wall_s, **counts, **view}}
+
+
+def time_view(robot: str, folder: Path) -> dict[str, float | None]:
+    """Times from `faultline view` to the page and to a playing failure, with compiled kernels.
+
+    The archive is the published one, without stored recordings; a headless browser opens the page.
+    """
+    browser_file = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser_file is None or find_spec("playwright") is None:
+        return {"view_to_page_s": None, "view_to_failure_s": None}
+    from playwright.sync_api import sync_playwright
+
+    cache = folder / "recordings"
+    shutil.rmtree(cache, ignore_errors=True)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    command = [sys.executable, "-m", "faultline", "view", "--run", f"results/{robot}/archive", "--port", port]
+    command += ["--cache", str(cache)]
+    with sync_playwright() as started:
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        page = started.chromium.launch(executable_path=browser_file, args=flags).new_page()
+        began = time.perf_counter()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            next(line for line in server.stdout if line.startswith("Open "))
+            served_s = time.perf_counter() - began
+            page.goto(f"http://127.0.0.1:{port}")
+            page.wait_for_function("document.querySelector('#faultline [aria-label=Pause]')", timeout=300_000)
+            plays_s = time.perf_counter() - began
+            server.terminate()
+            server.communicate()
+    return {"view_to_page_s": served_s, "view_to_failure_s": plays_s}
 
 
 def training_rates(script: Script, device: str) -> dict[str, Any]:

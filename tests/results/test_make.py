@@ -3,8 +3,10 @@
 import importlib
 import json
 import re
+import weakref
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -238,6 +240,11 @@ def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
     assert motion.robot_steps == 160
     assert motion.replay() > 0.0 and rollout.sim.parked.numpy().tolist() == [0, 2]
     assert rollout.sim.joint_q.numpy()[1, 2] == PARKING_HEIGHT
+    owner = Stub(None)  # of arrays, of which a graph has the addresses alone
+    kept, beside = weakref.ref(owner), bare.Motion(rollout.sim, [], partial(bool, owner))
+    del owner
+    beside.stand(1)
+    assert kept() is not None
 
 
 def test_means_over_seeds():
