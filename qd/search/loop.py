@@ -29,7 +29,7 @@ from qd.workers.pipeline import Pipeline, PipelineCfg
 from qd.workers.seeds import episode_seeds
 from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.command import Interrupted, command_line, say
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import get_space, is_user_space
 from sim.terrains.terrains import Terrains
@@ -80,6 +80,8 @@ def search(
         done = len(metrics)
         last = find_last_iteration(cfg, metrics, until)
         say(describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
+        if note := scaled_by_another(robot, policy):
+            print(note)
         if done < last:
             try:
                 with open_pipeline(crossing) as pipeline:

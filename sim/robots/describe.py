@@ -18,6 +18,7 @@ from sim.terrains.bank import TerrainBank
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _NEAR_LOWEST = 0.015  # geoms so near to the lowest one touch the ground [m]
 _TURN = 2.0 * np.pi
+_FREE = 1e3  # a joint with a wider range has none [rad]
 _NO_EFFORT_LIMIT = 1e5  # more is no limit [N m]
 _NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
 _REACHES = (0.05, 5.0)  # farthest point of a robot from its base [m]
@@ -96,9 +97,17 @@ def _unit_warnings(robot: RobotCfg, builder: Any) -> Iterator[tuple[str, Any]]:
         yield "reach", reach
     if not _MASSES[0] <= masses.sum() <= _MASSES[1]:
         yield "mass", masses.sum()
+    gyration = np.sqrt([np.linalg.eigvalsh(np.reshape(row, (3, 3)))[-1] for row in builder.body_inertia] / masses)
+    if (gyration > reach).any():
+        yield "gyration", [f"{builder.body_label[k]} ({gyration[k]:.3g} m)" for k in np.flatnonzero(gyration > reach)]
     angles = zip(robot.joint_names, robot.default_joint_pos, strict=True)
     if turned := [f"{name} ({angle:g})" for name, angle in angles if abs(angle) > _TURN]:
         yield "angles", turned
+    low, high = (np.array(limits[6:]) for limits in (builder.joint_limit_lower, builder.joint_limit_upper))
+    span = high - low
+    is_wide = (span > 2.0 * _TURN) & (span < _FREE) & (np.maximum(abs(low), abs(high)) > 2.0 * _TURN)
+    if is_wide.any():
+        yield "ranges", [f"{robot.joint_names[k]} ({low[k]:g} to {high[k]:g})" for k in np.flatnonzero(is_wide)]
 
 
 def describe_standing(robot: RobotCfg, standing: Standing) -> str:

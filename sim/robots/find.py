@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 
+from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
@@ -81,3 +82,14 @@ def fitting_space(robot: RobotCfg) -> str | None:
     if robot.settings_file is None or not robot.scales_file.exists():
         return None
     return read_json(robot.scales_file).get("space")
+
+
+def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
+    """A note on a search whose controller is not that of the robot's scales; None if it is.
+
+    This is no mistake: common scales make searches against different controllers comparable.
+    """
+    measured = read_json(robot.scales_file) if robot.scales_file.exists() else {}
+    if measured.get("policy_sha256") in (None, controller_hash(policy)):
+        return None
+    return f"Penalties are scaled by those of {measured.get('policy')}, with which {robot.scales_file} was measured."
