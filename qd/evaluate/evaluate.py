@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +74,17 @@ def cross_sets(
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     largest = max(map(len, sets.values()))
-    with Crosser(robot, compute, cache=cache, calls=len(controllers) * len(sets)) as crosser:
-        for controller, policy in controllers.items():
-            for name, terrains in sets.items():
-                label = f"{controller} on {name}{note}" + (f" ({engine})" if engine != "search" else "")
-                result = crosser.cross(
-                    policy, terrains.to_cross, replicas=episodes, engine=engine, reward=reward,
-                    penalties_from_s=penalties_from_s, label=label, room=largest,
-                )  # fmt: skip
-                rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
-                print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)
-                results[name][controller] = result
+    with Crosser(robot, compute, cache=cache) as crosser:
+        crossings = [*product(controllers.items(), sets.items())]
+        for number, ((controller, policy), (name, terrains)) in enumerate(crossings, 1):
+            label = f"{controller} on {name}{note}" + (f" ({engine})" if engine != "search" else "")
+            result = crosser.cross(
+                policy, terrains.to_cross, replicas=episodes, engine=engine, reward=reward,
+                penalties_from_s=penalties_from_s, label=f"{number} of {len(crossings)}: {label}", room=largest,
+            )  # fmt: skip
+            rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
+            print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)
+            results[name][controller] = result
     return results
 
 

@@ -7,37 +7,29 @@ that was stopped finds them when it is run again.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.faults.numbers import VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
-from qd.faults.searches import check_certifiers, find_certifiers, find_search
-from qd.faults.stages import STAGES
-from qd.faults.stages.base import Judging
-from qd.faults.stages.fresh import with_families
+from qd.faults.searches import find_search
+from qd.faults.stages import STAGES, Judging, open_judging, with_families
 from qd.search.archive import ARCHIVE_FILE, Archive, write_archive
-from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
+from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory
 from qd.show import figures
-from qd.workers.compute import Compute, check_policy
-from qd.workers.crosser import Crosser
-from sim.controllers.spec import ControllerSpec, controller_identity
+from qd.workers.compute import Compute
+from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json, to_json, write_atomically
-
-CROSSINGS_FOLDER = "crossings"
-"""Folder of a run that keeps what was crossed to judge it."""
-USUAL_STAGES = ("fresh", "resolved", "others")
-"""What judging does by default."""
 
 
 def judge(
     run: Path,
     *,
     compute: Compute,
-    stages: Sequence[str] = USUAL_STAGES,
+    stages: Sequence[str] = ("fresh", "resolved", "others"),
     certifiers: Mapping[str, str] | None = None,
     robot: str | None = None,
     policy: str | None = None,
@@ -51,24 +43,17 @@ def judge(
     """
     if unknown := [name for name in stages if name not in STAGES]:
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")
-    chosen = [STAGES[name] for name in stages]
+    ask = any(STAGES[name].asks_certifiers for name in stages)
     search = find_search(run, robot=robot, policy=policy, space=space)
-    check_policy(search.policy, search.robot, compute.device)
-    certifiers = find_certifiers(search) if certifiers is None else certifiers
-    if any(stage.calls[1] for stage in chosen):
-        check_certifiers(certifiers, search, compute.device)
-    calls = sum(stage.calls[0] + stage.calls[1] * len(certifiers) for stage in chosen)
-    with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER, calls=calls) as crosser:
+    with open_judging(search, compute, certifiers, ask=ask) as judging:
         archive = search.read_archive()
-        judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
-        for index, stage in enumerate(chosen):
-            stage.check(archive, judging, stages[:index])
+        for index, name in enumerate(stages):
+            STAGES[name].check(archive, judging, stages[:index])
         if archive.fresh is not None and archive.family is None:
             archive = with_families(archive, search)
-        for stage in chosen:
-            archive = stage.run(archive, judging)
-            origin = compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
-            _write(archive, judging, {stage.name: origin})
+        for number, name in enumerate(stages, 1):
+            archive = STAGES[name].run(archive, replace(judging, step=f"{number} of {len(stages)}: "))
+            _write(archive, judging, name)
     return archive
 
 
@@ -90,8 +75,8 @@ def find_seen(archive: Archive, families: NDArray[np.int64], certifiers: Mapping
     return np.stack(columns, axis=1) if columns else None
 
 
-def _write(archive: Archive, judging: Judging, origin: dict[str, Any]) -> None:
-    """Writes archive, numbers and figures of a run; ``origin`` is what judged it, by stage."""
+def _write(archive: Archive, judging: Judging, stage: str) -> None:
+    """Writes archive, numbers and figures of a run after a stage."""
     run = RunDirectory(judging.search.run)
     assert archive.fresh is not None and archive.family is not None
     seen = find_seen(archive, archive.family, judging.certifiers) if archive.is_judged else None
@@ -102,7 +87,7 @@ def _write(archive: Archive, judging: Judging, origin: dict[str, Any]) -> None:
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
         numbers |= found_numbers(archive, metrics[: archive.iterations])
     numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, archive.family, seen)
-    numbers["judged_by"] = numbers.get("judged_by", {}) | origin
+    numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
     write_archive(run.path / ARCHIVE_FILE, archive)
     write_atomically(file, to_json(numbers))
     if metrics:

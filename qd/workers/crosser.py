@@ -56,23 +56,14 @@ def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterat
 class Crosser:
     """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
 
-    Crossings that are done are stored in the folder ``cache``, if there is one. ``calls``, if known, count in the bars.
+    Crossings that are done are stored in the folder ``cache``, if there is one.
     """
 
-    def __init__(
-        self,
-        robot: RobotCfg | str,
-        compute: Compute,
-        *,
-        cache: Path | None = None,
-        calls: int | None = None,
-    ) -> None:
+    def __init__(self, robot: RobotCfg | str, compute: Compute, *, cache: Path | None = None) -> None:
         self.robot = get_robot(robot)
         self.compute = compute
         self._cache = None if cache is None else Cache(cache)
         self._stored: dict[str, StoredCrossings] = {}
-        self._call = 0
-        self._calls = calls
         self._stack = ExitStack()
         self._opened: tuple[PipelineCfg, Pipeline] | None = None
 
@@ -117,8 +108,6 @@ class Crosser:
             raise ValueError(
                 f"replicas must be 1 or more, engine one of {get_args(Engine)}, got {replicas} and '{engine}'"
             )
-        self._call += 1
-        label = f"{self._call} of {self._calls}: {label}" if self._calls else label
         cfg = PipelineCfg(
             compute=self.compute, robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)),
             replicas=replicas, engine=engine, space=terrains.space.name, reward=reward, record=record,

@@ -82,8 +82,10 @@ class PipelineCfg:
     @property
     def in_process(self) -> bool:
         """Whether this process simulates: on a GPU without Ray, and where it may have no children of its own."""
-        return not self.on_ray and not self.on_mujoco_c and (
-            self.compute.on_gpu or multiprocessing.current_process().daemon
+        return (
+            not self.on_ray
+            and not self.on_mujoco_c
+            and (self.compute.on_gpu or multiprocessing.current_process().daemon)
         )
 
     @property

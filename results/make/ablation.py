@@ -12,8 +12,7 @@ import numpy as np
 
 from qd.faults.families import find_families
 from qd.faults.numbers import FRESH_EPISODES, fresh_numbers
-from qd.faults.stages.base import elite_seeds
-from qd.faults.stages.fresh import fresh_values
+from qd.faults.stages import elite_seeds, fresh_values
 from qd.search.archive import Archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from qd.faults.judge import judge
 from qd.faults.minimise.minimise import minimise
 from qd.faults.numbers import EPISODES
-from qd.faults.stages.base import count_outcomes, elite_seeds
+from qd.faults.stages import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.directory import RunDirectory
 from qd.search.fitness import FAILING_GOAL_RATE

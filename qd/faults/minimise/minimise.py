@@ -11,19 +11,14 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
-from qd.faults.judge import CROSSINGS_FOLDER
 from qd.faults.minimise.results import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
 from qd.faults.minimise.subsets import Case, How, Trial, cut_genes, open_case, take_apart
 from qd.faults.numbers import judgement, rate_numbers
-from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
-from qd.faults.stages import STAGES
-from qd.faults.stages.base import Judging
+from qd.faults.searches import Search, find_search
+from qd.faults.stages import STAGES, Judging, open_judging
 from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
-from qd.search.directory import claimed
 from qd.show.figures import draw_minimal, save_figure
-from qd.workers.compute import Compute, check_policy
-from qd.workers.crosser import Crosser
-from sim.controllers.spec import controller_identity
+from qd.workers.compute import Compute
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import choose_elites, command_line
 from sim.files.npz import npz_bytes
@@ -31,8 +26,6 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 
 FIGURE_FILE = "minimal.png"
-
-_MAX_ELITES = {"cuda": 200, "cpu": 3}  # where none are named
 
 
 def minimise(
@@ -55,21 +48,15 @@ def minimise(
     it. Returns what the run has now; None without a failing elite.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
-    check_policy(search.policy, search.robot, compute.device)
-    certifiers = find_certifiers(search) if certifiers is None else certifiers
-    if judged:
-        check_certifiers(certifiers, search, compute.device)
-    device_kind = compute.device.partition(":")[0]
-    with claimed(run), Crosser(search.robot, compute, cache=run / CROSSINGS_FOLDER) as crosser:
+    with open_judging(search, compute, certifiers, ask=judged) as judging:
         archive = search.read_archive()
-        numbers = sorted(_choose_failing(archive, elite, search, max_elites=_MAX_ELITES[device_kind]))
-        on_gpu = device_kind == "cuda"
+        max_elites = 200 if compute.on_gpu else 3
+        numbers = sorted(_choose_failing(archive, elite, search, max_elites=max_elites))
         half_width = search.robot.half_width
-        cases = {n: open_case(archive, n, search.space, half_width, how, on_gpu=on_gpu) for n in numbers}
-        take_apart(archive, cases, search, crosser)
+        cases = {n: open_case(archive, n, search.space, half_width, how, on_gpu=compute.on_gpu) for n in numbers}
+        take_apart(archive, cases, judging)
         elites = _as_elites(archive, cases, search.space)
         if judged:
-            judging = Judging(search=search, certifiers=certifiers, crosser=crosser)
             for stage in ("resolved", "others"):
                 elites = STAGES[stage].run(elites, judging)
         if not numbers:
@@ -86,8 +73,7 @@ def minimise(
             genes = stored.genes | genes
         if not entries:
             return None
-        origin = compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
-        result = _write(search, origin, entries, genes)
+        result = _write(judging, entries, genes)
     for number in numbers:
         verdict = f"; {entries[number]['verdict']}" if judged else ""
         print(f"Elite {number}: {result.describe(number)}{verdict}.")
@@ -96,14 +82,14 @@ def minimise(
 
 
 def _write(
-    search: Search, origin: dict[str, Any], entries: Mapping[int, dict[str, Any]],
-    genes: Mapping[int, NDArray[np.float32]],
-) -> MinimalTerrains:  # fmt: skip
+    judging: Judging, entries: Mapping[int, dict[str, Any]], genes: Mapping[int, NDArray[np.float32]]
+) -> MinimalTerrains:
     """Writes numbers, genes and figure of all minimal terrains of a run."""
+    search = judging.search
     numbers = sorted(entries)
     ordered = [entries[number] for number in numbers]
     space = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
-    content = {**origin, **space, **_totals(ordered), "elites": ordered}
+    content = {**judging.origin, **space, **_totals(ordered), "elites": ordered}
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}
     arrays |= {"elite": np.array(numbers), "genes": np.array([genes[number] for number in numbers])}
     write_atomically(search.run / MINIMAL_FILE, npz_bytes(arrays))

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import find_effects
 from qd.faults.numbers import EPISODES, FRESH_EPISODES, fresh_counts
-from qd.faults.searches import Search
-from qd.faults.stages.base import count_outcomes, elite_seeds
+from qd.faults.stages import Judging, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import Terrains
@@ -206,12 +204,13 @@ def open_case(
     )
 
 
-def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, crosser: Crosser) -> None:
+def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) -> None:
     """Finds the minimal terrains of some elites, all of them together, by number of the elite.
 
     All subsets of an elite are crossed from the same starts, fresh episodes from others. Starts follow from the
     search's seed and from what names the elite.
     """
+    search = judging.search
     seeds = {}
     for fresh, stream in ((False, Stream.MINIMISED), (True, Stream.MINIMISED_FRESH)):
         times = Trial((), fresh=fresh).rows
@@ -226,14 +225,10 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], search: Search, cros
         if not trials:
             break
         genes = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
-        terrains = Terrains(
-            genes=np.concatenate(genes), seeds=np.concatenate([seeds[trial.fresh][n] for n, trial in trials]),
-            space=search.space,
-        )  # fmt: skip
+        rows = np.concatenate([seeds[trial.fresh][n] for n, trial in trials])
+        terrains = Terrains(genes=np.concatenate(genes), seeds=rows, space=search.space)
         label = f"{len(cases) - len(steps)} of {len(cases)} elites done"
-        result = crosser.cross(
-            search.policy, terrains, replicas=_ROW_EPISODES, room=room, invalid_ok=True, label=label
-        )
+        outcomes = judging.count(search.policy, terrains, label, replicas=_ROW_EPISODES, room=room)
         ends = np.cumsum([trial.rows for _, trial in trials])
-        for (number, trial), counts in zip(trials, np.split(count_outcomes(result), ends[:-1]), strict=True):
+        for (number, trial), counts in zip(trials, np.split(outcomes, ends[:-1]), strict=True):
             cases[number].counts[trial] = counts.sum(axis=0)

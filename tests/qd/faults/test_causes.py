@@ -18,7 +18,7 @@ from qd.faults.causes import (
     measure_shape,
 )
 from qd.faults.searches import Search
-from qd.faults.stages.fresh import with_families
+from qd.faults.stages import with_families
 from sim.robots.shipped import ROBOTS
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.base import CONDITIONS

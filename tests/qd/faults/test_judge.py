@@ -10,8 +10,7 @@ import pytest
 
 from qd.faults import judge as judging
 from qd.faults.judge import find_seen, judge
-from qd.faults.stages.base import count_outcomes, elite_seeds
-from qd.faults.stages.fresh import fresh_values
+from qd.faults.stages import count_outcomes, elite_seeds, fresh_values
 from qd.search.archive import read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
@@ -105,11 +104,11 @@ def numbers_in(path):
     return json.loads((path / "archive.json").read_text())
 
 
-def test_bars_count_the_crossings_to_come(path, monkeypatch):
+def test_bars_count_the_stages(path, monkeypatch):
     bars = []
     monkeypatch.setattr("qd.workers.crosser.Bar", lambda text: bars.append(text) or Bar(text))
     judged(path)
-    assert bars == ["1 of 3: contact resolved", "2 of 3: C-G", "3 of 3: C-G, contact resolved"]
+    assert bars == ["1 of 2: contact resolved", "2 of 2: C-G", "2 of 2: C-G, contact resolved"]
 
 
 def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from qd.faults.causes import find_effects
 from qd.faults.minimise.subsets import Case, Trial, find_minimal, open_case, take_apart
 from qd.faults.searches import Search
+from qd.faults.stages import Judging
 from qd.workers.crosser import Crosser
 from sim.robots.find import get_robot
 from sim.terrains.conditions.base import condition_column
@@ -164,7 +165,7 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
         with Crosser(ROBOT, compute_by(robots)) as crosser:
-            take_apart(archive, cases, search, crosser)
+            take_apart(archive, cases, Judging(search=search, certifiers={}, crosser=crosser))
         return cases
 
     together, alone = Robots(fails), Robots(fails)
@@ -196,7 +197,7 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
     search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
     with Crosser(ROBOT, compute_by(Robots(fails))) as crosser:
-        take_apart(archive, {0: case}, search, crosser)
+        take_apart(archive, {0: case}, Judging(search=search, certifiers={}, crosser=crosser))
     assert (case.minimal, case.scale) == ((3, 8), 0.625)
     effects = find_effects(genes[0], range(11), space)
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")
