@@ -11,7 +11,7 @@ import torch
 from msgspec import Meta
 
 from sim.controllers.adapters import Sensed, read_row
-from sim.controllers.mlp import ACTIVATIONS
+from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
 from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
 from sim.robots.robot import RobotCfg

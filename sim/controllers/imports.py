@@ -6,12 +6,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from sim.controllers.formats.deployments import RlSar, UnitreeRlGym
 from sim.controllers.formats.isaac_lab import IsaacLab
-from sim.controllers.formats.mjlab import Mjlab
-from sim.controllers.formats.rl_sar import RlSar
 from sim.controllers.formats.source import Source
-from sim.controllers.formats.unitree_rl_gym import UnitreeRlGym
-from sim.controllers.formats.weights import Weights
+from sim.controllers.formats.weights import Mjlab, Weights
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
@@ -19,12 +17,13 @@ from sim.robots.user import NEW_NAME, is_new_name
 
 FORMATS = (IsaacLab(), UnitreeRlGym(), RlSar(), Mjlab(), Weights())
 """Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
+_ROBOT_SETTINGS = ("drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
+_ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")
+_OBSERVATION_SETTINGS = ("observation_clip", "activation", "history", "observation")
 _SETTINGS_BY_FILE = {
-    "robot.toml": ("model_file", *PER_JOINT, "drive_delay_steps", "physics_dt", "decimation", "speed",
-                   "max_duration_s"),
-    "controller.toml": ("policy", "joints", "action_scale", "action_offset", "action_clip", "observation_clip",
-                        "activation", "history", "observation"),
-}  # fmt: skip
+    "robot.toml": ("model_file", *PER_JOINT, *_ROBOT_SETTINGS),
+    "controller.toml": (*_ACTION_SETTINGS, *_OBSERVATION_SETTINGS),
+}
 
 
 def import_controller(path: Path, model_file: Path, out: Path) -> None:
@@ -45,7 +44,9 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
     robot_file = read_robot_file(model_file)
     model = robot_file.model
     source = Source(file=path, model_file=model_file, model=model, joints=joint_names(model), home=robot_file.home)
-    source_format = _find_format(path)
+    source_format: Any = next((source_format for source_format in FORMATS if source_format.matches(path)), None)
+    if source_format is None:
+        raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
     weights_file = _read(source_format, path, source)
     copy = out / weights_file.name
     if copy.exists() and copy.read_bytes() != weights_file.read_bytes():
@@ -65,13 +66,6 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
     print(f"\nFill in {', '.join(gaps)}; then:" if gaps else "\nNext:")
     for name in ("check", "archive"):
         print(f"  {command_line(name, robot=out / 'robot.toml')}")
-
-
-def _find_format(path: Path) -> Any:
-    for source_format in FORMATS:
-        if source_format.matches(path):
-            return source_format
-    raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
 
 
 def _read(source_format: Any, path: Path, source: Source) -> Path:

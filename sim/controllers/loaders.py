@@ -15,7 +15,7 @@ import warp as wp
 
 from sim.controllers.described import ControllerCfg, Described, read_controller
 from sim.controllers.formats.network import Policy, find_widths, load_network
-from sim.controllers.mlp import MlpPolicy, RnnPolicy
+from sim.controllers.formats.rsl_rl import MlpPolicy, RnnPolicy
 from sim.controllers.runner import action_problem, reset_all
 from sim.controllers.spec import ControllerSpec, import_object, in_one_line, weights_file
 from sim.files.atomic import read_json

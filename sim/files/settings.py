@@ -13,6 +13,7 @@ from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+import yaml
 from msgspec import Meta
 
 PositiveInt = Annotated[int, Meta(ge=1)]
@@ -21,6 +22,8 @@ PositiveFloat = Annotated[float, Meta(gt=0)]
 NonNegativeFloat = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
+
+YAML_SUFFIXES = (".yaml", ".yml")
 
 Settings = TypeVar("Settings")
 
@@ -105,6 +108,31 @@ def read_toml(path: Path, text: str | None = None) -> dict[str, Any]:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from None
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Reads tags of Python as the lists, tables and texts that they are on."""
+
+    def drop_tag(self, suffix: str, node: yaml.Node) -> Any:
+        """The value of a node without its tag; a tag on nothing is its own text."""
+        if isinstance(node, yaml.ScalarNode):
+            return self.construct_scalar(node) or suffix.partition(":")[2]
+        construct: Any = self.construct_sequence if isinstance(node, yaml.SequenceNode) else self.construct_mapping
+        return construct(node, deep=True)
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _PlainLoader.drop_tag)
+
+
+def read_yaml(file: Path) -> dict[str, Any]:
+    """Names and values of a YAML, as data alone; an error names the file."""
+    try:
+        content = yaml.load(file.read_text(encoding="utf-8"), _PlainLoader)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"{file} cannot be read as YAML: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{file} must hold names with values, got {type(content).__name__}")
+    return content
 
 
 def to_toml(value: Any) -> str:

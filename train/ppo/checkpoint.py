@@ -9,9 +9,8 @@ from typing import Any
 import torch
 
 from sim.controllers.described import ControllerCfg, Described, read_controller
-from sim.controllers.formats.rsl_rl import read_weights
+from sim.controllers.formats.rsl_rl import ACTIVATIONS, MlpPolicy, read_weights
 from sim.controllers.loaders import load_described, load_policy
-from sim.controllers.mlp import ACTIVATIONS, MlpPolicy
 from sim.controllers.spec import in_one_line, weights_file
 from sim.files.atomic import write_atomically
 from sim.robots.robot import RobotCfg

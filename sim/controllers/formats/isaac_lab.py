@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.controllers.formats.rsl_rl import read_activation
 from sim.controllers.formats.source import Source, collapse, make_term
-from sim.controllers.formats.yaml_file import read_yaml
+from sim.files.settings import read_yaml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.robot import RobotCfg
 from sim.robots.user import per_joint

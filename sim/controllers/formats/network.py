@@ -1,6 +1,7 @@
 """The network of a file: an rsl_rl checkpoint, a TorchScript module, or ONNX."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import torch
 
 from sim.controllers.formats.rsl_rl import make_actor, read_weights
-from sim.controllers.formats.torchscript import separate_robots
+from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.controllers.spec import in_one_line
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -46,18 +47,6 @@ def load_network(
     return policy.to(device).eval()
 
 
-def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
-    """A TorchScript module from a file that is no checkpoint, for this reason."""
-    try:
-        module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
-    except Exception as error:
-        raise ValueError(
-            f"policy '{path}' is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module (truncated, "
-            f"foreign, or holding code): {in_one_line(reason)}: give one of these, or an ONNX file that ends in .onnx"
-        ) from error
-    return module if sizes is None else separate_robots(module, probe, path, sizes[0], device)
-
-
 def find_widths(network: Any) -> tuple[int | None, int | None]:
     """Columns and actions of a network, as far as it has or shows them."""
     if hasattr(network, "sizes"):
@@ -66,3 +55,77 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
         with suppress(Exception):  # of an inner layer
             return weight.shape[1], network(torch.zeros(1, weight.shape[1], device=weight.device)).shape[1]
     return None, None
+
+
+def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
+    """A TorchScript module from a file that is no checkpoint, for this reason; C++ reads it."""
+    try:
+        module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
+    except Exception as error:
+        raise ValueError(
+            f"policy '{path}' is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module (truncated, "
+            f"foreign, or holding code): {in_one_line(reason)}: give one of these, or an ONNX file that ends in .onnx"
+        ) from error
+    return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
+
+
+class _Script(torch.nn.Module):
+    """A module without memory, whatever ``reset()`` its exporter gave it."""
+
+    def __init__(self, module: Any) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        return self.module(with_rows_of_zeros(rows))[: len(rows)]
+
+
+class _RecurrentScript(Recurrent):
+    """A module that remembers one robot in its buffers, with a row of them for each robot."""
+
+    def __init__(self, module: Any, initial: Mapping[str, torch.Tensor], axis: int) -> None:
+        super().__init__([*initial.values()], axis)
+        self.module = module
+        self._paths = [name.split(".") for name in initial]
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        owners = [functools.reduce(getattr, path[:-1], self.module) for path in self._paths]
+        for owner, path, value in zip(owners, self._paths, state, strict=True):
+            setattr(owner, path[-1], value)
+        action = self.module(rows)
+        return action, [getattr(owner, path[-1]) for owner, path in zip(owners, self._paths, strict=True)]
+
+
+@torch.no_grad()
+def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: str) -> Any:
+    """The module of a file, for rows of ``width`` columns, with a memory of each robot if it remembers one.
+
+    ``probe`` is a copy of the module on the CPU. The buffers that a call of it changes are the memory.
+    """
+    rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
+    reset = getattr(probe, "reset", getattr(probe, "reset_memory", None))
+    if reset is not None:
+        reset()
+    before = {name: value.clone() for name, value in probe.named_buffers()}
+    try:
+        first, second = (probe(rows[0, :1]) for _ in range(2))
+    except Exception:  # it takes another width, or has nothing to call: trying it later says so
+        return _Script(module)
+    initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
+    if not isinstance(first, torch.Tensor) or not initial:
+        is_same = reset is None or not isinstance(first, torch.Tensor) or torch.equal(first, second)
+        return _Script(module) if is_same else module  # it has another memory
+    separate = []
+    for robot in range(rows.shape[1]):
+        for name, value in probe.named_buffers():
+            value.copy_(before[name])
+        separate.append(torch.cat([probe(step[robot : robot + 1]) for step in rows]))
+    for axis in (1, 0):  # the axis of robots is the one along which they act as they do alone
+        if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
+            recurrent = _RecurrentScript(probe, initial, axis)
+            with suppress(RuntimeError, torch.jit.Error):
+                together = torch.stack([recurrent(step) for step in rows], dim=1)
+                if torch.allclose(together, torch.stack(separate), rtol=1e-4, atol=1e-4):
+                    return _RecurrentScript(module, initial, axis).to(device)
+    remedy = "give the checkpoint of which it was made"
+    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: {remedy}")

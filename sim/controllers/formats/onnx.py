@@ -12,7 +12,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional
 
-from sim.controllers.mlp import MlpPolicy
+from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.files.atomic import prepare_output, write_atomically
 

@@ -1,4 +1,4 @@
-"""Checkpoints of rsl_rl 1 to 5: plain tensors, read as data alone."""
+"""Checkpoints of rsl_rl 1 to 5: plain tensors, read as data alone, and the networks that they make."""
 
 import re
 import warnings
@@ -6,12 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
-from sim.controllers.formats.yaml_file import read_yaml
-from sim.controllers.mlp import ACTIVATIONS, MlpPolicy, RnnPolicy
+from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.controllers.spec import agent_file
 from sim.files.atomic import check_zip
+from sim.files.settings import read_yaml
 
+_TORCH_NAMES = (nn.ELU, nn.SELU, nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.GELU, nn.Mish, nn.Identity)
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    **{layer.__name__.lower(): layer for layer in _TORCH_NAMES},
+    "lrelu": nn.LeakyReLU,
+    "swish": nn.SiLU,
+}
+"""What rsl_rl calls the functions between layers."""
 _FORMER_NAMES = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
 """Prefixes of an actor's tensors in rsl_rl 1 to 4, and in rsl_rl 5."""
 _KNOWN_NAMES = (
@@ -20,6 +28,61 @@ _KNOWN_NAMES = (
 )
 _ELU_KEYS = {"actor_state_dict", "iter", "trained_on"}
 """A checkpoint of ours that has these alone has ELU between its layers."""
+
+
+class MlpPolicy(nn.Module):
+    """Multilayer perceptron: rsl_rl's ``MLPModel`` without its distribution."""
+
+    def __init__(self, state: dict[str, torch.Tensor], activation: str = "elu") -> None:
+        """Build from rsl_rl's keys ``mlp.<k>.weight`` / ``.bias`` and, if any, ``obs_normalizer._mean`` / ``._std``."""
+        super().__init__()
+        self.activation = activation
+        weights = {key.removeprefix("mlp."): value for key, value in state.items() if key.startswith("mlp.")}
+        layers: list[nn.Module] = []
+        for index in sorted(int(key.removesuffix(".weight")) for key in weights if key.endswith(".weight")):
+            size, width = weights[f"{index}.weight"].shape
+            layers += [nn.Linear(width, size), ACTIVATIONS[activation]()]
+        self.layers = nn.Sequential(*layers[:-1])
+        self.layers.load_state_dict(weights)
+        self.mean = nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
+        self.std = nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
+        self.normalised = "obs_normalizer._mean" in state
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Observation and action size."""
+        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        return linear[0].in_features, linear[-1].out_features
+
+    def normalise(self, observation: torch.Tensor) -> torch.Tensor:
+        """Observation rows as the layers see them."""
+        return (observation - self.mean) / (self.std + 1e-2) if self.normalised else observation
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions, shape (num_envs, num_joints)."""
+        return self.layers(with_rows_of_zeros(self.normalise(observation)))[: len(observation)]
+
+
+class RnnPolicy(Recurrent):
+    """LSTM or GRU, and a perceptron of what it says: rsl_rl's ``RNNModel`` without its distribution."""
+
+    def __init__(self, state: dict[str, torch.Tensor], activation: str = "elu") -> None:
+        """Build from :class:`MlpPolicy`'s keys and ``rnn.rnn.<name>``."""
+        weights = {key.removeprefix("rnn.rnn."): value for key, value in state.items() if key.startswith("rnn.rnn.")}
+        gates, width = weights["weight_ih_l0"].shape
+        size = weights["weight_hh_l0"].shape[1]
+        layers = sum(name.startswith("weight_ih_l") for name in weights)
+        kind = {4: nn.LSTM, 3: nn.GRU}[gates // size]
+        super().__init__([torch.zeros(layers, 1, size)] * (2 if kind is nn.LSTM else 1), 1)
+        self.rnn = kind(width, size, layers)
+        self.rnn.load_state_dict(weights)
+        self.head = MlpPolicy(state, activation)
+        self.sizes = width, self.head.sizes[1]
+
+    def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Mean actions, and the state after them."""
+        out, after = self.rnn(self.head.normalise(rows)[None], tuple(state) if len(state) == 2 else state[0])
+        return self.head.layers(out[0]), [*after] if len(state) == 2 else [after]
 
 
 def read_weights(path: Path) -> Any:
@@ -48,7 +111,7 @@ def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
     """The actor's tensors by rsl_rl 5's names."""
     keys = ("actor_state_dict", "model_state_dict")
     state = next((content[key] for key in keys if isinstance(content, dict) and key in content), None)
-    names = {key: _rename(key) for key in (map(str, state) if isinstance(state, dict) else ())}
+    names = {key: _rename(key) for key in map(str, state if isinstance(state, dict) else ())}
     if not isinstance(state, dict) or "mlp.0.weight" not in names.values():
         got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
         raise ValueError(

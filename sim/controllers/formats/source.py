@@ -9,19 +9,21 @@ import numpy as np
 
 from sim.robots.compiled import PER_JOINT
 
+_NAMES_BY_TERM = {
+    "lin_vel": ("lin_vel", "base_lin_vel"),
+    "ang_vel": ("ang_vel", "ang_vel_body", "base_ang_vel"),
+    "gravity": ("gravity_vec", "projected_gravity"),
+    "command": ("commands", "command", "velocity_commands"),
+    "joint_pos": ("dof_pos", "joint_pos"),
+    "joint_vel": ("dof_vel", "joint_vel"),
+    "last_action": ("actions", "last_action"),
+}
+TERM_NAMES = {name: term for term, names in _NAMES_BY_TERM.items() for name in names}
+"""Terms of the observation by the names that rl_sar and mjlab give them."""
 BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
 """Terms of a controller without sight, in the usual order."""
-
-TERM_NAMES = {
-    "lin_vel": "lin_vel", "ang_vel": "ang_vel", "ang_vel_body": "ang_vel", "gravity_vec": "gravity",
-    "commands": "command", "dof_pos": "joint_pos", "dof_vel": "joint_vel", "base_lin_vel": "lin_vel",
-    "base_ang_vel": "ang_vel", "projected_gravity": "gravity", "command": "command", "velocity_commands": "command",
-    "joint_pos": "joint_pos", "joint_vel": "joint_vel", "actions": "last_action", "last_action": "last_action",
-}  # fmt: skip
-"""Terms of the observation by the names that rl_sar and mjlab give them."""
-SCALES = {"lin_vel_scale": "lin_vel", "ang_vel_scale": "ang_vel", "commands_scale": "command", "cmd_scale": "command",
-          "dof_pos_scale": "joint_pos", "dof_vel_scale": "joint_vel"}  # fmt: skip
-"""Terms by the settings that rl_sar and unitree_rl_gym scale them with."""
+SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physics_dt", "decimation")
+"""Settings that most sources have, under names of their own."""
 
 
 @dataclass(kw_only=True)
@@ -93,11 +95,3 @@ def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
     if scale is not None and not np.all(np.equal(scale, 1.0)):
         fields = {"scale": scale, **fields}
     return {"term": name, **{key: value for key, value in fields.items() if value is not None}}
-
-
-def find_weights(folder: Path, name: str) -> Path:
-    """The file of weights in a folder; its name may have a path of another machine."""
-    file = folder / Path(name).name
-    if not file.is_file():
-        raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
-    return file

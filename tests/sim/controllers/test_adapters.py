@@ -8,8 +8,8 @@ import torch
 
 from sim.controllers.adapters import read_row
 from sim.controllers.formats.onnx import export_onnx
+from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_policy
-from sim.controllers.mlp import MlpPolicy
 from sim.controllers.spec import (
     ControllerSpec,
     controller_hash,

@@ -9,8 +9,8 @@ import warp as wp
 from onnx import TensorProto, helper, numpy_helper
 
 from sim.controllers.formats.onnx import export_onnx, load_onnx
+from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_actor, load_policy
-from sim.controllers.mlp import MlpPolicy
 from sim.controllers.runner import PolicyRunner, is_graph_safe
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 

@@ -1,0 +1,113 @@
+"""Controllers as robots run them: YAML files of rl_sar, and of unitree_rl_gym's deploy_mujoco."""
+
+from pathlib import Path
+
+from sim.controllers.formats.source import BLIND_TERMS, SETTINGS, TERM_NAMES, Source, make_term
+from sim.files.settings import YAML_SUFFIXES, read_yaml
+
+_TERMS = TERM_NAMES | {"g1_phase": "clock", "cmd": "command"}
+_SCALED = ("lin_vel", "commands", "ang_vel", "cmd", "dof_pos", "dof_vel")
+_CLOCK_PERIOD = 0.8  # of the code of both [s]
+_RL_SAR_KEYS = ("default_dof_pos", "rl_kp", "rl_kd", "action_scale", "dt", "decimation")
+_RL_SAR_OPTIONAL_KEYS = {"torque_limits": "effort_limit", "clip_obs": "observation_clip"}
+_WITHOUT_EFFECT = ("fixed_kp", "fixed_kd", "num_of_dofs", "num_observations", "joint_controller_names", "framework")
+_UNITREE_KEYS = ("default_angles", "kps", "kds", "action_scale", "simulation_dt", "control_decimation")
+
+
+class RlSar:
+    """Reads a YAML over the base.yaml of its robot, which is beside it or in the folder above."""
+
+    label = "a controller of rl_sar (its YAML, or a folder with config.yaml)"
+
+    def matches(self, path: Path) -> bool:
+        """Whether it is a YAML of one name that has observations, or a folder with such a config.yaml."""
+        file = path / "config.yaml" if path.is_dir() else path
+        if file.suffix not in YAML_SUFFIXES or not file.is_file():
+            return False
+        values = list(read_yaml(file).values())
+        return len(values) == 1 and isinstance(values[0], dict) and "observations" in values[0]
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of both files, refused by name if they are not understood."""
+        source.file = file = path / "config.yaml" if path.is_dir() else path
+        bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
+        base = next((candidate for candidate in bases if candidate.is_file()), None)
+        if base is None:
+            raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
+        content = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
+        if content.pop("wheel_indices", None):
+            raise ValueError(f"{file}: wheel_indices must be empty, since wheels are not supported")
+        names = content.pop("joint_names")
+        joints = [names[k] for k in content.pop("joint_mapping")]
+        source.set_joints(joints)
+        optional = {key: name for key, name in _RL_SAR_OPTIONAL_KEYS.items() if key in content}
+        source.move(content, dict(zip(_RL_SAR_KEYS, SETTINGS, strict=True)) | optional, joints)
+        if "clip_actions_upper" in content:
+            limits = zip(content.pop("clip_actions_lower"), content.pop("clip_actions_upper"), strict=True)
+            pairs = [list(pair) for pair in limits]
+            high = pairs[0][1]
+            source.set(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
+        steps = content.pop("observations_history", None) or [0]
+        _set_history(source, steps, content.pop("observations_history_priority", "time"))
+        terms = content.pop("observations")
+        source.refuse_unknown(terms, _TERMS)
+        scales = {_TERMS[name]: content.pop(f"{name}_scale") for name in _SCALED if f"{name}_scale" in content}
+        periods = {"clock": _CLOCK_PERIOD}
+        names = [_TERMS[term] for term in terms]
+        source.set(observation=[make_term(name, scales.get(name), period_s=periods.get(name)) for name in names])
+        weights = _find_weights(file.parent, content.pop("model_name"))
+        source.refuse_unknown(content, _WITHOUT_EFFECT)
+        return weights
+
+
+def _set_history(source: Source, steps: list[int], priority: str) -> None:
+    if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
+        raise ValueError(f"{source.file}: observations_history must be all steps from 0 on, got {steps}")
+    by = {"time": "row", "term": "term"}.get(priority)
+    if by is None:
+        raise ValueError(f"{source.file}: observations_history_priority must be time or term, got {priority}")
+    if len(steps) > 1:
+        history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
+        source.set(history=history, reason="steps before the start are zeros, as in rl_sar's own loop")
+
+
+class UnitreeRlGym:
+    """Reads a YAML, and the observation of deploy_mujoco.py, which fixes its terms and their order."""
+
+    label = "a deployment of unitree_rl_gym (a YAML with kps, kds, ...)"
+
+    def matches(self, path: Path) -> bool:
+        """Whether it is a YAML with gains called kps."""
+        return path.suffix in YAML_SUFFIXES and path.is_file() and "kps" in read_yaml(path)
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of the YAML, and the observation of the script, with a clock if there are two columns for it."""
+        content = read_yaml(path)
+        count = content.pop("num_actions")
+        width = content.pop("num_obs")
+        if count != len(source.joints):
+            joints = f"{len(source.joints)}, the joints of {source.model_file}"
+            raise ValueError(f"{path}: num_actions must be {joints}, got {count}")
+        blind = 9 + 3 * count
+        if width not in (blind, blind + 2):
+            by_hand = "describe it by hand (docs/controllers.md)"
+            raise ValueError(f"{path}: num_obs must be {blind}, or {blind + 2} with a clock, got {width}: {by_hand}")
+        source.move(content, dict(zip(_UNITREE_KEYS, SETTINGS, strict=True)), source.joints)
+        scales = {_TERMS[name]: content.pop(f"{name}_scale") for name in ("ang_vel", "cmd", "dof_pos", "dof_vel")}
+        terms = [make_term(name, scales.get(name)) for name in BLIND_TERMS]
+        reason = "the order of unitree_rl_gym's deploy_mujoco.py"
+        if width > blind:
+            terms.append(make_term("clock", period_s=_CLOCK_PERIOD))
+            reason += ", and the period of its clock"
+        source.set(observation=terms, reason=reason)
+        weights = _find_weights(path.parent, content.pop("policy_path"))
+        source.refuse_unknown(content, ("xml_path", "simulation_duration", "cmd_init"))
+        return weights
+
+
+def _find_weights(folder: Path, name: str) -> Path:
+    """The file of weights in a folder; its name may have a path of another machine."""
+    file = folder / Path(name).name
+    if not file.is_file():
+        raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+    return file
