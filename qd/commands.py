@@ -9,7 +9,7 @@ import tyro
 from msgspec import Meta
 
 from qd.evaluate.labels import SetsCfg
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS
 from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values

@@ -11,7 +11,7 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS
 from sim.files.atomic import write_atomically
 
 _KIND = b"faultline search checkpoint "
@@ -40,15 +40,17 @@ _ADMITTED = {
     "qd.search.scheduler": ("Asked", "Scheduler"),
     "qd.search.surrogate.surrogate": ("Surrogate",),
 }
-"""Classes that a state may hold, by their modules; methods of search beside them."""
+"""Classes that a state may hold, by their modules; methods of search beside them, by their names alone."""
 
 
 class _StateUnpickler(pickle.Unpickler):
     """Builds plain values and the admitted classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        is_method = any((module, name) == (method.__module__, method.__name__) for method in METHODS.values())
-        if not is_method and name not in _ADMITTED.get(module, ()):
+        methods = {method.__name__: method for method in METHODS.values()}
+        if name in methods:
+            return methods[name]
+        if name not in _ADMITTED.get(module, ()):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is no part of a search")
         return super().find_class(module, name)
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS
 from sim.files.settings import NonNegativeInt
 
 _CFGS = list(dict.fromkeys(method.Cfg for method in METHODS.values()))

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, select_terrains
 from qd.search.grid import FIELDS, grid_rows, make_grid
-from qd.search.methods.base import Columns, Method, Setup
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS, Columns, Method, Setup
 from qd.search.pool import Pool
 from qd.search.presets import SchedulerCfg
 from sim.terrains.spaces.base import TerrainSpace, clipped

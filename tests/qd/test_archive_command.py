@@ -14,7 +14,7 @@ from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
 from qd.search import settings, start
 from qd.search.archive import read_archive
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS
 from qd.search.summary import print_summary
 from qd.workers.compute import Compute
 from sim.files.command import run_command

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.search.methods.base import Columns, Method, MethodCfg, Setup
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS, Columns, Method, MethodCfg, Setup
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation
-from qd.search.surrogate.cfg import SurrogateCfg
+from qd.search.methods import SurrogateCfg
 from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Trainer
 from sim.controllers.loaders import on_stream, prepare_torch
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps

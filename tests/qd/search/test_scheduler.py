@@ -4,7 +4,7 @@ import pytest
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, evaluate_rollout
-from qd.search.methods.registry import METHODS
+from qd.search.methods import METHODS
 from qd.search.presets import SchedulerCfg
 from qd.search.scheduler import Scheduler
 from qd.search.surrogate import surrogate

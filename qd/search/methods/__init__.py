@@ -1,1 +1,0 @@
-"""Methods of search, one file each: where new terrains come from."""
