@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
 from qd.search.fitness import FITNESS_FLOOR, Evaluation
-from qd.search.methods import SurrogateCfg
 from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Trainer
 from sim.controllers.loaders import on_stream, prepare_torch
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
@@ -65,12 +64,14 @@ class Prediction(NamedTuple):
 class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
+    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`.
+
     Attributes:
         squared_error: Mean squared error of predicted ratios so far, the noise of their episodes included, shape (P,);
             None before the networks are asked.
     """
 
-    def __init__(self, cfg: SurrogateCfg, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
+    def __init__(self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
         self.cfg = cfg
         self.cells = cells
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
@@ -326,9 +327,7 @@ class Surrogate:
         self._work_on("cpu", moments)
 
 
-def vary_elites(
-    pool: Tensor, count: int, cfg: SurrogateCfg, genes_per_part: int | None, draw: torch.Generator
-) -> Tensor:
+def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
     """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
 
     Where the space has parts (:attr:`sim.terrains.spaces.base.TerrainSpace.genes_per_part`), a share of the children
