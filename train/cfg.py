@@ -1,27 +1,125 @@
 """Settings of trainings. This module loads neither torch nor Warp, so that a command's help is quick."""
 
-from dataclasses import asdict, dataclass, field, replace
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from msgspec import Meta
 
-from sim.files.settings import NonNegativeInt, PositiveInt, check_settings
+from sim.files.settings import (
+    Interval,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Share,
+    check_settings,
+    select_settings,
+)
 from sim.robots.robot import RobotCfg
-from sim.robots.training import Draw
-from train.ppo.cfg import PpoCfg, ppo_problems
-from train.task.cfg import TaskCfg, task_problems
+from sim.robots.training import MAX_SPREAD, Draw, NoiseCfg, PaceCfg, TrainingCfg
+from sim.terrains.hand_crafted import NUM_LEVELS
 
-_Cfg = TypeVar("_Cfg", bound="TrainCfg")
-Sizes = dict[str, int]
-"""Sizes of a training by the names of their settings."""
-_BASE_ON_CPU: Sizes = {"num_envs": 32, "iterations": 20}
-_TUNING_ON_CPU: Sizes = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
-LARGE: Sizes = {"num_envs": 8192, "terrains": 2000}
+_BASE_ON_CPU = {"num_envs": 32, "iterations": 20}
+_TUNING_ON_CPU = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
+LARGE = {"num_envs": 8192, "terrains": 2000}
 """Sizes that left ANYmal a third of the faults that the paper's left."""
-SPECIALIST: Sizes = {**LARGE, "iterations": 1000}
+SPECIALIST = {**LARGE, "iterations": 1000}
 """Sizes of the training of a search's own specialist."""
 _SPECIALIST_SEED = 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumCfg:
+    """Shares of the terrain types and where robots begin.
+
+    legged_gym's tiles have no rough ground on a level plane, which one in six hand-crafted crossings is made of:
+    columns of ``noise`` tiles are added beside them.
+    """
+
+    num_columns: NonNegativeInt = 20
+    """Columns of legged_gym's types; 20 and its multiples give its shares exactly."""
+    noise_columns: NonNegativeInt = 2
+    """Columns of noise: uniform +-(.02 + .08 d) m on patches of 0.2 m."""
+    max_first_level: Annotated[int, Meta(ge=0, le=NUM_LEVELS - 1)] = 5
+    """Robots begin on levels 0 to this, drawn uniformly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskCfg(TrainingCfg):
+    """The task; the defaults are legged_gym's for ANYmal, except the start's yaw, which is 0 there."""
+
+    noise: NoiseCfg = field(default_factory=NoiseCfg)
+    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    crosses: bool = False
+    """Robots start at one side of a terrain and are told to go to the other, as in a search, instead of random
+    velocities and headings from its middle."""
+    start_spread: Annotated[float, Meta(ge=0, le=MAX_SPREAD)] = 0.0
+    """Where robots cross, they start up to so far along the way, uniformly [m]; the goal stays where it is."""
+    episode_s: PositiveFloat = 20.0
+    command_interval_s: PositiveFloat = 10.0
+    """Time between commands [s]."""
+    lin_vel_x: Interval = (-1.0, 1.0)
+    """Range of the commanded forward velocity [m/s]."""
+    lin_vel_y: Interval = (-1.0, 1.0)
+    """Range of the commanded sideward velocity [m/s]."""
+    min_speed: NonNegativeFloat = 0.2
+    """Slower commands become 0 [m/s]."""
+    yaw_gain: NonNegativeFloat = 0.5
+    """Commanded yaw rate per heading error [1/s]."""
+    max_yaw_rate: NonNegativeFloat = 1.0
+    """Largest commanded yaw rate [rad/s]."""
+    push_interval_s: NonNegativeFloat = 15.0
+    """Time between pushes [s]; 0 for none."""
+    friction: Interval = (0.5, 1.25)
+    """Range of the robots' friction coefficients."""
+    start_position_range: NonNegativeFloat = 1.0
+    """Starts lie within this of the tile's centre along x and y [m]."""
+    start_yaw_range: NonNegativeFloat = math.pi
+    """Half width of the start's heading [rad]: every heading, so that robots meet a stair or slope at every angle."""
+    start_velocity_range: NonNegativeFloat = 0.5
+    """Half width of the base's first linear and angular velocity [m/s, rad/s]."""
+    base_force: NonNegativeFloat = 1.0
+    """Contact force on the base that ends an episode [N]."""
+    max_gravity_z: float = -0.1
+    """An episode ends when the projected gravity's z component exceeds this (-1: upright)."""
+
+    @classmethod
+    def of(cls, robot: RobotCfg, **changes: Any) -> Self:
+        """The task with a robot's own settings, but for ``changes``."""
+        return cls(**{**vars(robot.training), **changes})
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoCfg(PaceCfg):
+    """Settings of the learner; the defaults are legged_gym's, except the steps."""
+
+    hidden_dims: tuple[PositiveInt, ...] = (512, 256, 128)
+    """Hidden layers (ELU) of actor and critic."""
+    steps_per_env: PositiveInt = 16
+    """Control steps an iteration, per environment; legged_gym's 24 are for half as many environments."""
+    epochs: PositiveInt = 5
+    """Passes over the data of an iteration."""
+    mini_batches: PositiveInt = 4
+    """Minibatches a pass."""
+    learning_rate: PositiveFloat = 1e-3
+    """Learning rate at the start; adapted to the KL divergence from then on."""
+    gamma: Share = 0.99
+    """Discount per control step."""
+    lam: Share = 0.95
+    """Lambda of generalised advantage estimation."""
+    clip: PositiveFloat = 0.2
+    """Clip range of the probability ratio and of the value."""
+    average: Share = 0.0
+    """Share of all iterations, the last ones, whose actors' weights are averaged into the controller; 0: it is the last
+    actor. The mean walks a little more smoothly."""
+
+    @classmethod
+    def of(cls, robot: RobotCfg) -> Self:
+        """The settings that a robot's controller is learned with."""
+        return cls(**vars(select_settings(PaceCfg, robot.learning)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,15 +157,27 @@ class TrainCfg:
 
     def sized(self, robot: RobotCfg, device: str) -> Self:
         """Replaces sizes of 0 by those that suit the robot and the Warp device."""
-        on_cuda = {"num_envs": robot.learning.num_envs, "iterations": robot.learning.iterations}
-        return _with_sizes(self, on_cuda if device.startswith("cuda") else _BASE_ON_CPU)
+        return self._with_sizes(vars(robot.learning) if device.startswith("cuda") else _BASE_ON_CPU)
+
+    def _with_sizes(self, sizes: Mapping[str, Any]) -> Self:
+        unset = [name for name in ("num_envs", "terrains", "iterations") if getattr(self, name, None) == 0]
+        return replace(self, **{name: sizes[name] for name in unset})
 
     def check(self, robot: RobotCfg) -> None:
         """Raises a ValueError for settings that cannot be trained with; sizes must be filled in."""
         check_settings(self)
-        lines = [*task_problems(self.task, robot.control_dt), *ppo_problems(self.ppo, self.num_envs)]
-        if lines:
-            raise ValueError("; ".join(lines))
+        for name in ("episode_s", "command_interval_s"):
+            if (time_s := getattr(self.task, name)) < robot.control_dt:
+                raise ValueError(f"task.{name} must be at least a control step, {robot.control_dt:g} s, got {time_s:g}")
+        if self.task.friction[0] < 0:
+            raise ValueError(f"task.friction must be at least 0, got {self.task.friction[0]:g}")
+        if not self.ppo.hidden_dims:
+            raise ValueError("ppo.hidden_dims must name at least one layer, got none")
+        if self.ppo.mini_batches > self.num_envs * self.ppo.steps_per_env // 2:
+            raise ValueError(
+                f"ppo.mini_batches must be at most half of the {self.num_envs} x {self.ppo.steps_per_env} transitions "
+                f"of an iteration, got {self.ppo.mini_batches}: give fewer, or more num_envs"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +245,9 @@ class FinetuneCfg(TrainCfg):
 
     def sized(self, robot: RobotCfg, device: str, **on_cuda: int) -> Self:
         """Replaces sizes of 0 by ``on_cuda`` and the paper's on a GPU, or by small ones on the CPU."""
-        sizes = asdict(robot.paper) | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
+        sizes = vars(robot.paper) | on_cuda if device.startswith("cuda") else _TUNING_ON_CPU
         recipe = replace(self.recipe, swap_every=self.recipe.swap_every or sizes["swap_every"])
-        return replace(_with_sizes(self, sizes), recipe=recipe)
+        return replace(self._with_sizes(sizes), recipe=recipe)
 
     def check(self, robot: RobotCfg) -> None:
         """Raises a ValueError for settings that cannot be trained with; sizes must be filled in."""
@@ -201,7 +311,3 @@ class HardenCfg:
     def sized_tune(self, robot: RobotCfg, device: str) -> FinetuneCfg:
         """The settings of each training, with sizes of 0 replaced by those that suit the robot and the Warp device."""
         return self.tune.sized(robot, device, **(LARGE if robot.tuning.large_rounds else {}))
-
-
-def _with_sizes(cfg: _Cfg, sizes: Sizes) -> _Cfg:
-    return replace(cfg, **{name: getattr(cfg, name) or size for name, size in sizes.items() if hasattr(cfg, name)})

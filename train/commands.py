@@ -45,7 +45,7 @@ class TrainCommand(_TrainingFlags, TrainCfg):
 
     def execute(self) -> None:
         """Trains."""
-        from train.base import train
+        from train.ppo.training import train
 
         robot = get_robot(self.robot)
         run_dir = _run_dir(self, f"{robot.name}-base")

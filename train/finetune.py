@@ -25,7 +25,6 @@ from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
 from train.ppo.training import (
     DESCRIBED,
-    Kind,
     Training,
     check_resumed,
     dump_settings,
@@ -34,7 +33,7 @@ from train.ppo.training import (
     read_saved,
     run_directory,
 )
-from train.task.mix import Mix
+from train.task.tiles import Mix
 
 _CRITIC_ITERATIONS = 50
 
@@ -76,7 +75,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
-        training = FineTuning(
+        training = begin_finetuning(
             robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
         )
         policy = training.run(run.export)
@@ -168,72 +167,41 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     )
 
 
-class FineTuning(Training):
-    """A fine-tuning at work: the terrains are exchanged under the learner."""
-
-    kind: Kind = "finetune"
-
-    def __init__(
-        self,
-        robot: RobotCfg,
-        cfg: FinetuneCfg,
-        run_dir: Path,
-        *,
-        device: str,
-        settings: dict[str, Any],
-        saved: dict[str, Any] | None,
-        elites: TrainingElites,
-        start: Start,
-    ) -> None:
-        """Begin with networks, or go on from a checkpoint; as of :class:`Training`."""
-        self.mix = Mix(
-            kind=cfg.mix,
-            num_terrains=cfg.terrains,
-            draw=cfg.recipe.draw,
-            genes=elites.genes,
-            spaces=elites.spaces,
-            seed=cfg.seed,
-            device=device,
-            goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
-        )
-        if saved is None:
-            critic_iterations = cfg.recipe.critic_iterations
-            if start.critic is not None:
-                critic_iterations = 0
-            elif critic_iterations is None:
-                critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
-            trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
-            trained_on = sorted({*chain(*map(hash_elites, elites.genes)), *trained_before})
-            facts = {TRAINED_ON: trained_on, "critic_iterations": critic_iterations}
-            tiles = self.mix.next()
-        else:
-            facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
-            tiles = self.mix.restore(saved["mix"])
-        self._swap_every = cfg.recipe.swap_every
-        super().__init__(
-            robot,
-            cfg,
-            run_dir,
-            device=device,
-            settings=settings,
-            saved=saved,
-            tiles=tiles,
-            facts=facts,
-            controller=start.controller,
-        )
-        if saved is None:
-            self.learner.start_from(start)
-
-    def before_iteration(self) -> None:
-        """Exchanges the terrains when that is due, and lets the actor learn after its critic's first iterations."""
-        iteration = self.learner.iteration
-        if iteration // self._swap_every > self.mix.swap:
-            self.task.exchange(self.mix.next(self.task.counts()))
-            self.learner.begin()
-        self.learner.alg.let_actor_learn(iteration >= self.critic_iterations)
-        if iteration == self.critic_iterations:
-            self.learner.alg.begin_actor()
-
-    def state(self) -> dict[str, Any]:
-        """Content of a checkpoint, with the present terrains."""
-        return {**super().state(), "mix": self.mix.state(self.task.counts())}
+def begin_finetuning(
+    robot: RobotCfg,
+    cfg: FinetuneCfg,
+    run_dir: Path,
+    *,
+    device: str,
+    settings: dict[str, Any],
+    saved: dict[str, Any] | None,
+    elites: TrainingElites,
+    start: Start,
+) -> Training:
+    """The fine-tuning of the networks of ``start`` on elites, or of a checkpoint; as of :class:`Training`."""
+    if saved is not None:
+        facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
+    else:
+        trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
+        critic_iterations = 0
+        if start.critic is None:
+            half = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+            critic_iterations = half if cfg.recipe.critic_iterations is None else cfg.recipe.critic_iterations
+        facts = {
+            TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
+            "critic_iterations": critic_iterations,
+        }
+    mix = Mix(
+        kind=cfg.mix,
+        num_terrains=cfg.terrains,
+        swap_every=cfg.recipe.swap_every,
+        draw=cfg.recipe.draw,
+        genes=elites.genes,
+        spaces=elites.spaces,
+        seed=cfg.seed,
+        device=device,
+        goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
+    )
+    return Training(
+        robot, cfg, run_dir, device=device, settings=settings, saved=saved, mix=mix, facts=facts, start=start
+    )

@@ -15,9 +15,7 @@ from qd.evaluate.evaluate import cross_sets
 from qd.evaluate.sets import generated_set, paper_terrains, plain_set
 from results.make.common import SEEDS, Script, crossing_rates, file_name, parse
 from results.make.tables import MIXES, SIZES, train, train_controllers
-from train.cfg import FinetuneCfg
-from train.ppo.cfg import PpoCfg
-from train.task.cfg import TaskCfg
+from train.cfg import FinetuneCfg, PpoCfg, TaskCfg
 
 RECIPES = ("today's", "the base's own")
 

@@ -18,9 +18,8 @@ import torch
 from results.make import peer
 from results.make.common import Script, parse
 from sim.files.provenance import device_name
-from train.ppo.learner import Learner, PpoCfg, Ranks
+from train.ppo.learner import CommandVecEnv, Learner, PpoCfg, Ranks
 from train.task.task import CommandTask, TaskCfg
-from train.task.vec_env import CommandVecEnv
 
 WARM_UP = 10
 SIZES = ((4096, peer.STEPS), (8192, PpoCfg.steps_per_env))

@@ -90,7 +90,7 @@ class LearningCfg(PaceCfg):
 
 
 Draw = Literal["uniform", "failing", "learnable"]
-"""How a fine-tuning draws elites (:class:`train.task.mix.MixCfg`)."""
+"""How a fine-tuning draws elites (:class:`train.cfg.RecipeCfg`)."""
 MAX_SPREAD = 10.0
 """How far along the way a training's robots may start [m]; farther ones would start within 2 m of the goal."""
 

@@ -15,10 +15,10 @@ from sim.robots.find import get_robot
 from tests.kills.faults import Steps
 from tests.qd.searches import crossing_by, rows_of
 from tests.qd.stand_in import open_stand_in
+from train.cfg import CurriculumCfg, TaskCfg
 from train.ppo import training
 from train.ppo.checkpoint import CHECKPOINT, read_checkpoint
 from train.ppo.training import POLICY
-from train.task.cfg import CurriculumCfg, TaskCfg
 from train.task.task import CommandTask
 
 _SEARCH = (

@@ -8,10 +8,10 @@ import pytest
 
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from train.cfg import FinetuneCfg
-from train.finetune import FineTuning, find_training_elites
+from train.cfg import CurriculumCfg, FinetuneCfg, TaskCfg
+from train.finetune import begin_finetuning, find_training_elites
 from train.ppo.checkpoint import read_start
-from train.task.cfg import CurriculumCfg, TaskCfg
+from train.ppo.training import Training
 from train.task.task import CommandTask
 
 NUM_ENVS = 6
@@ -33,9 +33,9 @@ def shared_task(device: str) -> CommandTask:
     return CommandTask(get_robot("anymal"), TaskCfg(curriculum=CURRICULUM), num_envs=NUM_ENVS, device=device, seed=1)
 
 
-def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> FineTuning:
+def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> Training:
     """A fine-tuning on the CPU that has not iterated yet."""
     start = read_start(Path(cfg.policy or robot.policy_file), robot)
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
     elites = find_training_elites(robot, cfg)
-    return FineTuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)
+    return begin_finetuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from qd.evaluate.marks import TRAINED_ON, hash_elites
-from train.ppo.cfg import PpoCfg
+from train.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)

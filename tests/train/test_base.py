@@ -15,14 +15,12 @@ from sim.files.atomic import locked
 from sim.files.command import Interrupted, run_command
 from sim.robots.find import get_robot
 from tests.train.conftest import CURRICULUM
-from train.base import train
-from train.cfg import RunCfg, TrainCfg
+from train.cfg import PpoCfg, RunCfg, TaskCfg, TrainCfg
 from train.commands import TrainCommand
 from train.ppo import training
-from train.ppo.cfg import PpoCfg
 from train.ppo.checkpoint import read_checkpoint
 from train.ppo.learner import Learner
-from train.task.cfg import TaskCfg
+from train.ppo.training import train
 
 ROBOT = get_robot("anymal")
 PPO = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=1, mini_batches=2)
@@ -154,7 +152,7 @@ def test_errors_come_before_any_work(flags, field, tmp_path, monkeypatch, capsys
 def test_new_runs_have_places_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = []
-    monkeypatch.setattr("train.base.train", lambda robot, cfg, run_dir, run: places.append(run_dir))
+    monkeypatch.setattr("train.ppo.training.train", lambda robot, cfg, run_dir, run: places.append(run_dir))
     for _ in range(3):
         assert run_command(TrainCommand, ["--device", "cpu"], name="train") == 0
         places[-1].mkdir(parents=True)

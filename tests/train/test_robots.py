@@ -8,9 +8,8 @@ import torch
 import tyro
 
 from sim.robots.find import get_robot
+from train.cfg import PpoCfg, TaskCfg
 from train.commands import TrainCommand
-from train.ppo.cfg import PpoCfg
-from train.task.cfg import TaskCfg
 
 CONTROL_DT = 0.02
 

@@ -8,7 +8,7 @@ from torch import nn
 
 from sim.controllers.described import ControllerCfg
 from sim.device import recording
-from train.ppo.cfg import PpoCfg
+from train.cfg import PpoCfg
 
 _FIRST_ACTOR_RATE = 1e-4  # learning rate of a trained actor's first steps; adapted from then on
 _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state and choose the matrix kernels

@@ -1,4 +1,4 @@
-"""Training loop with checkpoints, signals to stop, and the controller and its record at the end."""
+"""Training a base controller; the loop of all trainings, their checkpoints, and the controller with its record."""
 
 import io
 import signal
@@ -16,7 +16,7 @@ from qd.evaluate.marks import TRAINED_ON
 from qd.search.archive import ARCHIVE_FILE
 from qd.search.directory import CHECKPOINT_FILE
 from qd.search.settings import differences
-from sim.controllers.described import ControllerCfg, format_controller
+from sim.controllers.described import format_controller
 from sim.controllers.spec import is_same_controller
 from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
@@ -24,13 +24,12 @@ from sim.files.command import Interrupted
 from sim.files.provenance import provenance
 from sim.robots.identity import robot_digest
 from sim.robots.robot import RobotCfg
-from train.cfg import TrainCfg
-from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, read_checkpoint, write_checkpoint
-from train.ppo.learner import Learner, Ranks
+from train.cfg import RUN, RunCfg, TrainCfg
+from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, Start, read_checkpoint, write_checkpoint
+from train.ppo.learner import CommandVecEnv, Learner, Ranks
 from train.ppo.progress import TrainingProgress
-from train.task.curriculum import Tiles
 from train.task.task import CommandTask
-from train.task.vec_env import CommandVecEnv
+from train.task.tiles import Mix
 
 DESCRIBED = "controller.toml"
 """File of a training's directory with the description of its controller, if it has one."""
@@ -59,6 +58,27 @@ def stop_request() -> Iterator[Event]:
     finally:
         for kind, handler in handlers.items():
             signal.signal(kind, handler)
+
+
+def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
+    """Trains a controller by PPO on legged_gym's rough-terrain task; returns its file, ``<run_dir>/policy.pt``.
+
+    If the directory holds a checkpoint of the same settings, the training goes on. torchrun may start several processes
+    of it, each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and
+    TensorBoard's file. ``run`` has the device and an export.
+    """
+    device = find_device(run.device)
+    cfg = cfg.sized(robot, device)
+    settings = dump_settings(cfg, robot)
+    saved = read_saved(run_dir, "train", robot.name) if (run_dir / CHECKPOINT).exists() else None
+    if saved is not None:
+        check_resumed(run_dir, saved, settings)
+    with run_directory(run_dir, run.export):
+        if Ranks.from_environment().is_first:
+            sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
+            print(f"Training '{robot.name}': {sizes}, in {run_dir}", flush=True)
+        training = Training(robot, cfg, run_dir, device=device, settings=settings, saved=saved)
+        return training.run(run.export)
 
 
 def find_device(name: str | None) -> str:
@@ -131,15 +151,15 @@ def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
 
 
 class Training:
-    """A training: its task, learner and progress.
+    """A training, of a base controller or, with a mix of terrains, a fine-tuning: its task, learner and progress.
 
     Attributes:
         task: Robots on their terrains.
         learner: Actor, critic and optimiser.
         progress: Rows printed and recorded.
+        critic_iterations: First iterations, in which the critic learns alone.
+        averaged_from: The iteration after which actors count into the controller.
     """
-
-    kind: Kind = "train"
 
     def __init__(
         self,
@@ -150,28 +170,34 @@ class Training:
         device: str,
         settings: dict[str, Any],
         saved: dict[str, Any] | None,
-        tiles: Tiles | None = None,
+        mix: Mix | None = None,
         facts: dict[str, Any] | None = None,
-        controller: ControllerCfg | None = None,
+        start: Start | None = None,
     ) -> None:
-        """Begin, or go on from a checkpoint (:func:`read_saved`); without ``tiles`` on those of the curriculum.
+        """Begin, with the networks of ``start`` if given, or go on from a checkpoint (:func:`read_saved`).
 
-        Checkpoint and record have ``settings`` (:func:`dump_settings`) under one key and each of ``facts`` under its
-        own. ``controller`` is as of :class:`CommandVecEnv`.
+        Without ``mix`` robots walk on the tiles of the curriculum. Checkpoint and record have ``settings``
+        (:func:`dump_settings`) under one key and each of ``facts`` under its own.
         """
         self._cfg = cfg
         self._run_dir = run_dir
         self._settings = settings
+        self._mix = mix
         self._facts = facts or {}
+        self.critic_iterations: int = self._facts.get("critic_iterations", 0)
+        self.averaged_from = max(round((1.0 - cfg.ppo.average) * cfg.iterations), self.critic_iterations)
         ranks = Ranks.from_environment()
+        tiles = mix and (mix.next() if saved is None else mix.restore(saved["mix"]))
         self.task = CommandTask(
             robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
         )
         # On given terrains every episode is whole, because the crossings of each terrain are counted.
-        env = CommandVecEnv(self.task, controller)
-        self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=tiles is None)
+        env = CommandVecEnv(self.task, start and start.controller)
+        self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=mix is None)
         if saved is not None:
             self.learner.resume(saved)
+        elif start is not None:
+            self.learner.start_from(start)
         self.progress = TrainingProgress(
             run_dir,
             self.learner,
@@ -181,27 +207,27 @@ class Training:
         )
 
     def before_iteration(self) -> None:
-        """A hook for kinds of training; does nothing here."""
-
-    @property
-    def critic_iterations(self) -> int:
-        """Iterations in which the critic learns alone."""
-        return self._facts.get("critic_iterations", 0)
-
-    @property
-    def averaged_from(self) -> int:
-        """The iteration after which actors count into the controller; none counts while the critic learns alone."""
-        return max(round((1.0 - self._cfg.ppo.average) * self._cfg.iterations), self.critic_iterations)
+        """Exchanges a mix's terrains when that is due; lets the actor learn after its critic's first iterations."""
+        if self._mix is None:
+            return
+        iteration = self.learner.iteration
+        if iteration // self._mix.swap_every > self._mix.swap:
+            self.task.exchange(self._mix.next(self.task.counts()))
+            self.learner.begin()
+        self.learner.alg.let_actor_learn(iteration >= self.critic_iterations)
+        if iteration == self.critic_iterations:
+            self.learner.alg.begin_actor()
 
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint."""
         controller = self.learner.env.controller
         return {
             **self.learner.state(),
-            "kind": self.kind,
+            "kind": "train" if self._mix is None else "finetune",
             "settings": self._settings,
             "progress": self.progress.state(),
-            **({DESCRIPTION: format_controller(controller)} if controller is not None else {}),
+            **({} if controller is None else {DESCRIPTION: format_controller(controller)}),
+            **({} if self._mix is None else {"mix": self._mix.state(self.task.counts())}),
             **self._facts,
         }
 
@@ -225,11 +251,9 @@ class Training:
         last_save = time.monotonic()
         if learner.iteration - learner.averaged < self.averaged_from:  # a shorter training averaged other actors
             learner.count_into_mean(False)
-
-        def wants_more() -> bool:
-            return learner.iteration < self._cfg.iterations and not stop.is_set()
-
-        while learner.ranks.all_true(wants_more(), learner.env.device):
+        while learner.ranks.all_true(
+            learner.iteration < self._cfg.iterations and not stop.is_set(), learner.env.device
+        ):
             self.before_iteration()
             step = learner.iterate()
             learner.count_into_mean(learner.iteration > self.averaged_from)

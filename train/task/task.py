@@ -30,8 +30,8 @@ from sim.reward import Reward
 from sim.robots.robot import RobotCfg
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
-from train.task.cfg import TaskCfg
-from train.task.curriculum import Tiles, make_tiles
+from train.cfg import TaskCfg
+from train.task.tiles import Tiles, make_tiles
 
 _FALLS = (Outcome.BASE_COLLISION, Outcome.TILT, Outcome.INVALID)
 """An invalid state costs what a fall does: were it free, falling robots would learn to whip their legs too fast."""

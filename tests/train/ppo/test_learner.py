@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from train.ppo.cfg import PpoCfg
+from train.cfg import PpoCfg
 from train.ppo.checkpoint import STD, read_checkpoint, write_checkpoint
-from train.ppo.learner import Learner, Ranks
-from train.task.vec_env import CommandVecEnv
+from train.ppo.learner import CommandVecEnv, Learner, Ranks
 
 CFG = PpoCfg(hidden_dims=(16, 8), steps_per_env=4, epochs=2, mini_batches=2)
 

@@ -12,10 +12,10 @@ from sim.terrains.conditions.base import condition_column, nominal_row
 from sim.terrains.ground import GroundMaps
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
-from train.task.cfg import NoiseCfg, TaskCfg, task_problems
-from train.task.curriculum import Tiles
+from train.cfg import NoiseCfg, TaskCfg, TrainCfg
+from train.ppo.learner import CommandVecEnv
 from train.task.task import CommandTask
-from train.task.vec_env import CommandVecEnv
+from train.task.tiles import Tiles
 
 ACTION = slice(36, 48)
 
@@ -202,8 +202,8 @@ def test_what_no_task_can_do_is_refused(shared_task):
     with pytest.raises(ValueError, match=r"\(6, 12\), got \(6, 11\)"):
         shared_task.step(torch.zeros(6, 11, device=shared_task.device))
     for changes in ({"friction": (-0.1, 1.0)}, {"lin_vel_x": (1.0, -1.0)}, {"episode_s": 0.01}):
-        (problem,) = task_problems(TaskCfg(**changes), 0.02)
-        assert problem.startswith(f"task.{next(iter(changes))} ")
+        with pytest.raises(ValueError, match=f"task.{next(iter(changes))} "):
+            TrainCfg(num_envs=6, task=TaskCfg(**changes)).check(get_robot("anymal"))
 
 
 def test_a_robot_whose_file_has_it_in_the_ground_overflows_nothing_while_the_step_is_captured(tmp_path, capfd):
@@ -214,3 +214,30 @@ def test_a_robot_whose_file_has_it_in_the_ground_overflows_nothing_while_the_ste
     assert task.sim.contacts.count.numpy().max() < dog.nconmax
     ctypes.CDLL(None).fflush(None)  # kernels print through C
     assert "contacts" not in capfd.readouterr().out
+
+
+def test_nothing_handed_out_changes_later(shared_task):
+    env = CommandVecEnv(shared_task)
+    assert (env.num_envs, env.num_actions, env.max_episode_length) == (6, 12, 1000)
+    handed = [env.get_observations()["policy"], env.episode_length_buf]
+    actions = torch.zeros(6, 12, device=env.device)
+    observations, rewards, dones, extras = env.step(actions)
+    assert observations["policy"].shape == (6, 235) and rewards.shape == dones.shape == (6,)
+    handed += [observations["policy"], rewards, dones, extras["time_outs"], actions]
+    copies = [tensor.clone() for tensor in handed]
+    for _ in range(3):
+        env.step(torch.ones(6, 12, device=env.device))
+    assert all(tensor.equal(copy) for tensor, copy in zip(handed, copies, strict=True))
+    assert not env.get_observations()["policy"].equal(handed[0])
+
+
+def test_time_outs_are_the_dones_of_the_clock(shared_task):
+    env = CommandVecEnv(shared_task)
+    shared_task.restart_all(torch.zeros(6, device=env.device))
+    env.episode_length_buf = torch.tensor([0, 998, 999, 999, 5, 5], device=env.device)
+    joint_q = torch.from_dlpack(shared_task.sim.joint_q)
+    joint_q[3:5, 3:7] = torch.tensor([1.0, 0.0, 0.0, 0.0], device=env.device)  # on their backs
+    _, _, dones, extras = env.step(torch.zeros(6, 12, device=env.device))
+    assert dones.tolist() == [False, False, True, True, True, False]
+    assert extras["time_outs"].tolist() == [False, False, True, False, False, False]
+    assert env.episode_length_buf.tolist() == [1, 999, 0, 0, 0, 6]

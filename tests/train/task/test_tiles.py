@@ -1,21 +1,23 @@
-"""Terrains of a fine-tuning: shares, exchanges, what is remembered of elites, and going on from a checkpoint."""
+"""Tiles of the curriculum; mixes: shares, exchanges, what is remembered of elites, going on from a checkpoint."""
 
 import numpy as np
 import pytest
 
 from sim.terrains.bank import make_terrains
-from sim.terrains.hand_crafted import CROSSING_TYPES
+from sim.terrains.hand_crafted import CROSSING_TYPES, NUM_COLS, NUM_LEVELS, NUM_ROWS, training_tiles
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from train.task.mix import Mix
+from train.cfg import CurriculumCfg
+from train.task.tiles import Mix, make_tiles
 
 ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 
 
 def make_mix(*, kind="generated", terrains=6, elites=ELITES, seed=0, **changes) -> Mix:
     genes = elites if kind == "generated" else np.zeros((0, 64), np.float32)
-    return Mix(kind=kind, num_terrains=terrains, seed=seed, device="cpu", **{"genes": (genes,), **changes})
+    settings = {"genes": (genes,), "swap_every": 1, "device": "cpu", **changes}
+    return Mix(kind=kind, num_terrains=terrains, seed=seed, **settings)
 
 
 def counts(goals, episodes, invalid=None):
@@ -158,3 +160,38 @@ def test_elites_that_fail_under_conditions_are_trained_on_under_them():
     np.testing.assert_array_equal(
         tiles.ground.rows[:5], COURSE.condition_rows(np.zeros((5, 36)))
     )  # hand-crafted: nominal
+
+
+@pytest.fixture(scope="module")
+def tiles():
+    return make_tiles(CurriculumCfg(num_columns=5, noise_columns=2), seed=3)
+
+
+def test_grid_order(tiles):
+    assert tiles.heights.shape == (NUM_LEVELS * 7, NUM_ROWS, NUM_COLS)
+    assert (tiles.num_levels, tiles.num_columns) == (NUM_LEVELS, 7)
+    assert tiles.type_of_column[-2:] == ("noise", "noise")
+    without_noise = tiles.heights.reshape(NUM_LEVELS, 7, NUM_ROWS, NUM_COLS)[:, :5].reshape(-1, NUM_ROWS, NUM_COLS)
+    rng = np.random.default_rng(3).spawn(2)[0]
+    np.testing.assert_array_equal(without_noise, training_tiles(5, rng)[0])
+
+
+def test_noise_grows_with_the_level(tiles):
+    for level in range(NUM_LEVELS):
+        tile = tiles.heights[level * 7 + 6]
+        bound = 0.02 + 0.08 * level / 10
+        assert 0.9 * bound < np.abs(tile).max() <= bound
+    assert (tiles.heights[5] != tiles.heights[6]).any()
+
+
+def test_every_column_gets_its_share(tiles):
+    counts = np.bincount(tiles.assign_columns(700))
+    assert counts.tolist() == [100] * 7
+    assert set(np.bincount(tiles.assign_columns(703))) == {100, 101}
+    assert tiles.assign_columns(3).max() < 7
+
+
+def test_columns_of_noise_alone_and_none_at_all():
+    assert make_tiles(CurriculumCfg(num_columns=0, noise_columns=1), seed=0).type_of_column == ("noise",)
+    with pytest.raises(ValueError, match="num_columns"):
+        make_tiles(CurriculumCfg(num_columns=0, noise_columns=0), seed=0)
