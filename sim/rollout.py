@@ -148,8 +148,7 @@ class Rollout:
         """
         if num_terrains < 1 or replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
-                "num_terrains, replicas and num_envs must be positive, "
-                f"got {num_terrains}, {replicas} and {num_envs}"
+                f"num_terrains, replicas and num_envs must be positive, got {num_terrains}, {replicas} and {num_envs}"
             )
         self.robot = robot
         self.cfg = cfg or CrossingCfg()

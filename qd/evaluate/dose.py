@@ -20,8 +20,7 @@ from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
 from sim.terrains.doses import Dose
 

@@ -31,8 +31,7 @@ from qd.workers.pipeline import Engine
 from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, resolve_policy
 from sim.files.command import publish
 from sim.robots.find import get_robot, read_penalty_scales
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import load_space, space_at
 

@@ -22,8 +22,7 @@ from qd.search.fitness import FAILING_GOAL_RATE
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.intervals import wilson_interval
-from sim.robots.identity import check_robot_digest
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, check_robot_digest
 
 Tables = dict[str, Any]
 """Numbers of controllers on sets of terrains, as JSON values; rates are fractions, None where no terrain is valid.

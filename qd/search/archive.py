@@ -63,7 +63,7 @@ class Archive(Evaluation):
     robot: str
     robot_sha256: str
     penalty_definition: str
-    """How its penalties are defined (:data:`sim.robots.identity.PENALTY_DEFINITION`)."""
+    """How its penalties are defined (:data:`sim.robots.robot.PENALTY_DEFINITION`)."""
     space: str
     """Name of the terrain space of the genes (:func:`sim.terrains.spaces.registry.get_space`)."""
     penalties: tuple[str, ...]

@@ -16,8 +16,7 @@ from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
-from sim.robots.identity import check_robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, check_robot_identity
 from sim.terrains.spaces.registry import get_space, load_space
 
 RUNS = Path("runs")

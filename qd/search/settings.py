@@ -12,8 +12,7 @@ from qd.search.presets import SchedulerCfg, read_preset
 from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, resolve_policy
 from sim.files.settings import NonNegativeInt, PositiveInt, check_settings, from_builtins
 from sim.robots.find import read_penalty_scales
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_identity
 
 _MOST_EPISODES = 10_000_000
 
@@ -26,7 +25,7 @@ class SearchCfg:
     robot_sha256: str
     """Hash of its settings, model and meshes."""
     penalty_definition: str
-    """How the penalties are defined (:data:`sim.robots.identity.PENALTY_DEFINITION`)."""
+    """How the penalties are defined (:data:`sim.robots.robot.PENALTY_DEFINITION`)."""
     preset: str
     policy: str
     """Controller: ``shipped``, or as :func:`sim.controllers.loaders.load_policy` takes it."""

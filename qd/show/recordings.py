@@ -19,10 +19,8 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream, episode_seeds
 from sim.controllers.spec import controller_hash
 from sim.files.provenance import code_fingerprint
-from sim.recording.file import read_recording, write_recording
-from sim.recording.recorder import Recording, make_recording
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.recording.recorder import Recording, make_recording, read_recording, write_recording
+from sim.robots.robot import RobotCfg, robot_identity
 from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space, space_key
 from sim.terrains.terrains import Terrains

@@ -26,8 +26,7 @@ from sim.controllers.spec import controller_hash, resolve_policy
 from sim.files.command import Interrupted
 from sim.files.provenance import code_fingerprint
 from sim.robots.find import get_robot
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import space_key
 from sim.terrains.terrains import Terrains

@@ -20,8 +20,7 @@ from sim.controllers.runner import action_problem, reset_all
 from sim.controllers.spec import ControllerSpec, import_object, in_one_line, weights_file
 from sim.files.atomic import read_json
 from sim.robots.find import get_robot
-from sim.robots.identity import robot_digest
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_digest
 
 _EXPECTED = "expected a .toml, .pt, .ts or .onnx file, module:callable or module:adapter@file (docs/controllers.md)"
 PolicySpec = str | Path | Policy

@@ -14,8 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from sim.robots.identity import robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_identity
 
 SHIPPED = "shipped"
 """Name of the controller that comes with the robot."""

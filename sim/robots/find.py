@@ -10,8 +10,7 @@ from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
-from sim.robots.identity import check_robot_identity
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, check_robot_identity
 from sim.robots.shipped import ROBOTS
 
 
@@ -45,7 +44,7 @@ def resolve_robot(
     """The robot that a file names, for example a run's, if it has not changed since.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
-    file names. The record has the keys of :func:`sim.robots.identity.robot_identity`; ``given`` is what the command
+    file names. The record has the keys of :func:`sim.robots.robot.robot_identity`; ``given`` is what the command
     names, if anything; errors name the file and its ``kind``.
     """
     name = record["robot"]

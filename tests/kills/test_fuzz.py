@@ -19,7 +19,7 @@ from qd.search.archive import read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.workers.cache import Cache
 from sim.controllers.loaders import load_policy
-from sim.recording.file import read_recording
+from sim.recording.recorder import read_recording
 from sim.robots.find import get_robot
 from tests.builders import judged_archive
 from tests.kills import runs

@@ -18,7 +18,7 @@ from qd.show import figures
 from qd.workers import crosser
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from tests.qd import stand_in
 from tests.qd.stand_in import compute_by, open_stand_in
 

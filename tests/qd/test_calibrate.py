@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.calibrate import calibrate, find_fitting_height, measure_scales
+from qd.check import calibrate, find_fitting_height, measure_scales
 from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg

@@ -8,7 +8,7 @@ import pytest
 from sim.controllers.loaders import load_policy
 from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, resolve_robot
-from sim.robots.identity import robot_digest, robot_identity
+from sim.robots.robot import robot_digest, robot_identity
 from sim.robots.shipped import ROBOTS
 from tests.builders import rsl_rl_actor, save_checkpoint
 from tests.sim.dogs import write_dog

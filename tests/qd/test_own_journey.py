@@ -9,7 +9,7 @@ import faultline
 from qd.search.archive import read_archive
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from sim.terrains.maps.heightmap import read_heightmap
 from tests.sim.dogs import write_dog
 from tests.sim.terrains.spaces.spaces import write_ridges

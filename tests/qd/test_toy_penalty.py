@@ -11,7 +11,7 @@ from qd.show.figures import draw_archive
 from qd.workers.pipeline import Pipeline, build_simulator
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from tests.qd.searches import crossing_by
 from tests.sim.dogs import write_dog
 

@@ -22,8 +22,7 @@ from sim.device import resolve_device
 from sim.files.atomic import locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.command import Interrupted
 from sim.files.provenance import provenance
-from sim.robots.identity import robot_digest
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_digest
 from train.cfg import RUN, RunCfg, TrainCfg
 from train.ppo.checkpoint import CHECKPOINT, DESCRIPTION, POLICY, Start, read_checkpoint, write_checkpoint
 from train.ppo.learner import CommandVecEnv, Learner, Ranks

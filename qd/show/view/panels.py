@@ -21,7 +21,7 @@ from qd.show.crossed import ENDINGS
 from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
-from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
+from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
 _WIDTH = 360  # of a panel [pixels]

@@ -12,7 +12,7 @@ from qd.show.view.meshes import Part, arrow_mesh, arrow_pose, in_linear_light, t
 from qd.show.view.playing import Crossing
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights
-from sim.recording.scene import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
+from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
 

@@ -10,7 +10,7 @@ from qd.evaluate.labels import FATES
 from qd.evaluate.measures import measure
 from qd.evaluate.show import show_tables
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from tests.builders import judged_archive
 from tests.qd.evaluate.made import make_measured, make_set
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of

@@ -9,8 +9,7 @@ from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg
 from qd.search.settings import as_settings, differences, find_policy, from_settings, is_searched, preset
 from sim.controllers.spec import controller_hash
-from sim.robots.identity import robot_digest
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import RobotCfg, robot_digest
 from sim.robots.shipped import ROBOTS
 from tests.qd import stand_in
 

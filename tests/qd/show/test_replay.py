@@ -22,7 +22,7 @@ from qd.show.replay import compute_numbers, describe, replay, source_from_map, s
 from qd.show.view.viewed import open_viewed_run
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from tests.builders import fresh_values, small_archive
 from tests.qd.recordings import FRAMES, recording_of
 from tests.qd.searches import CFG

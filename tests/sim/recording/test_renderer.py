@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sim.mujoco_c.model import surface_heights
-from sim.recording.renderer import Camera, Renderer, open_context
-from sim.recording.scene import ground_paint, scene_model
+from sim.recording.renderer import Camera, Renderer, ground_paint, open_context, scene_model
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.sim.plain_mujoco import rays_from_above, to_c
 from tests.sim.scenes import standing as standing_robots

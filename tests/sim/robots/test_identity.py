@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim.controllers.spec import controller_identity
-from sim.robots.identity import check_robot_identity, robot_digest
+from sim.robots.robot import check_robot_identity, robot_digest
 from sim.robots.training import TrainingCfg
 
 

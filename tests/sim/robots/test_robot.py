@@ -8,8 +8,8 @@ import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
 from sim.robots.find import read_penalty_scales
-from sim.robots.identity import robot_identity
 from sim.robots.model import build_robot
+from sim.robots.robot import robot_identity
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
 from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE

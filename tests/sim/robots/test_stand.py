@@ -4,9 +4,8 @@ import dataclasses
 
 import pytest
 
-from sim.robots.describe import describe_model, describe_standing
 from sim.robots.find import get_robot
-from sim.robots.stand import stand, standing_mistakes
+from sim.robots.stand import describe_model, describe_standing, stand, standing_mistakes
 from tests.sim.dogs import KINDS, LEGS, write_dog
 
 

@@ -16,10 +16,10 @@ from sim.crossing import resolved
 from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot, read_penalty_scales
-from sim.robots.identity import robot_digest
 from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes
+from sim.robots.robot import robot_digest
 from sim.robots.skeleton import Skeleton
 from sim.robots.user import PackedRobot, pack_robot
 from sim.terrains.terrains import Terrains

@@ -2,7 +2,7 @@
 
 from qd.show.report.evaluation import compare_controllers
 from sim.files.atomic import to_json
-from sim.robots.identity import robot_identity
+from sim.robots.robot import robot_identity
 from tests.qd.evaluate.made import make_report
 from tests.qd.show.report.pages import text_of
 

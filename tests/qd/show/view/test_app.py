@@ -16,7 +16,7 @@ from qd.show.view.app import App
 from qd.show.view.recorder import TaskProgress
 from qd.show.view.tab import Tab
 from qd.show.view.viewed import open_viewed_run
-from sim.recording.file import read_recording
+from sim.recording.recorder import read_recording
 from tests.builders import free_port
 from tests.qd.show.view.visitor import visit
 
