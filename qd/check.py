@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.dose import measure_dose
+from qd.evaluate.dose import measure_dose, parse_doses
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
@@ -32,7 +32,6 @@ from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, describe_standing, stand, standing_mistakes
 from sim.robots.user import describe_inferred
 from sim.rollout import RolloutResult
-from sim.terrains.doses import parse_doses
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height

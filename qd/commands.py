@@ -365,8 +365,7 @@ class DoseCommand(RobotFlag, WorkerFlags):
 
     def execute(self) -> None:
         """Measures."""
-        from qd.evaluate.dose import measure_dose
-        from sim.terrains.doses import parse_doses
+        from qd.evaluate.dose import measure_dose, parse_doses
 
         robot = get_robot(self.robot)
         measure_dose(

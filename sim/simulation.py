@@ -29,8 +29,7 @@ from sim.robots.training import NoiseCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.base import begin_effects, disturb_effects
-from sim.terrains.conditions.delay import MAX_DELAY_S
-from sim.terrains.conditions.lag import MAX_LAG_S
+from sim.terrains.conditions.kinds import MAX_LATENCY_S
 
 
 class Simulation:
@@ -204,7 +203,7 @@ class Simulation:
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
         max_steps = robot.drive_delay_steps
         if self.bank.conditions is not None:
-            max_steps += math.ceil(MAX_DELAY_S / robot.physics_dt)
+            max_steps += math.ceil(MAX_LATENCY_S / robot.physics_dt)
         if max_steps:
             actuators = len(self._coordinates.target_of_actuator)
             delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
@@ -226,7 +225,7 @@ class Simulation:
         self._varied = self.dynamics.vary_bases()
         self._varied.delay_steps, self._varied.friction = self._delay.steps, self.bank.ground.factor
         self._varied.drive_delay, self._varied.physics_dt = self.robot.drive_delay_steps, self.robot.physics_dt
-        max_lag, size = math.ceil(MAX_LAG_S / self.robot.control_dt), self.robot.observation_size
+        max_lag, size = math.ceil(MAX_LATENCY_S / self.robot.control_dt), self.robot.observation_size
         disturbed = make_zeros(
             Disturbed, str(self.device), row=(self.num_envs, self.bank.conditions.shape[1]),
             age=(self.num_envs, size), former=(self.num_envs, 1 + max_lag, size),

@@ -1,6 +1,12 @@
-"""Which real obstacle at which size stops a controller: goal rate against a stair's rise, a ditch's width, friction."""
+"""Which real obstacle at which size stops a controller: goal rate against a stair's rise, a ditch's width, friction.
 
-from collections.abc import Mapping, Sequence
+A dose is one obstacle alone on flat ground, or one ground or condition everywhere, of which one number grows. An
+obstacle is an element of a course (:mod:`sim.terrains.elements`) of any size, within the ranges of its space or beyond.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
+from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.sets import TerrainSet, set_rng
 from qd.evaluate.show import show_table
@@ -22,7 +29,12 @@ from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
-from sim.terrains.doses import Dose
+from sim.terrains.conditions.base import CONDITIONS, Condition
+from sim.terrains.elements.base import ELEMENTS
+from sim.terrains.quantities import Quantity, Sweep
+from sim.terrains.spaces.names import join_name
+from sim.terrains.spaces.on_ground import ground_genes
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
@@ -32,6 +44,137 @@ _BEYOND = {"first": "before the first", "last": "beyond the last", None: "-"}
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
+_GROUNDS = {
+    "friction": (
+        Quantity(name="friction", low=MIN_FRICTION, high=1.0),
+        (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15),
+    ),
+    "softness": (
+        Quantity(name="softness", low=1.1 * MIN_TIME_CONSTANT_S, high=MAX_TIME_CONSTANT_S, unit="s"),
+        (0.015, 0.02, 0.03, 0.04, 0.05, 0.06),
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dose(Sweep):
+    """An obstacle, a ground or a condition, of which one quantity grows."""
+
+    quantities: Mapping[str, Quantity]
+    make: Callable[[Mapping[str, Any], int, np.random.Generator], NDArray[np.float32]] = field(compare=False)
+    """Makes the terrains of quantities, of which one has several values (:meth:`terrains`)."""
+    space: str = SUPER_GAUSSIAN.name
+    """Terrain space of its genes; of heights any."""
+
+    @property
+    def unit(self) -> str:
+        """Of the quantity that grows; empty of a number."""
+        return self.quantities[self.parameter].unit
+
+    @property
+    def harder_up(self) -> bool:
+        """Whether larger values are harder."""
+        return self.values[-1] >= self.values[0]
+
+    def describe(self) -> str:
+        """The obstacle and its other quantities: ``stairs up, tread 0.30 m, flight 5 steps``."""
+        others = (f"{name} {self.quantities[name].format(value)}" for name, value in self.others.items())
+        return ", ".join([self.title, *others])
+
+    def changed(self, values: Iterable[float] | None, others: Mapping[str, float]) -> "Dose":
+        """The same with other values, the easiest first, and other quantities where it has them."""
+        changed = {name: value for name, value in others.items() if name in self.others}
+        values = self.values if values is None else sorted(values, reverse=not self.harder_up)
+        if not values or len(set(values)) < len(values):
+            raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {values}")
+        for name, value in [*((self.parameter, value) for value in values), *changed.items()]:
+            quantity = self.quantities[name]
+            steps = value / quantity.step if quantity.step else 0.0
+            if not quantity.low <= value <= quantity.high or abs(steps - round(steps)) > 1e-6:
+                every = f" in steps of {quantity.step:g}" if quantity.step else ""
+                limits = f"{quantity.low:g} to {quantity.high:g} {quantity.unit}".rstrip()
+                raise ValueError(f"{self.title}: {name} must be {limits}{every}, got {value:g}")
+        return replace(self, values=tuple(values), others={**self.others, **changed})
+
+    def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Terrains of all values, ``count`` each: first one of each value, then the next of each.
+
+        An obstacle begins at ``count`` nodes that are spread evenly over 1 m. A cross slope leans to a side that is
+        drawn for each node, rubble is another one at each. All else is the same for all values. Returns heights [m],
+        shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
+        """
+        return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
+
+
+def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[NDArray[Any]], NDArray[Any]]) -> Dose:
+    """Level ground, whose map or condition has ``to_genes`` of the values, shape (num_values, number of its genes)."""
+
+    def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        genes = to_genes(quantities[name])
+        flat = np.zeros((len(genes), SUPER_GAUSSIAN.num_genes))  # bumps of no height
+        return np.tile(np.concatenate([flat, genes], axis=1).astype(np.float32), (count, 1))
+
+    space = join_name(SUPER_GAUSSIAN.name, (name,))
+    return Dose(name, sweep.values, title=sweep.title, quantities={name: quantity}, make=make, space=space)
+
+
+def _dose_condition(condition: Condition, sweep: Sweep) -> Dose:
+    (gene,) = (gene for gene in condition.genes if gene.name == sweep.parameter)
+    quantity = replace(gene, low=max(0.0, gene.low))
+    return _dose_level(
+        condition.name, sweep, quantity, lambda values: condition.to_genes({**sweep.others, sweep.parameter: values})
+    )
+
+
+def all_doses() -> dict[str, Dose]:
+    """Every dose by its name: obstacles, then grounds, then conditions."""
+    doses = {
+        name: Dose(
+            sweep.parameter, sweep.values, sweep.others, name.replace("_", " "), quantities=element.quantities,
+            make=partial(element.lay_alone, sweep.turn),
+        )
+        for element in ELEMENTS.values()
+        for name, sweep in element.doses.items()
+    }  # fmt: skip
+    for name, (quantity, values) in _GROUNDS.items():
+        doses[name] = _dose_level(
+            name, Sweep(name, values, title="level ground"), quantity, partial(ground_genes, name)
+        )
+    return doses | {
+        name: _dose_condition(condition, sweep) for name, condition in CONDITIONS.items() if (sweep := condition.dose)
+    }
+
+
+def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
+    """Some of :func:`all_doses`, in their order, as a command line names them; without ``texts`` all but conditions.
+
+    A word is ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces. ``at`` are
+    other quantities of those that have them, ``tread=0.25``.
+    """
+    doses, chosen = all_doses(), dict[str, Sequence[float] | None]()
+    for word in " ".join(texts).split():
+        name, equals, values = word.partition("=")
+        chosen[name] = [_parse_number(value, word) for value in values.split(",")] if equals else None
+    chosen = chosen or {name: None for name in doses if name not in CONDITIONS}
+    if unknown := chosen.keys() - doses.keys():
+        raise ValueError(f"elements must be some of {', '.join(doses)}, got {', '.join(sorted(unknown))}")
+    pairs = (word.partition("=") for word in " ".join(at).split())
+    others = {name: _parse_number(value, f"{name}={value}") for name, _, value in pairs}
+    doses = {name: dose for name, dose in doses.items() if name in chosen}
+    allowed = sorted({name for dose in doses.values() for name in dose.others})
+    if wrong := others.keys() - set(allowed):
+        raise ValueError(
+            f"at must name quantities that the elements have beside the one that grows ({', '.join(allowed) or 'none'}"
+            f"), got {', '.join(sorted(wrong))}: leave that out"
+        )
+    return {name: dose.changed(chosen[name], others) for name, dose in doses.items()}
+
+
+def _parse_number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None
 
 
 def measure_dose(
@@ -59,10 +202,8 @@ def measure_dose(
 
     def measure() -> dict[str, Any]:
         sets = {name: dose_set(dose, count, seed) for name, dose in doses.items()}
-        results = cross_sets(
-            controllers, sets, robot=robot, compute=compute, episodes=episodes,
-            engine="resolved" if resolved else "search", cache=crossings_folder(robot),
-        )  # fmt: skip
+        engine, cache = "resolved" if resolved else "search", crossings_folder(robot)
+        results = cross_sets(controllers, sets, robot, compute, episodes, engine=engine, cache=cache)
         rows = {
             (name, controller): measure_rates(name, dose, controller, results[name][controller])
             for name, dose in doses.items()
@@ -91,12 +232,8 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     """
     rng = set_rng("dose", seed)
     seeds = rng.integers(2**32, size=num_terrains, dtype=np.uint32).repeat(len(dose.values))
-    return TerrainSet(
-        terrains=dose.terrains(num_terrains, rng),
-        seeds=seeds,
-        numbers=np.arange(len(seeds)),
-        space=dose.space,
-    )
+    terrains, numbers = dose.terrains(num_terrains, rng), np.arange(len(seeds))
+    return TerrainSet(terrains=terrains, seeds=seeds, numbers=numbers, space=dose.space)
 
 
 def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:
@@ -114,13 +251,18 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
     counted = counted_episodes(outcome == Outcome.INVALID)
     hits = {"goal": outcome == Outcome.GOAL, "fallen": group(result.fallen)}
     hits["success"] = outcome != Outcome.BASE_COLLISION
+    about = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "at": dict(dose.others)}
     rows = []
     for number, value in enumerate(dose.values):
         count = int(counted[number].sum())
+        left_out = outcome.shape[1] - count
         row: dict[str, Any] = {
-            "element": name, "parameter": dose.parameter, "value": value, "unit": dose.unit, "at": dict(dose.others),
-            "controller": controller, "episodes": count, "left_out": outcome.shape[1] - count,
-        }  # fmt: skip
+            **about,
+            "value": value,
+            "controller": controller,
+            "episodes": count,
+            "left_out": left_out,
+        }
         for rate, is_hit in hits.items():
             num_hits = int((is_hit & counted)[number].sum())
             row[f"{rate}_rate"] = num_hits / count if count else None

@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
-from qd.evaluate.dose import measure_dose
+from qd.evaluate.dose import all_doses, measure_dose, parse_doses
 from results.make.common import parse, published_controllers
-from sim.terrains.doses import all_doses, parse_doses
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from qd.check import ensure_ready, walk
-from qd.evaluate.dose import measure_dose
+from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
 from qd.faults.judge import judge
 from qd.search.directory import RunDirectory
@@ -37,7 +37,6 @@ from sim.files.provenance import provenance
 from sim.files.settings import read_toml
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.doses import parse_doses
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
 from sim.terrains.terrains import Terrains

@@ -91,7 +91,7 @@ class EpisodeStates:
         self.delay_steps = robot.drive_delay_steps
         self.former_rows = deque[Array]()
         self.rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))
-        self._conditions = list(split_row(nominal_row() if conditions is None else conditions))
+        self._conditions = split_row(nominal_row() if conditions is None else conditions)
         for condition, values in self._conditions:
             condition.begin_plain(self, values)
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
-from sim.terrains.conditions.base import check_conditions, nominal_row
+from sim.terrains.conditions.base import condition_genes, nominal_row
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""
@@ -15,10 +15,7 @@ GROUND_KINDS = ("friction", "softness")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundMaps:
-    """Friction and softness of the patches of T terrains, and the conditions under which each is crossed.
-
-    docs/terrains.md says what the numbers do.
-    """
+    """Friction and softness of the patches of T terrains, and the conditions under which each is crossed."""
 
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
@@ -35,8 +32,14 @@ class GroundMaps:
                 f"maps must be of as many terrains, got {len(self.friction)} of friction and "
                 f"{len(self.time_constant_s)} of softness"
             )
-        if self.conditions is not None:
-            check_conditions(self.conditions, len(self))
+        genes = condition_genes()
+        if self.rows.shape != (len(self), len(genes)):
+            raise ValueError(f"conditions must have shape ({len(self)}, {len(genes)}), got {self.rows.shape}")
+        for gene, values in zip(genes, self.rows.T, strict=True):
+            low, high = gene.limits
+            wrong = ~((values >= low - 1e-6) & (values <= high + 1e-6))
+            if wrong.any():
+                raise ValueError(f"the condition {gene.name} must lie in {low:g} to {high:g}, got {values[wrong][0]:g}")
 
     @property
     def rows(self) -> NDArray[np.float32]:
@@ -47,10 +50,8 @@ class GroundMaps:
         return len(self.friction)
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> "GroundMaps":
-        conditions = None if self.conditions is None else self.conditions[rows]
-        return GroundMaps(
-            friction=self.friction[rows], time_constant_s=self.time_constant_s[rows], conditions=conditions
-        )
+        chosen: dict[str, Any] = {name: maps[rows] for name, maps in vars(self).items() if maps is not None}
+        return GroundMaps(**chosen)
 
     @classmethod
     def plain(cls, num_terrains: int) -> "GroundMaps":

@@ -3,7 +3,8 @@
 import warp as wp
 
 from kernels.conditions import DisturbedStep
-from sim.terrains.conditions.base import Condition, ConditionDose, Gene, register
+from sim.terrains.conditions.base import Condition, Gene, register
+from sim.terrains.quantities import Sweep
 
 
 @wp.func
@@ -15,11 +16,9 @@ def _blow(step: DisturbedStep, row: wp.array[float], first: int, env: int, colum
 class Wind(Condition):
     name, cause = "wind", "headwind"
     genes = (Gene(name="wind", low=-5.0, middle=0.0, high=5.0, unit="m/s^2"),)
-    dose = ConditionDose(title="wind from behind", values=(0.0, 1.0, 2.0))
+    form, least = "wind of {:.1f} m/s^2", 0.05
+    dose = Sweep("wind", (0.0, 1.0, 2.0), title="wind from behind")
     disturb = _blow
-
-    def text(self, values):
-        return f"wind of {values[0]:.1f} m/s^2" if abs(values[0]) >= 0.05 else ""
 
     def disturb_plain(self, episodes, values, rows, running, step):
         for k in running:

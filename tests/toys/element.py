@@ -5,8 +5,9 @@ from typing import ClassVar
 
 import warp as wp
 
-from kernels.course import Element
-from sim.terrains.elements.base import LENGTH, CourseElement, ElementDose, Quantity, hard, register_element, whole
+from kernels.course import Element, Range
+from sim.terrains.elements.base import LENGTH, CourseElement, register_element
+from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.course import Course
 from sim.terrains.spaces.registry import register_space
 
@@ -19,12 +20,12 @@ def _hump_relief(element: Element, s: int, row: int) -> float:
 
 HUMP = CourseElement(
     name="hump",
-    size=hard(0.05, 0.5),
-    length=whole(10, 40),
+    size=Range(0.05, 0.5, hard="high"),
+    length=Range(10, 40, whole=True),
     relief=_hump_relief,
     text=lambda e: f"hump of {e['size']:.2f} m",
-    quantities={"height": Quantity(parameter="size", low=0.01, high=1.0), "length": LENGTH},
-    doses={"hump": ElementDose("height", (0.1, 0.2, 0.4), others={"length": 1.0})},
+    quantities={"height": Quantity(name="size", low=0.01, high=1.0, unit="m"), "length": LENGTH},
+    doses={"hump": Sweep("height", (0.1, 0.2, 0.4), {"length": 1.0})},
 )
 register_element(HUMP)
 

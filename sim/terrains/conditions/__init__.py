@@ -1,16 +1,3 @@
-"""Conditions under which robots cross: payload, weak motors, delays, noise, a push; one file each.
+"""Conditions under which robots cross, which belong to a terrain: payload, weak motors, delays, noise, a push."""
 
-They belong to a terrain, as its ground does.
-"""
-
-from sim.terrains.conditions.base import register
-from sim.terrains.conditions.delay import ActionDelay
-from sim.terrains.conditions.grip import Grip
-from sim.terrains.conditions.lag import ObservationLag
-from sim.terrains.conditions.motors import MotorStrength
-from sim.terrains.conditions.noise import ObservationNoise
-from sim.terrains.conditions.payload import Payload
-from sim.terrains.conditions.push import Push
-
-for _condition in (Payload(), MotorStrength(), ActionDelay(), ObservationLag(), ObservationNoise(), Push(), Grip()):
-    register(_condition)
+from sim.terrains.conditions import kinds as kinds

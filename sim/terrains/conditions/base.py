@@ -4,29 +4,25 @@ A condition has genes in [-1, 1], each of which becomes one number. The numbers 
 they are registered, are the row of conditions of a terrain.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.terrains.quantities import Quantity, Sweep
+
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gene:
+class Gene(Quantity):
     """How a gene in [-1, 1] becomes a number of a condition: ``middle`` at 0, and linear on both sides."""
 
-    name: str
-    low: float
     middle: float
-    high: float
     absent: float = 0.0
     """The gene that changes nothing."""
-    step: float = 0.0
-    """What values are multiples of; 0 if they may be any number."""
-    unit: str = ""
     limits: tuple[float, float] = (-100.0, 100.0)
     """Values that can be simulated."""
     mirrored: bool = False
@@ -44,27 +40,20 @@ class Gene:
         return np.interp(values, (self.low, self.middle, self.high), (-1.0, 0.0, 1.0))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConditionDose:
-    """A condition as a dose on level ground: one of its genes grows."""
-
-    title: str
-    values: tuple[float, ...]
-    """The easiest first."""
-    gene: int = 0
-    others: tuple[tuple[int, float], ...] = ()
-    """Values of other genes."""
-
-
 class Condition:
-    """A condition under which robots cross. A class of one in a file, and its instance in ``__init__``, add one."""
+    """A condition under which robots cross. A class, whose instance is registered, adds one."""
 
     name: ClassVar[str]
     """What a space is called by it: ``course+payload``."""
-    genes: ClassVar[tuple[Gene, ...]]
     cause: ClassVar[str]
     """What a fault is called that it causes."""
-    dose: ClassVar[ConditionDose | None] = None
+    genes: ClassVar[tuple[Gene, ...]]
+    form: ClassVar[str]
+    """Its values as text."""
+    least: ClassVar[float]
+    """What its first value differs by from the nominal one, or nothing is said of it."""
+    dose: ClassVar[Sweep | None] = None
+    """One of its genes as a dose on level ground."""
     varied: ClassVar[tuple[float, float] | None] = None
     """Limits between which its first value is drawn for varied conditions; None if it stays nominal."""
     begin: ClassVar[Any] = None
@@ -76,7 +65,13 @@ class Condition:
 
     def text(self, values: Array) -> str:
         """Its values in a few words; empty where it changes nothing to speak of."""
-        raise NotImplementedError
+        nominal = self.genes[0].to_value(self.genes[0].absent)
+        return self.form.format(*values) if abs(values[0] - nominal) >= self.least else ""
+
+    def to_genes(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Genes of some values by name, each of shape (...), as (..., number of genes); the others change nothing."""
+        genes = (gene.to_gene(values[gene.name]) if gene.name in values else gene.absent for gene in self.genes)
+        return np.stack(np.broadcast_arrays(*genes), axis=-1)
 
     def begin_plain(self, episodes: Any, values: Array) -> None:
         """Varies the model, ``strength`` or ``delay_steps`` of a :class:`sim.mujoco_c.crossing.Episodes`."""
@@ -113,65 +108,25 @@ def nominal_row() -> NDArray[np.float32]:
     return np.array([gene.to_value(gene.absent) for gene in condition_genes()], np.float32)
 
 
-def condition_rows(genes: NDArray[np.floating], names: Sequence[str]) -> NDArray[np.float32]:
-    """Rows of conditions of genes of some conditions, shape (num_terrains, number of their genes)."""
-    rows = np.tile(nominal_row(), (len(genes), 1))
-    for column, gene in enumerate(condition_genes(names)):
-        rows[:, condition_column(gene.name)] = gene.to_value(genes[:, column])
-    return rows
-
-
-def split_row(row: NDArray[Any]) -> Iterator[tuple[Condition, NDArray[Any]]]:
+def split_row(row: Array) -> list[tuple[Condition, Array]]:
     """Each condition with its numbers in a row."""
-    for condition, first in _first_columns():
-        yield condition, row[first : first + len(condition.genes)]
+    ends = np.cumsum([len(condition.genes) for condition in CONDITIONS.values()])
+    return list(zip(CONDITIONS.values(), np.split(row, ends[:-1]), strict=True))
 
 
 def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str]:
     """Some conditions of a row as text; empty where one changes nothing to speak of."""
-    texts = {condition.name: condition.text(values) for condition, values in split_row(row) if condition.name in names}
+    texts = {condition.name: condition.text(values) for condition, values in split_row(row)}
     return [texts[name] for name in names]
 
 
 def begin_effects() -> tuple[tuple[Any, int], ...]:
     """Warp functions that vary robots, each with its first column in a row."""
-    return tuple((condition.begin, first) for condition, first in _first_columns() if condition.begin is not None)
+    columns = split_row(np.arange(len(condition_genes())))
+    return tuple((condition.begin, int(first)) for condition, (first, *_) in columns if condition.begin is not None)
 
 
 def disturb_effects() -> tuple[tuple[Any, int], ...]:
-    """Warp functions that disturb control steps, likewise, in the order in which they do."""
-    ordered = sorted(_first_columns(), key=lambda pair: pair[0].disturbs_last)
-    return tuple((condition.disturb, first) for condition, first in ordered if condition.disturb is not None)
-
-
-def _first_columns() -> Iterator[tuple[Condition, int]]:
-    first = 0
-    for condition in CONDITIONS.values():
-        yield condition, first
-        first += len(condition.genes)
-
-
-def check_conditions(rows: NDArray[np.floating], count: int) -> None:
-    """Checks that ``rows`` are conditions of ``count`` terrains that can be simulated."""
-    genes = condition_genes()
-    if rows.shape != (count, len(genes)):
-        raise ValueError(f"conditions must have shape ({count}, {len(genes)}), got {rows.shape}")
-    for gene, values in zip(genes, rows.T, strict=True):
-        low, high = gene.limits
-        wrong = ~((values >= low - 1e-6) & (values <= high + 1e-6))
-        if wrong.any():
-            raise ValueError(f"the condition {gene.name} must lie in {low:g} to {high:g}, got {values[wrong][0]:g}")
-
-
-def round_steps(seconds: float, dt: float) -> int:
-    """Steps of a time, rounded as the parallel simulation does."""
-    return int(np.float32(seconds) / np.float32(dt) + np.float32(0.5))
-
-
-def direction_text(values: NDArray[np.floating], form: str, least: float, directions: Sequence[str]) -> str:
-    """Two numbers along the axes, each with one of four ``directions``: ahead, back, left, right."""
-    return " and ".join(
-        f"{abs(value):{form}} {directions[2 * axis + (value < 0)]}"
-        for axis, value in enumerate(values)
-        if abs(value) >= least
-    )
+    """Warp functions that disturb control steps, in the order in which they do, each with its first column in a row."""
+    columns = sorted(split_row(np.arange(len(condition_genes()))), key=lambda pair: pair[0].disturbs_last)
+    return tuple((condition.disturb, int(first)) for condition, (first, *_) in columns if condition.disturb is not None)

@@ -5,57 +5,27 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
-from kernels.course import SPACING, ElementKind, Range
+from kernels import course
+from kernels.course import SPACING, ElementKind
+from sim.device import host_device
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.quantities import Quantity, Sweep
+
+FIRST_COL = 100
+"""An element alone on flat ground begins at x = 5 m, or at one of the next nodes."""
+NUM_STARTS = 20
+"""Nodes at which it may begin: over 1 m, more than a stride."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Quantity:
-    """A number that a dose sets: how far it can go, and its unit."""
-
-    low: float
-    high: float
-    unit: str = "m"
-    step: float = 0.0
-    """What values are multiples of; 0 if they may be any number."""
-    parameter: str = ""
-    """Of an element: which of its parameters it is."""
-
-    def format(self, value: float) -> str:
-        """A value with its unit: ``0.30 m``, ``5 steps``."""
-        digits = {"steps": 0, "s": 3}.get(self.unit, 2)
-        return f"{value:.{digits}f} {self.unit}".strip()
-
-    def to_parameter(self, values: Any) -> Any:
-        """Values as the element's parameter, which counts cells if they are multiples of cells."""
-        return np.rint(np.asarray(values) / SPACING) if self.step and self.unit == "m" else values
-
-
-def cells(parameter: str, low: float, high: float, every: int = 1) -> Quantity:
+def cells(name: str, low: float, high: float, every: int = 1) -> Quantity:
     """A length [m] that is a multiple of ``every`` cells."""
-    return Quantity(parameter=parameter, low=low, high=high, step=every * SPACING)
+    return Quantity(name=name, low=low, high=high, unit="m", step=every * SPACING)
 
 
 LENGTH = cells("length", 0.20, 4.0)
-
-
-@dataclass(frozen=True)
-class ElementDose:
-    """An element alone on flat ground, of which one quantity grows."""
-
-    quantity: str
-    values: tuple[float, ...]
-    """The easiest first."""
-    turn: float = 0.0
-    """1 up, -1 down."""
-    others: Mapping[str, float] = field(default_factory=dict)
-    """The other quantities."""
-
-
-def both_ways(name: str, *dose: Any, **others: float) -> dict[str, ElementDose]:
-    """Doses of an element that leads up and down."""
-    return {f"{name}_{way}": ElementDose(*dose, turn, others) for way, turn in (("up", 1.0), ("down", -1.0))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,10 +36,35 @@ class CourseElement(ElementKind):
     """Of a record of :class:`kernels.course.Element`."""
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
     """What doses can set."""
-    doses: Mapping[str, ElementDose] = field(default_factory=dict)
+    doses: Mapping[str, Sweep] = field(default_factory=dict)
     """Doses by name."""
     draw_turns: Callable[[int, np.random.Generator], NDArray[Any]] | None = None
-    """Draws the turns of an element of a dose, one for each place where it begins."""
+    """Draws the turns of an element of a dose, one for each node where it begins."""
+
+    def lay_alone(
+        self, turn: float, quantities: Mapping[str, Any], count: int, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Elements alone on flat ground before x = 12 m, of quantities of which one has several values.
+
+        They begin at ``count`` nodes that are spread evenly over 1 m. Returns heights [m], shape (count * num_values,
+        NUM_ROWS, NUM_COLS): first one of each value, then the next of each.
+        """
+        record: Any = course.Element  # Warp makes its dtype
+        laid: Any = np.zeros((count, max(map(np.size, quantities.values()))), record.numpy_dtype())
+        laid["kind"] = all_elements().index(self)
+        laid["detail"] = 1.0  # pallets
+        laid["first"] = (FIRST_COL + np.arange(count) * NUM_STARTS // count)[:, None]
+        laid["turn"] = turn if self.draw_turns is None else self.draw_turns(count, rng)[:, None]
+        for name, values in quantities.items():
+            quantity = self.quantities[name]
+            in_cells = quantity.step and quantity.unit == "m"
+            laid[quantity.name] = np.rint(np.asarray(values) / SPACING) if in_cells else values
+        with wp.ScopedDevice(host_device()):
+            elements: Any = wp.array(laid.reshape(-1, 1), dtype=course.Element)
+            course.lay_elements(elements, all_elements())
+            heights: Any = wp.empty((len(elements), NUM_ROWS, NUM_COLS), dtype=float)
+            course.rasterise_elements(elements, all_elements(), heights)
+            return np.array(heights.numpy(), np.float32)
 
 
 ELEMENTS: dict[str, CourseElement] = {}
@@ -84,23 +79,3 @@ def register_element(element: CourseElement) -> None:
 def all_elements() -> tuple[CourseElement, ...]:
     """All elements, in the order of their numbers in kernels."""
     return tuple(ELEMENTS.values())
-
-
-def hard(low: float, high: float) -> Range:
-    """Any number, of which larger ones are harder."""
-    return Range(low, high, hard="high")
-
-
-def whole(low: int, high: int, hard_end: str = "") -> Range:
-    """Whole numbers."""
-    return Range(low, high, whole=True, hard=hard_end)
-
-
-def metres(num_cells: float) -> str:
-    """A length in metres."""
-    return f"{num_cells * SPACING:.2f} m"
-
-
-def up_or_down(element: Any) -> str:
-    """Its direction."""
-    return "up" if element["turn"] >= 0.0 else "down"

@@ -96,10 +96,12 @@ class OnGround(WiderSpace):
 
 
 def ground_genes(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Genes of frictions, or of time constants [s] above the least; a gene of -1 is firm ground."""
+    """Genes of a map of one friction, or of one time constant [s] above the least; shape (num_values, 32)."""
     if kind == "friction":
-        return 1.0 - 2.0 * (1.0 - values) / (1.0 - MIN_FRICTION)
-    return 2.0 * np.log(values / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
+        genes = 1.0 - 2.0 * (1.0 - values) / (1.0 - MIN_FRICTION)
+    else:
+        genes = 2.0 * np.log(values / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
+    return np.repeat(genes[:, None], NUM_PATCHES, axis=1)
 
 
 _TITLES = {

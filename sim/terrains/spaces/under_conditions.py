@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
-from sim.terrains.conditions.base import CONDITIONS, condition_genes, condition_rows, condition_texts
+from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, condition_texts, nominal_row
 from sim.terrains.spaces.base import Seed, TerrainSpace, WiderSpace, clipped
 
 
@@ -29,7 +29,11 @@ class UnderConditions(WiderSpace):
 
     def condition_rows(self, genes: ArrayLike) -> NDArray[np.float32]:
         """Rows of conditions, shape (num_terrains, number of values)."""
-        return condition_rows(self._split(genes)[1], self.conditions)
+        values = self._split(genes)[1]
+        rows = np.tile(nominal_row(), (len(values), 1))
+        for column, gene in enumerate(condition_genes(self.conditions)):
+            rows[:, condition_column(gene.name)] = gene.to_value(values[:, column])
+        return rows
 
     def lay_ground(self, genes: Any, ground_out: Ground) -> None:
         """Turns genes into maps on the device, by the space."""
@@ -96,8 +100,7 @@ def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray
             if name in kept:
                 row.append(kept[name])
             elif condition.varied:
-                drawn, *others = condition.genes
-                value = float(drawn.to_gene(np.array(rng.uniform(*condition.varied))))
-                row.append(np.array([value, *(gene.absent for gene in others)], np.float32))
+                drawn = rng.uniform(*condition.varied)
+                row.append(condition.to_genes({condition.genes[0].name: drawn}).astype(np.float32))
         rows.append(np.concatenate(row))
     return np.stack(rows)

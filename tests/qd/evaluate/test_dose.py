@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.evaluate.dose import dose_set, find_half, measure_dose, measure_rates
-from sim.terrains.doses import parse_doses
+from qd.evaluate.dose import dose_set, find_half, measure_dose, measure_rates, parse_doses
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from qd.commands import ArchiveCommand, DoseCommand
+from qd.evaluate.dose import all_doses, parse_doses
 from qd.faults.causes import find_effects
 from sim.rollout import Rollout
 from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_texts, nominal_row
 from sim.terrains.corridor import corridor_maps, num_maps
-from sim.terrains.doses import all_doses, parse_doses
 from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.spaces.registry import SPACES, get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -41,7 +41,7 @@ def test_a_condition_appears_wherever_conditions_do(name):
         assert name in DoseCommand.help_values()["conditions"]
         dose = parse_doses([name], [])[name]
         rows = get_space(dose.space).condition_rows(dose.terrains(1, np.random.default_rng(0)))
-        column = condition_column(condition.genes[condition.dose.gene].name)
+        column = condition_column(condition.dose.parameter)
         np.testing.assert_allclose(rows[:, column], dose.values, atol=1e-6)
 
 

@@ -1,0 +1,298 @@
+"""The conditions that are shipped, each in the parallel simulation and in MuJoCo C."""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from kernels.conditions import BASE, DisturbedStep, VariedRobots
+from kernels.episode import Outcome
+from kernels.observation import noise_width
+from sim.robots.training import NoiseCfg
+from sim.terrains.conditions.base import Array, Condition, Gene, register
+from sim.terrains.quantities import Sweep
+
+MAX_LATENCY_S = 0.06
+"""Longest delay of actions, beside the robot's own, and largest age of observations [s]."""
+
+
+def round_steps(seconds: float, dt: float) -> int:
+    """Steps of a time, rounded as the parallel simulation does."""
+    return int(np.float32(seconds) / np.float32(dt) + np.float32(0.5))
+
+
+def _direction_text(values: Array, form: str, least: float, directions: Sequence[str]) -> str:
+    """Two numbers along the axes, each with one of four ``directions``: ahead, back, left, right."""
+    return " and ".join(
+        f"{abs(value):{form}} {directions[2 * axis + (value < 0)]}"
+        for axis, value in enumerate(values)
+        if abs(value) >= least
+    )
+
+
+@wp.func
+def _point_inertia(d: wp.vec3) -> wp.mat33:
+    """Inertia of a unit mass at ``d`` [m]."""
+    return wp.length_sq(d) * wp.identity(n=3, dtype=float) - wp.outer(d, d)
+
+
+@wp.func
+def _begin_payload(robots: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int):
+    mass, rotation = robots.base_mass[env], robots.base_frame[env]
+    added = wp.max(row[first] * robots.total_mass[env], -0.5 * mass)
+    frame = wp.quat(rotation[0], rotation[1], rotation[2], rotation[3])
+    moved, moments = wp.vec3(0.0), 1.0 * robots.base_inertia[env]
+    if added < 0.0:
+        moments *= (mass + added) / mass
+    if added > 0.0:
+        offset = wp.vec3(row[first + 1], row[first + 2], 0.0)
+        moved = (added / (mass + added)) * offset
+        to_base = wp.quat_to_matrix(wp.quat(rotation[1], rotation[2], rotation[3], rotation[0]))
+        inertia = to_base * wp.diag(moments) * wp.transpose(to_base)
+        inertia += mass * _point_inertia(moved) + added * _point_inertia(offset - moved)
+        axes, principal = wp.eig3(inertia)
+        turned = wp.quat_from_matrix(axes)
+        frame = wp.quat(turned[3], turned[0], turned[1], turned[2])
+        moments = principal
+    robots.body_mass[env, BASE] = mass + added
+    robots.body_subtreemass[env, BASE] = robots.total_mass[env] + added
+    robots.body_ipos[env, BASE] = robots.base_centre[env] + moved
+    robots.body_iquat[env, BASE] = frame
+    robots.body_inertia[env, BASE] = moments
+
+
+class Payload(Condition):
+    """Mass over that of the robot, and where it is from the base's mass centre, ahead and to the left [m].
+
+    A negative one leaves less of the base, half of it at least.
+    """
+
+    name, cause = "payload", "payload"
+    genes = (
+        Gene(name="payload", low=-0.05, middle=0.0, high=0.4, limits=(-0.1, 10.0)),
+        Gene(name="payload_x", low=-0.2, middle=0.0, high=0.2, unit="m"),
+        Gene(name="payload_y", low=-0.2, middle=0.0, high=0.2, unit="m", mirrored=True),
+    )
+    dose = Sweep("payload", (0.0, 0.1, 0.2, 0.3, 0.4), title="payload over the mass")
+    varied = (-0.01, 0.03)
+    begin = _begin_payload
+
+    def text(self, values: Array) -> str:
+        """Its share of the robot's mass, and where it is."""
+        share, where = values[0], values[1:]
+        if abs(share) < 0.0005:
+            return ""
+        if share < 0:
+            return f"base lighter by {-share:.1%} of the robot's mass"
+        offset = _direction_text(where, ".2f", 0.005, ("m ahead of", "m behind", "m left of", "m right of"))
+        return f"payload of {share:.1%} of the robot's mass{offset and f', {offset} the centre of the base'}"
+
+    def begin_plain(self, episodes: Any, values: Array) -> None:
+        """Adds the mass to the base of the model."""
+        from sim.robots.elements import mj, rotation_matrix
+
+        model, base = episodes.model, 1
+        added = max(values[0] * model.body_subtreemass[base], -0.5 * model.body_mass[base])
+        if added:
+            model.body_sameframe[base] = 0  # or MuJoCo takes the frame of the body for that of its inertia
+            model.body_subtreemass[[0, base]] += added
+        if added < 0.0:
+            model.body_inertia[base] *= (model.body_mass[base] + added) / model.body_mass[base]
+            model.body_mass[base] += added
+        elif added > 0.0:
+            mass, offset = model.body_mass[base], np.append(values[1:], 0.0)
+            moved = added / (mass + added) * offset
+            axes = rotation_matrix(model.body_iquat[base])
+            inertia = axes @ np.diag(model.body_inertia[base]) @ axes.T
+            for kilograms, d in ((mass, moved), (added, offset - moved)):
+                inertia += kilograms * (d @ d * np.eye(3) - np.outer(d, d))
+            moments, axes = np.linalg.eigh(inertia)
+            axes[:, 2] *= np.linalg.det(axes)  # right-handed
+            mj.mju_mat2Quat(model.body_iquat[base], axes.ravel())
+            model.body_inertia[base], model.body_mass[base] = moments, mass + added
+            model.body_ipos[base] += moved
+
+
+@wp.func
+def _begin_motors(robots: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int):
+    robots.strength[env] = row[first]
+
+
+class MotorStrength(Condition):
+    """Factor of the torques of all motors, and of their limits."""
+
+    name, cause = "motors", "weak motors"
+    genes = (Gene(name="strength", low=0.4, middle=1.0, high=1.2, limits=(1e-3, 10.0)),)
+    form, least = "motors at {:.0%}", 0.005
+    dose = Sweep("strength", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4), title="strength of motors")
+    varied = (0.9, 1.1)
+    begin = _begin_motors
+
+    def begin_plain(self, episodes: Any, values: Array) -> None:
+        """Scales gains and limits of the model's actuators."""
+        episodes.strength, model = float(values[0]), episodes.model
+        model.actuator_gainprm[:, 0] *= values[0]
+        model.actuator_biasprm[:, :3] *= values[0]
+        model.actuator_forcerange[:] *= values[0]
+        model.jnt_actfrcrange[:] *= values[0]
+
+
+class Latency(Condition):
+    """A time by which something is late [s], in steps of the shipped robots."""
+
+    least = 0.5
+
+    def text(self, values: Array) -> str:
+        """The time in milliseconds."""
+        return super().text(1000 * values)
+
+
+def _latency_gene(name: str, step: float) -> Gene:
+    low, high = limits = (0.0, MAX_LATENCY_S)
+    return Gene(name=name, low=low, middle=high / 2, high=high, absent=-1.0, step=step, unit="s", limits=limits)
+
+
+@wp.func
+def _begin_delay(robots: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int):
+    robots.delay_steps[env] = robots.drive_delay + int(wp.round(row[first] / robots.physics_dt))
+
+
+class ActionDelay(Latency):
+    """Time after which an action counts, beside the robot's own [s]."""
+
+    name, cause, form = "delay", "late actions", "actions {:.0f} ms late"
+    genes = (_latency_gene("delay", 0.005),)
+    dose = Sweep("delay", (0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06), title="delay of actions")
+    varied = (0.0, 0.02)
+    begin = _begin_delay
+
+    def begin_plain(self, episodes: Any, values: Array) -> None:
+        """Adds physics steps to the delay of the robot's drives."""
+        episodes.delay_steps += round_steps(values[0], episodes.robot.physics_dt)
+
+
+@wp.func
+def _disturb_lag(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
+    lag = int(wp.round(row[first] / (float(step.every) * step.dt)))
+    if lag > 0:
+        age, size = step.memory.age[env, column], step.memory.former.shape[1]
+        step.memory.former[env, age % size, column] = step.observation[env, column]
+        step.observation[env, column] = step.memory.former[env, wp.max(age - lag, 0) % size, column]
+
+
+class ObservationLag(Latency):
+    """Age of what the controller observes [s]; the first observation is shown until there is one so old."""
+
+    name, cause, form = "lag", "old observations", "observations {:.0f} ms old"
+    genes = (_latency_gene("lag", 0.02),)
+    dose = Sweep("lag", (0.0, 0.02, 0.04, 0.06), title="age of observations")
+    disturb = _disturb_lag
+    disturbs_last = True
+
+    def begin_plain(self, episodes: Any, values: Array) -> None:
+        """Keeps as many observations as are needed."""
+        episodes.former_rows = deque(maxlen=1 + round_steps(values[0], episodes.robot.control_dt))
+
+    def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
+        """Shows the oldest rows that are kept."""
+        episodes.former_rows.append(rows)
+        return episodes.former_rows[0].copy()
+
+
+@wp.func
+def _disturb_noise(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
+    if row[first] > 0.0:
+        # Drawn by the episode's own stream: neither robot nor slot changes an episode.
+        number = step.memory.age[env, column] * step.observation.shape[1] + column
+        state = wp.rand_init(int(step.episodes.rng[env]), number)
+        width = noise_width(step.memory.noise, column, step.num_joints)
+        step.observation[env, column] += row[first] * width * wp.randf(state, -1.0, 1.0)
+
+
+def noise_widths(robot: Any) -> NDArray[np.float64]:
+    """Half widths of legged_gym's noise of each column of an observation, shape (observation_size,)."""
+    noise, joints = NoiseCfg(), robot.num_joints
+    counts = [3, 3, 3, 3, joints, joints, joints, len(robot.scan_points()[0])]
+    widths = [2.0 * noise.lin_vel, 0.25 * noise.ang_vel, noise.gravity, 0.0]
+    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan]
+    return np.repeat(widths, counts)
+
+
+class ObservationNoise(Condition):
+    """Factor of legged_gym's uniform noise of observations."""
+
+    name, cause = "noise", "noise"
+    genes = (Gene(name="noise", low=0.0, middle=2.0, high=4.0, absent=-1.0, limits=(0.0, 100.0)),)
+    form, least = "noise {:.1f} times legged_gym's", 0.05
+    dose = Sweep("noise", (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0), title="noise over legged_gym's")
+    varied = (1.0, 1.0)
+    disturb = _disturb_noise
+
+    def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
+        """Adds noise, drawn otherwise than in the parallel simulation."""
+        widths = values[0] * noise_widths(episodes.robot)
+        return rows + widths * episodes.rng.uniform(-1.0, 1.0, rows.shape)
+
+
+@wp.func
+def _disturb_push(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
+    if column == 0 and step.episodes.outcome[env] == Outcome.RUNNING:
+        due = int(wp.round(row[first + 2] / step.dt))
+        steps = step.episodes.steps[env]
+        if steps <= due and due < steps + step.every:
+            step.joint_qd[env, 0] += row[first]
+            step.joint_qd[env, 1] += row[first + 1]
+
+
+class Push(Condition):
+    """A kick of the base's velocity along the way and to its left [m/s], and when [s]; it is observed a step later."""
+
+    name, cause = "push", "push"
+    genes = (
+        Gene(name="push_x", low=-2.0, middle=0.0, high=2.0, unit="m/s"),
+        Gene(name="push_y", low=-2.0, middle=0.0, high=2.0, unit="m/s", mirrored=True),
+        Gene(name="push_time", low=0.0, middle=6.0, high=12.0, unit="s", hard_at_limits=False),
+    )
+    dose = Sweep("push_y", (0.0, 0.5, 1.0, 1.5, 2.0), {"push_time": 5.0}, "push to the side")
+    disturb = _disturb_push
+
+    def text(self, values: Array) -> str:
+        """Its velocity and its time."""
+        if np.abs(values[:2]).max() < 0.05:
+            return ""
+        directions = ("m/s ahead", "m/s back", "m/s to the left", "m/s to the right")
+        return f"pushed by {_direction_text(values[:2], '.1f', 0.05, directions)} after {values[2]:.0f} s"
+
+    def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
+        """Adds to the velocities of the bases of the running episodes."""
+        if step <= round_steps(values[2], episodes.robot.physics_dt) < step + episodes.robot.decimation:
+            for k in running:
+                episodes.data[k].qvel[:2] += values[:2]
+                episodes.qvel[k] = episodes.data[k].qvel
+        return rows
+
+
+@wp.func
+def _begin_grip(robots: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int):
+    robots.friction[terrain] = row[first]
+
+
+class Grip(Condition):
+    """Factor of the friction of all contacts."""
+
+    name, cause = "grip", "little grip"
+    genes = (Gene(name="friction", low=0.2, middle=1.0, high=1.2, limits=(1e-3, 10.0)),)
+    form, least = "friction times {:.2f}", 0.005
+    varied = (0.7, 1.2)
+    begin = _begin_grip
+
+    def begin_plain(self, episodes: Any, values: Array) -> None:
+        """Scales the friction of all geoms of the model."""
+        episodes.model.geom_friction[:, 0] *= values[0]
+
+
+for _condition in (Payload(), MotorStrength(), ActionDelay(), ObservationLag(), ObservationNoise(), Push(), Grip()):
+    register(_condition)
