@@ -56,15 +56,12 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
                 of_alpha = replace(cfg, iterations=count, fitness=replace(cfg.fitness, alpha=alpha))
                 archive = search(of_alpha, script.runs / "ablation" / f"{name}-{count}", script.compute)
                 rows[name].append(look_again(archive, of_alpha, script.policy, crosser))
-    return script.write(
-        {
-            "preset": cfg.preset,
-            "iterations": iterations,
-            "mean_std": {name: [row["mean_std"] for row in of_run] for name, of_run in rows.items()},
-            "intervals": {name: [row["mean_std_interval"] for row in of_run] for name, of_run in rows.items()},
-            "elites": {name: [row["elites"] for row in of_run] for name, of_run in rows.items()},
-        }
-    )
+    columns = {"mean_std": "mean_std", "intervals": "mean_std_interval", "elites": "elites"}
+    numbers = {
+        name: {run: [row[key] for row in rows_of_run] for run, rows_of_run in rows.items()}
+        for name, key in columns.items()
+    }
+    return script.write({"preset": cfg.preset, "iterations": iterations, **numbers})
 
 
 if __name__ == "__main__":

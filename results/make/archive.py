@@ -13,7 +13,7 @@ from typing import Any
 from qd.faults.judge import judge
 from qd.faults.stages import STAGES
 from qd.search.directory import RunDirectory
-from results.make.common import CURVE_FILE, PAPER_SIZE, Script, follow_search, parse
+from results.make.common import ARCHIVE_FILES, CURVE_FILE, FRESH_COUNTS, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import train_specialist
@@ -27,11 +27,8 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
 """Changes of preset wide, and seed of each."""
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
-PUBLISHED = (
-    "archive.npz", "archive.json", "config.json", "*.png", "minimal.*", "certifiers/specialist.*", CURVE_FILE,
-)  # fmt: skip
+PUBLISHED = (*ARCHIVE_FILES, "*.png", "minimal.*", "certifiers/specialist.*", CURVE_FILE)
 """Files of a run that are published, the one last by which all.sh knows that it is done."""
-COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
 
 
 def make_archive(script: Script, name: str) -> Path:
@@ -39,7 +36,7 @@ def make_archive(script: Script, name: str) -> Path:
     changes, seed = ({}, 0) if script.small else SEARCHES[name]
     run, cfg = script.runs / name, script.search_cfg(seed=script.seed + seed, **changes)
     points = script.count_iterations(cfg, *(CURVE if name.startswith("archive") else CURVE[:3]))
-    follow_search(script, run, cfg, points, COUNTS)
+    follow_search(script, run, cfg, points, FRESH_COUNTS)
     if not script.small and name.startswith("archive"):  # on a CPU a training takes hours
         judge_with_specialist(script, run)
     summary = RunDirectory(run).read_summary()

@@ -39,6 +39,11 @@ SEEDS = (0, 1, 2)
 """Seeds of repeated trainings and searches."""
 ONCE = {"replicas": 20, "batch_size": 20, "again": 0, "candidates": 20}
 """Changes of preset wide: every terrain is crossed once, in the paper's 20 episodes."""
+FRESH_COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
+"""What archive.json counts once fresh episodes are crossed."""
+COUNTS = (*FRESH_COUNTS, "confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
+"""... once contact is resolved and others have crossed what fails, too."""
+ARCHIVE_FILES = ("archive.npz", "archive.json", "config.json")
 CURVE_FILE = "curve.json"
 """File of a run: counts after each step of its search."""
 PAPER_SIZE = {**ONCE, "emitters": 10, "groups": 1}
@@ -134,9 +139,7 @@ class Script:
         published = self.results / name
         if self.small or not is_same_file(run / "archive.npz", published / "archive.npz"):
             run = self.runs / "copy" / name
-            if not all(
-                is_same_file(run / file, published / file) for file in ("archive.npz", "archive.json", "config.json")
-            ):
+            if not all(is_same_file(run / file, published / file) for file in ARCHIVE_FILES):
                 shutil.rmtree(run, ignore_errors=True)
                 shutil.copytree(published, run)
         return run

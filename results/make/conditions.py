@@ -11,18 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.judge import judge
 from qd.faults.minimise.minimise import minimise
 from qd.faults.numbers import EPISODES
 from qd.faults.stages import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
-from qd.search.directory import RunDirectory
 from qd.search.fitness import FAILING_GOAL_RATE
-from qd.search.loop import search
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from results.make.common import Script, parse
-from results.make.spaces import COUNTS, causes_of
+from results.make.common import ARCHIVE_FILES, Script, parse
+from results.make.spaces import search_space
 from sim.terrains.conditions.base import CONDITIONS
 from sim.terrains.spaces.names import join_name
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
@@ -32,17 +29,7 @@ EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
 SPACE = join_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
-_PUBLISHED = ("archive.npz", "archive.json", "config.json", "minimal.npz", "minimal.json")
-
-
-def search_under_conditions(script: Script) -> tuple[Archive, dict[str, Any]]:
-    """The judged archive of a search of terrains and conditions, and its numbers."""
-    run = script.runs / "conditions"
-    search(script.search_cfg(episodes=EPISODES_SEARCHED, seed=script.seed, space=SPACE), run, script.compute)
-    stages = ("fresh",) if script.small else ("fresh", "resolved", "others")
-    archive = judge(run, stages=stages, compute=script.compute)
-    summary = RunDirectory(run).read_summary()
-    return archive, {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
+_PUBLISHED = (*ARCHIVE_FILES, "minimal.npz", "minimal.json")
 
 
 def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
@@ -62,8 +49,10 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
 
         again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]
         cured = again[rates(again, range(len(space.conditions)), "nominal conditions") >= FAILING_GOAL_RATE]
-        needed = {kind: rates(cured, [number], f"without {kind}") >= FAILING_GOAL_RATE
-                  for number, kind in enumerate(space.conditions)}  # fmt: skip
+        needed = {
+            kind: rates(cured, [number], f"without {kind}") >= FAILING_GOAL_RATE
+            for number, kind in enumerate(space.conditions)
+        }
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
     examples = examples_of(archive, cured, needed)
     minima = None
@@ -105,7 +94,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches, and takes conditions away."""
     script = parse(__doc__, argv, "conditions.json")
     dose = script.read_dose(conditions=True)
-    archive, numbers = search_under_conditions(script)
+    cfg = script.search_cfg(episodes=EPISODES_SEARCHED, seed=script.seed, space=SPACE)
+    archive, numbers = search_space(script, "conditions", cfg)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
     return script.write(

@@ -1,6 +1,7 @@
 """Which real obstacle at which size stops a controller: dose.json, and dose-resolved.json with contact resolved."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from qd.evaluate.dose import all_doses, measure_dose, parse_doses
 from results.make.common import parse, published_controllers
@@ -14,10 +15,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     size = 1 if script.small else None
     for resolved in (False,) if script.small else (False, True):
         out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out
-        measure_dose(
-            script.robot, controllers, doses, compute=script.compute, resolved=resolved, terrains=size,
-            episodes=size, seed=script.seed, out=out,
-        )  # fmt: skip
+        sizes: dict[str, Any] = {"terrains": size, "episodes": size, "seed": script.seed}
+        measure_dose(script.robot, controllers, doses, compute=script.compute, resolved=resolved, out=out, **sizes)
 
 
 if __name__ == "__main__":

@@ -18,15 +18,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     run = script.run_of_archive("archive" if script.small else "independent")
     if not script.small:
         judge(run, stages=("resolved", "others"), compute=script.compute)
-    make_pack(
-        find_search(run),
-        published_controllers(script),
-        compute=script.compute,
-        size=size,
-        episodes=episodes,
-        seed=script.seed,
-        out=script.out.parent,
-    )
+    sizes = {"size": size, "episodes": episodes, "seed": script.seed}
+    controllers = published_controllers(script)
+    make_pack(find_search(run), controllers, compute=script.compute, out=script.out.parent, **sizes)
 
 
 if __name__ == "__main__":

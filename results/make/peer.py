@@ -18,8 +18,8 @@ TASK = "Mjlab-Velocity-Rough-Unitree-Go1"
 STEPS = 24
 """Control steps an iteration, as its task says."""
 WARM_UP, TIMED = 3, 9
-UNUSED = ("wandb", "mediapy", "imageio_ffmpeg", "viser", "viser.transforms", "viser.uplot", "mjviser",
-          "mjviser.conversions")  # fmt: skip
+VIEWERS = ("viser", "viser.transforms", "viser.uplot", "mjviser", "mjviser.conversions")
+UNUSED = ("wandb", "mediapy", "imageio_ffmpeg", *VIEWERS)
 """What mjlab imports for logs, films and its viewer, and a training without them never calls."""
 
 

@@ -94,15 +94,14 @@ def draw_growth() -> Figure:
     figure = new_figure(12, 3.6)
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="million episodes", ylabel="elites")
-        searches = {"archive": ("default", "C0"), "independent": ("default, two other seeds", "C9"),
-                    "third": (None, "C9"), "archive_cma_mae": ("CMA-MAE", "C1")}  # fmt: skip
-        for name, (label, color) in searches.items():
+        searches = {"archive": ("default", "C0"), "independent": ("default, two other seeds", "C9")}
+        searches |= {"third": (None, "C9"), "archive_cma_mae": ("CMA-MAE", "C1")}
+        for name, (of_search, color) in searches.items():
             rows = read(f"results/{robot}/{name}/curve.json")["curve"]
             for count, style in {"corrected_elites": "-", "failing": "--"}.items():
-                axes.plot(
-                    [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows], style, marker=".",
-                    color=color, label=label and f"{label}: {count.replace('_', ' ')}",
-                )  # fmt: skip
+                episodes, counts = [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows]
+                label = of_search and f"{of_search}: {count.replace('_', ' ')}"
+                axes.plot(episodes, counts, style, marker=".", color=color, label=label)
         axes.axhline(read(PAPER)[robot]["archive"]["elites"], color="0.5", label="the paper's elites, as found")
         axes.grid(alpha=0.3)
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside right center")

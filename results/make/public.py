@@ -9,6 +9,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,9 @@ from qd.show.replay import source_from_run
 from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine
-from results.make.common import agreement, crossing_rates, read_alike, runs_of_today
+from results.make.common import COUNTS, agreement, crossing_rates, read_alike, runs_of_today
 from results.make.pictures import take_still
-from results.make.spaces import COUNTS, causes_of
+from results.make.spaces import causes_of
 from results.make.speed import time_crossings
 from sim.controllers.imports import import_controller
 from sim.device import resolve_device
@@ -74,9 +75,9 @@ PICTURES = ("go2-robot-lab", "go1-playground", "g1-unitree")
 def fill_in(file: Path, text: str) -> None:
     """Puts settings into a TOML of an import, in place of its gaps and guesses of the same names."""
     names = [line.partition(" =")[0] for line in text.splitlines() if " = " in line and line[0].isalpha()]
-    kept = [line for line in file.read_text().splitlines(True)
-            if not any(line.removeprefix("# ").startswith(f"{name} =") for name in names)]  # fmt: skip
-    file.write_text("".join(kept) + text)
+    gaps = tuple(f"{prefix}{name} =" for name in names for prefix in ("", "# "))
+    others = [line for line in file.read_text().splitlines(keepends=True) if not line.startswith(gaps)]
+    file.write_text("".join(others) + text)
 
 
 def ready(name: str, folder: Path, runs: Path, compute: Compute) -> tuple[RobotCfg, str]:
@@ -99,14 +100,12 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     with Crosser(robot, compute, cache=runs / "crossings") as crosser:
         checked = check_numbers(walk(crosser, policy, seed), robot.speed)
         agreed = agree(crosser, named, seed, 1 if small else 40)
-    rates = evaluate_rates(
-        robot, policy, compute=compute, terrains=6 if small else 300, episodes=2 if small else 20, space=named,
-        seed=seed, out=runs / f"{name}-rates.json",
-    )  # fmt: skip
-    dose = measure_dose(
-        robot, {name: policy}, parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), compute=compute, seed=seed,
-        terrains=1 if small else None, episodes=1 if small else None, out=runs / f"{name}-dose.json",
-    )  # fmt: skip
+    sizes: dict[str, Any] = {"terrains": 6 if small else 300, "episodes": 2 if small else 20}
+    out = runs / f"{name}-rates.json"
+    rates = evaluate_rates(robot, policy, compute=compute, space=named, seed=seed, out=out, **sizes)
+    doses, out = parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), runs / f"{name}-dose.json"
+    sizes = {"terrains": 1, "episodes": 1} if small else {}
+    dose = measure_dose(robot, {name: policy}, doses, compute=compute, seed=seed, out=out, **sizes)
     cfg = preset("small" if small else "wide", robot, None, space=named)
     search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
     archive = judge(run, stages=("fresh",) if small else ("fresh", "resolved"), compute=compute, robot=robot.spec)
@@ -154,11 +153,6 @@ def agree(crosser: Crosser, space: str, seed: int, terrains: int) -> dict[str, A
     return {**rates, "both_resolved": agreement(outcome["resolved"], outcome["mujoco_c"], seed)}
 
 
-def read_rows(out: Path, origin: dict[str, Any]) -> dict[str, Any]:
-    """Controllers in the file that today's sources measured on this device."""
-    return read_alike(out, origin, "sources_sha256", "device", "seed", "small").get("controllers", {})
-
-
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures all controllers, or those of ``--only``, and writes the file after each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -182,10 +176,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         return {}
     prepare_output(out)
     origin, content = provenance(compute.device, args.seed) | {"small": args.small}, dict[str, Any]()
+    read_rows = partial(read_alike, out, origin, "sources_sha256", "device", "seed", "small")
     for name in args.only:
-        if name not in read_rows(out, origin):
+        if name not in read_rows().get("controllers", {}):
             numbers = measure(name, args.folder, runs, compute, seed=args.seed, small=args.small)
-            rows = read_rows(out, origin) | {name: numbers}  # another process may have written meanwhile
+            rows = read_rows().get("controllers", {}) | {name: numbers}  # another process may have written meanwhile
             content = origin | {"controllers": {name: rows[name] for name in CONTROLLERS if name in rows}}
             print(json.dumps({name: numbers}, indent=1), flush=True)
             write_atomically(out, to_json(content))

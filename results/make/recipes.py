@@ -53,19 +53,18 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     plain = ("hand_crafted", "hard_random")
     sets = {name: plain_set(name, terrains, script.seed, purpose="validation") for name in plain}
     sets["generated"] = generated_set(script.read_archive(), terrains, script.seed, "validation")
-    crossed = cross_sets(
-        {"base": script.policy, **controllers}, sets, robot=script.robot, compute=script.compute, episodes=episodes,
-        cache=script.runs / "crossings",
-    )  # fmt: skip
+    controllers = {"base": script.policy} | controllers
+    cache = script.runs / "crossings"
+    crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, cache=cache)
     goal = {
         controller: {
             name: float(np.nanmean(crossing_rates(crossed[name][controller].outcome, "goal"))) for name in sets
         }
-        for controller in ("base", *controllers)
+        for controller in controllers
     }
     score = {
-        recipe: float(np.mean([[*goal[name].values()] for name in controllers if TRAININGS[name][0] == recipe]))
-        for recipe in dict.fromkeys(TRAININGS[name][0] for name in controllers)
+        recipe: float(np.mean([[*goal[name].values()] for name in names if TRAININGS[name][0] == recipe]))
+        for recipe in dict.fromkeys(TRAININGS[name][0] for name in names)
     }
     return script.write(
         {"score": score, "goal": goal, "terrains": {name: len(of_set) for name, of_set in sets.items()}}

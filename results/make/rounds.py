@@ -14,15 +14,10 @@ from typing import Any
 
 from qd.search.loop import search
 from results.make.archive import judge_with_specialist
-from results.make.common import Script, parse, publish_controller, read_made
+from results.make.common import COUNTS, Script, parse, publish_controller, read_made
 from results.make.tables import train, write_tables
 from train.cfg import HardenCfg
 from train.harden import ROUNDS_FILE, harden
-
-COUNTS = (
-    "episodes", "elites", "corrected_elites", "families", "failing", "confirmed", "certified", "faults", "faults_panel",
-    "faults_unseen", "fault_families",
-)  # fmt: skip
 
 EPISODES = 416_000
 SEEDS = (1000, 1001, 1002)
@@ -66,11 +61,9 @@ def cfg_of(script: Script) -> HardenCfg:
     cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=False)
     if not script.small:
         return cfg
-    return replace(
-        cfg, rounds=1, search=replace(cfg.search, episodes=16),
-        tune=replace(cfg.tune, num_envs=4, terrains=4, iterations=1),
-        evaluation=replace(cfg.evaluation, terrains=2, episodes=1),
-    )  # fmt: skip
+    tune = replace(cfg.tune, num_envs=4, terrains=4, iterations=1)
+    evaluation = replace(cfg.evaluation, terrains=2, episodes=1)
+    return replace(cfg, rounds=1, search=replace(cfg.search, episodes=16), tune=tune, evaluation=evaluation)
 
 
 def train_at_once(script: Script) -> Path:

@@ -43,14 +43,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     terrains, replicas, rounds = (4, 1, 1) if script.small else (256, 16, ROUNDS) if on_gpu else (4, 4, ROUNDS)
     devices = wp.get_cuda_device_count() if on_gpu else available_cores()
     counts = (1,) if script.small else [1 << k for k in range(devices.bit_length())]
+    alone = Compute(script.device, workers="1")
     search = preset("paper" if on_gpu else "small", script.robot)
     one_process = PipelineCfg(
-        compute=Compute(script.device, workers="1"), robot=script.robot, policy=script.policy, num_terrains=terrains,
-        replicas=replicas,
-    )  # fmt: skip
-    shared = replace(
-        one_process, num_terrains=4 if script.small else search.scheduler.num_terrains, replicas=search.replicas
+        compute=alone, robot=script.robot, policy=script.policy, num_terrains=terrains, replicas=replicas
     )
+    paper_size = 4 if script.small else search.scheduler.num_terrains
+    shared = replace(one_process, num_terrains=paper_size, replicas=search.replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, script.seed, rounds) for cfg in (one_process, shared))
     rate_alone = terrains * replicas / alone_s
     rows = []

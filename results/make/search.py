@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from results.make.common import CURVE_FILE, ONCE, PAPER_SIZE, Script, file_name, follow_search, mean_over_seeds, parse
+from results.make import common
+from results.make.common import COUNTS, ONCE, PAPER_SIZE, Script, file_name, follow_search, mean_over_seeds, parse
 
 DEFAULT = "surrogate"
 LEARNING = ("cma_mae+map_elites", "cma_mae", "map_elites")
@@ -27,52 +28,40 @@ SEEDS = (10, 11, 12)
 """Others than those by which the default was chosen."""
 STEPS = (96_000, 192_000, 384_000)
 """Episodes after which elites cross fresh ones."""
-COUNTS = ("elites", "elites_same_cell", "corrected_elites", "failing", "families")
-JUDGED = ("confirmed", "certified", "faults", "faults_panel", "fault_families")
 
 
 def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """Counts of a search after each step; the last ones with the origin of the search."""
     cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
-    run, counts = script.runs / "search" / file_name(f"{method}, seed {seed}"), ("episodes", *COUNTS, *JUDGED)
-    *rows, last = follow_search(
-        script, run, cfg, script.count_iterations(cfg, *STEPS), counts, ("fresh", "resolved", "others")
-    )  # fmt: skip
-    origin = script.read_so_far(run / CURVE_FILE)
+    run = script.runs / "search" / file_name(f"{method}, seed {seed}")
+    points, stages = script.count_iterations(cfg, *STEPS), ("fresh", "resolved", "others")
+    *rows, last = follow_search(script, run, cfg, points, COUNTS, stages)
+    origin = script.read_so_far(run / common.CURVE_FILE)
     named = {"method": method, "search_seed": seed, **{key: origin[key] for key in ("commit", "device", "date")}}
     return [*rows, named | last]
 
 
-def seeds_of(method: str) -> tuple[int, ...]:
-    """Seeds that a method is searched with."""
-    return SEEDS if method == DEFAULT else SEEDS[:2]
-
-
-def curve_of(rows_of_seeds: Sequence[list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Means over seeds after each step."""
-    return [
-        {name: float(np.mean([row[name] for row in rows])) for name in ("episodes", *COUNTS)}
-        for rows in zip(*rows_of_seeds, strict=True)
-    ]
-
-
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Runs every method with every seed, and writes means with 95 % t intervals over seeds; parts are runs alone."""
-    runs = {f"{method}, seed {seed}": (method, seed) for method in METHODS for seed in seeds_of(method)}
+    seeds_by_method = {method: SEEDS if method == DEFAULT else SEEDS[:2] for method in METHODS}
+    runs = {f"{method}, seed {seed}": (method, seed) for method, seeds in seeds_by_method.items() for seed in seeds}
     script = parse(__doc__, argv, "search.json", parts=tuple(runs))
     for part in script.parts:
         follow(script, *runs[part])
     if script.parts:
         return {}
-    methods = [(DEFAULT, SEEDS[:1])] if script.small else [(name, seeds_of(name)) for name in METHODS]
-    rows = {name: [follow(script, name, seed) for seed in seeds] for name, seeds in methods}
+    methods = {DEFAULT: SEEDS[:1]} if script.small else seeds_by_method
+    rows = {name: [follow(script, name, seed) for seed in seeds] for name, seeds in methods.items()}
     numbers, searches = {}, list[dict[str, Any]]()
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
         numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
-        for count in (*COUNTS, *JUDGED):
+        for count in COUNTS[1:]:
             numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
-        numbers[name]["curve"] = curve_of(rows_of_seeds)
+        numbers[name]["curve"] = [
+            {count: float(np.mean([row[count] for row in rows_of_step])) for count in common.FRESH_COUNTS}
+            for rows_of_step in zip(*rows_of_seeds, strict=True)
+        ]
         searches += last
     return script.write({"methods": numbers, "curve": numbers[DEFAULT]["curve"], "searches": searches})
 

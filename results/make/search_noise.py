@@ -20,7 +20,7 @@ from qd.search.loop import search
 from qd.search.pool import chance_to_stay
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from results.make.common import ONCE, Script, file_name, parse
+from results.make.common import FRESH_COUNTS, ONCE, Script, file_name, parse
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
@@ -61,8 +61,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     both = archive.fresh.valid & second.valid
     numbers = RunDirectory(run).read_summary()
     corrected = archive.fresh.corrected_elites()
-    counts = ("episodes", "wall_s", "elites", "elites_same_cell", "corrected_elites", "corrected_qd_score", "failing",
-              "families")  # fmt: skip
+    counts = ("wall_s", "corrected_qd_score", *FRESH_COUNTS)
     return {
         "search": name,
         "design": design_name,

@@ -8,15 +8,12 @@ from qd.faults.judge import judge
 from qd.search.archive import Archive
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
-from results.make.common import parse
+from qd.search.settings import SearchCfg
+from results.make.common import COUNTS, Script, parse
 from sim.robots.shipped import ROBOTS
 from sim.terrains.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")
-COUNTS = (
-    "iterations", "episodes", "elites", "reachable_coverage", "corrected_elites", "families", "failing", "confirmed",
-    "certified", "faults", "faults_panel",
-)  # fmt: skip
 
 
 def causes_of(archive: Archive) -> dict[str, int]:
@@ -26,17 +23,27 @@ def causes_of(archive: Archive) -> dict[str, int]:
     return {cause: len(rows) for cause, rows in ranking.by_cause().items()}
 
 
+def search_space(script: Script, name: str, cfg: SearchCfg) -> tuple[Archive, dict[str, Any]]:
+    """The archive of a search in the folder ``name``, judged by all stages but varied conditions, and its numbers."""
+    run = script.runs / name
+    search(cfg, run, script.compute)
+    stages = ("fresh",) if script.small else ("fresh", "resolved", "others")
+    archive = judge(run, stages=stages, compute=script.compute)
+    summary = RunDirectory(run).read_summary()
+    return archive, {
+        **{count: summary.get(count) for count in ("iterations", "reachable_coverage", *COUNTS)},
+        "causes": causes_of(archive),
+    }
+
+
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches each space as long, and judges what was found."""
     script = parse(__doc__, argv, "spaces.json")
-    numbers, dose = {}, script.read_dose(conditions=False)
+    dose = script.read_dose(conditions=False)
+    numbers = {}
     for name in SPACES:
-        run = script.runs / "spaces" / name
-        search(script.search_cfg(13, seed=script.seed, space=name), run, script.compute)
-        archive = judge(run, stages=("fresh",) if script.small else ("fresh", "resolved", "others"),
-                        compute=script.compute)  # fmt: skip
-        summary = RunDirectory(run).read_summary()
-        numbers[name] = {**{count: summary.get(count) for count in COUNTS}, "causes": causes_of(archive)}
+        cfg = script.search_cfg(13, seed=script.seed, space=name)
+        _, numbers[name] = search_space(script, f"spaces/{name}", cfg)
     return script.write({"spaces": numbers, "dose": dose})
 
 

@@ -12,13 +12,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import warp as wp
@@ -28,12 +26,10 @@ from qd.search.archive import read_archive
 from qd.search.directory import Metrics, RunDirectory
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.loop import search
-from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg, preset
 from qd.workers.compute import Compute
 from qd.workers.crosser import open_pipeline
 from qd.workers.pipeline import PipelineCfg, build_simulator
-from qd.workers.seeds import episode_seeds
 from results.make.bare import bare_rates, kernel_shares, standing_rates
 from results.make.common import ONCE, Script, parse
 from sim.robots.robot import RobotCfg
@@ -48,18 +44,8 @@ REPLICAS = 20
 PROFILED = 22_400
 """Robots whose kernels are timed, as in a search of preset wide."""
 PAPER_EPISODES = 4_000_000
-KEYS = (
-    "iteration_s_median",
-    "bare_physics_ratio",
-    "world_steps_per_s",
-    "ground_step_ratio",
-    "conditions_step_ratio",
-    "envs_curve",
-    "wide",
-    "flat",
-    "kernels",
-    "cpu",
-)
+ITERATION_KEYS = ("iteration_s_median", "bare_physics_ratio", "world_steps_per_s", "ground_step_ratio")
+KEYS = (*ITERATION_KEYS, "conditions_step_ratio", "envs_curve", "wide", "flat", "kernels", "cpu")
 """Keys that readers expect: null until measured."""
 
 
@@ -77,10 +63,10 @@ def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> t
 
 def make_rollout(script: Script, num_terrains: int, num_envs: int, replicas: int) -> Rollout:
     """A simulation of the shipped controller in this process."""
+    compute = Compute(script.device, workers="1", num_envs=num_envs)
     cfg = PipelineCfg(
-        compute=Compute(script.device, workers="1", num_envs=num_envs), robot=script.robot, policy=script.policy,
-        num_terrains=num_terrains, replicas=replicas,
-    )  # fmt: skip
+        compute=compute, robot=script.robot, policy=script.policy, num_terrains=num_terrains, replicas=replicas
+    )
     rollout = build_simulator(cfg, num_terrains)
     assert isinstance(rollout, Rollout)
     return rollout
@@ -117,8 +103,7 @@ def time_wide(script: Script) -> dict[str, Any]:
     numbers = {}
     for method in WIDE:
         cfg = script.search_cfg(method=method, **({} if method == "surrogate" else ONCE))
-        with record_lots() as lots:
-            metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
+        metrics, _ = time_search(script, f"wide-{method}", cfg, 5)
         seconds = float(np.median([row["wall_s"] for row in metrics]))
         numbers[method] = {
             "iteration_s_median": seconds,
@@ -126,44 +111,7 @@ def time_wide(script: Script) -> dict[str, Any]:
             "idle_share": float(np.median([row["idle_share"] for row in metrics])),
             "search_share": float(np.median([row["search_s"] / row["wall_s"] for row in metrics])),
         }
-        if method == "surrogate":
-            crossings_s = cross_again(script, cfg, lots[: -2 * cfg.scheduler.num_groups])
-            numbers[method]["crossings_s_median"] = float(np.median(crossings_s))
     return {"wide": numbers}
-
-
-@contextmanager
-def record_lots() -> Iterator[list[NDArray[np.float32]]]:
-    """The lots of terrains that searches ask for; those of the last two iterations are not crossed."""
-    lots: list[NDArray[np.float32]] = []
-    ask = Scheduler.ask
-
-    def ask_and_record(self: Scheduler, group: int = 0, *, new: bool = True) -> NDArray[np.float32]:
-        lots.append(ask(self, group, new=new))
-        return lots[-1]
-
-    with patch.object(Scheduler, "ask", ask_and_record):
-        yield lots
-
-
-def cross_again(script: Script, cfg: SearchCfg, lots: list[NDArray[np.float32]]) -> list[float]:
-    """Seconds of the crossings alone in each iteration after the first two.
-
-    Lots of the first iteration are left out; in it no terrain can be crossed again, so they have another size.
-    """
-    num_groups = cfg.scheduler.num_groups
-    num_terrains = cfg.scheduler.num_terrains
-    iterations = range(2, len(lots) // num_groups + 1)
-    lots = lots[num_groups:]
-    seeds = np.concatenate([episode_seeds(cfg.seed, iteration, num_terrains) for iteration in iterations])
-    evaluator = PipelineCfg(
-        compute=Compute(script.device, workers="1"), robot=script.robot, policy=script.policy,
-        num_terrains=num_terrains, replicas=cfg.replicas, lots=num_groups,
-    )  # fmt: skip
-    with open_pipeline(evaluator) as pipeline:
-        terrains = Terrains(genes=np.concatenate(lots), seeds=seeds)
-        lots_ended = [time.perf_counter() for _ in pipeline.in_lots(terrains, len(lots[0]))]
-    return np.diff(lots_ended[num_groups - 1 :: num_groups])[WARM_UP - 2 :].tolist()
 
 
 def time_curve(script: Script) -> dict[str, Any]:
@@ -179,10 +127,15 @@ def time_crossings(
     num_terrains = max(1, num_envs * each // REPLICAS)
     drawn = load_space(space)
     genes = drawn.hard_random(num_terrains, seed)
+    compute, policy = Compute(device, workers="1", num_envs=num_envs), str(robot.policy_file)
     cfg = PipelineCfg(
-        compute=Compute(device, workers="1", num_envs=num_envs), robot=robot, policy=str(robot.policy_file),
-        num_terrains=max(1, num_terrains * 4 // each), space=space, replicas=REPLICAS,
-    )  # fmt: skip
+        compute=compute,
+        robot=robot,
+        policy=policy,
+        num_terrains=max(1, num_terrains * 4 // each),
+        space=space,
+        replicas=REPLICAS,
+    )
     with open_pipeline(cfg) as evaluate:
         result = evaluate(Terrains(genes=genes, seeds=np.arange(num_terrains, dtype=np.uint32), space=drawn))
     rate = result.outcome.size / result.wall_s

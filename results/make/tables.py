@@ -28,7 +28,7 @@ from results.make.common import (
     publish_controller,
     published_controllers,
     read_made,
-)  # fmt: skip
+)
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
@@ -117,40 +117,26 @@ def is_hardened_here(script: Script, policy: str | None) -> bool:
 def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
     """Evaluates controllers on all sets, and writes the file and the rates of its terrains."""
     terrains, episodes = (2, 1) if script.small else (paper_terrains(script.robot.name), 20)
-    cfg = SetsCfg(
-        sets=("hard_random", "generated") if script.small else (),
-        archive=script.results / "archive",
-        independent=None if script.small else script.results / "independent",
-        terrains=terrains,
-        episodes=episodes,
-        seed=script.seed,
-    )
+    archive, independent = script.results / "archive", None if script.small else script.results / "independent"
+    names = ("hard_random", "generated") if script.small else ()
+    sizes: dict[str, Any] = {"terrains": terrains, "episodes": episodes, "seed": script.seed}
+    cfg = SetsCfg(sets=names, archive=archive, independent=independent, **sizes)
     draft = script.runs / script.out.name  # what is published is written last, and whole
     tables = evaluate_tables(script.robot, controllers, cfg, compute=script.compute, out=draft)
-    archive = script.read_archive()
-    independent = None if cfg.independent is None else script.read_archive("independent")
-    sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent)
-    crossed = cross_sets(
-        controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, reward=True,
-        cache=crossings_folder(script.robot),
-    )  # fmt: skip
+    archives = {"archive": script.read_archive(), "independent": independent and script.read_archive("independent")}
+    sets = make_sets(cfg.sets, terrains, cfg.seed, **archives)
+    cache = {"cache": crossings_folder(script.robot), "reward": True}
+    crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, **cache)
     rates = {
         name: {controller: crossing_rates(result.outcome, "goal") for controller, result in row.items()}
         for name, row in crossed.items()
     }
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
     family = {name: families_of(of_set) for name, of_set in sets.items()}
-    arrays |= {f"{name}_family": of_set for name, of_set in family.items()}
-    arrays["controllers"] = np.array(list(controllers))
+    arrays |= {f"{name}_family": of_set for name, of_set in family.items()} | {"controllers": np.array([*controllers])}
     write_atomically(script.out.with_suffix(".npz"), npz_bytes(arrays))
-    script.add(
-        tables,
-        {
-            "differences": {
-                name: tables["differences"][name] | differences_of(rates[name], family[name], cfg.seed) for name in sets
-            }
-        },
-    )
+    differences = {name: differences_of(rates[name], family[name], cfg.seed) for name in sets}
+    script.add(tables, {"differences": {name: tables["differences"][name] | differences[name] for name in sets}})
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
-from tests.qd.searches import rows_of, run, without_figures
+from tests.qd.searches import without_figures
 from tests.qd.stand_in import Stub, make_result
 from train.ppo.learner import Ranks
 
@@ -211,15 +211,6 @@ def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
         assert row["elites"] == report["methods"]["surrogate"]["elites"]
 
 
-def test_lots_that_a_search_asks_for_are_recorded(tmp_path, monkeypatch):
-    without_figures(monkeypatch)
-    with speed.record_lots() as lots:
-        run(tmp_path / "run", iterations=4)
-    # Lots of 12 terrains: one is put in first, one behind each iteration, and the last is not crossed.
-    assert [len(lot) for lot in lots] == [12] * 5
-    assert sum(row["terrains"] for row in rows_of(tmp_path / "run")) == 4 * 12
-
-
 def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
     # Two robots for 60 control steps, of which the first 10 of every 20 are replayed. One ends behind the 15th: of
     # (2 + 1 + 1) * 10 control steps, 4 physics steps each, count.
@@ -304,7 +295,9 @@ def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
 
 def test_a_cell_is_a_number_with_its_interval():
     rows = {"a": {"share": 0.5, "share_interval": [0.2, 1.0]}, "b": {"share": 0.25}}
-    made = docs.table(rows, {"cm": docs.shown("share", ".1f", 100), "rate": docs.shown("share", ".2f")}, upright=True)
+    made = docs.table(
+        rows, {"cm": docs.shown("share", form=".1f", factor=100), "rate": docs.shown("share", form=".2f")}, upright=True
+    )
     assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
 
 
