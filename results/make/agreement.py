@@ -74,17 +74,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         way: crossing_rates(outcome["elites"][way], "goal") < FAILING_GOAL_RATE
         for way in ("search", "again", "resolved")
     }
-    return script.write(
-        {
-            **{
-                name: compare(of_set, find_families(genes, get_space(space)), script.seed)
-                for (name, of_set), (genes, space) in zip(outcome.items(), sets.values(), strict=True)
-            },
-            "failing": int(fails["search"].sum()),
-            "failing_again": int((fails["search"] & fails["again"]).sum()),
-            "failing_resolved": int((fails["search"] & fails["resolved"]).sum()),
-        }
-    )
+    numbers: dict[str, Any] = {
+        name: compare(outcome[name], find_families(genes, get_space(space)), script.seed)
+        for name, (genes, space) in sets.items()
+    }
+    for key, way in {"failing": "search", "failing_again": "again", "failing_resolved": "resolved"}.items():
+        numbers[key] = int((fails["search"] & fails[way]).sum())
+    return script.write(numbers)
 
 
 if __name__ == "__main__":

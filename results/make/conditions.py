@@ -54,8 +54,11 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             for number, kind in enumerate(space.conditions)
         }
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
-    examples = examples_of(archive, cured, needed)
-    minima = None
+    examples, minima = dict[int, str](), None
+    for kind, is_needed in needed.items():  # some elites that need this kind alone, faults first
+        numbers = cured[(alone == 1) & is_needed]
+        numbers = numbers[np.argsort(~archive.is_fault[numbers], kind="stable")]
+        examples |= dict.fromkeys(numbers[:_EXAMPLES].tolist(), kind)
     if examples and not script.small:
         minima = minimise(run, compute=script.compute, elite=" ".join(map(str, examples)), judged=True)
     return {
@@ -77,17 +80,6 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
             for number, kind in examples.items()
         ],
     }
-
-
-def examples_of(archive: Archive, cured: NDArray[np.int64], needed: dict[str, NDArray[np.bool_]]) -> dict[int, str]:
-    """Some elites of each kind that is the only one they need, faults first; by their numbers."""
-    single = np.sum([*needed.values()], axis=0) == 1
-    examples = {}
-    for kind, of_kind in needed.items():
-        numbers = cured[single & of_kind]
-        for number in numbers[np.argsort(~archive.is_fault[numbers], kind="stable")][:_EXAMPLES].tolist():
-            examples[number] = kind
-    return examples
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

@@ -26,21 +26,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     nearest = {
         name: nearest_distance(terrains.terrains, trained_on, read_space(archive)) for name, terrains in sets.items()
     }
-    return script.write(
-        {
-            "iterations": archive.iterations,
-            "trained_on": len(trained_on),
-            "nearest_m": {
-                name: {
-                    "terrains": len(distances),
-                    "median": float(np.median(distances)),
-                    "least": float(distances.min()),
-                    "largest": float(distances.max()),
-                }
-                for name, distances in nearest.items()
-            },
-        }
-    )
+    rows = {}
+    for name, distances in nearest.items():
+        least, median, largest = np.quantile(distances, (0.0, 0.5, 1.0)).tolist()
+        rows[name] = {"terrains": len(distances), "median": median, "least": least, "largest": largest}
+    return script.write({"iterations": archive.iterations, "trained_on": len(trained_on), "nearest_m": rows})
 
 
 if __name__ == "__main__":

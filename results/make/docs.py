@@ -434,7 +434,8 @@ def speed() -> str:
         origins = [part for part in parts if part.get("device")]
         kernel_shares = Counter[str]()
         for kernel in numbers.get("kernels") or ():
-            kernel_shares[shorten_kernel(kernel["name"])] += kernel["share"]
+            plain_name = kernel["name"].rpartition("__")[2].removesuffix("_kernel").strip("_")
+            kernel_shares["matrix products" if "gemm" in kernel["name"] else plain_name] += kernel["share"]
         largest = [f"{name} {share:.0%}" for name, share in kernel_shares.most_common() if share >= 0.04]
         ray = [f"{row['workers']}: {row['episodes_per_s']:,.0f}" for row in scale.get("rows", ())]
         rows[label] = numbers | {
@@ -484,11 +485,6 @@ def trained(key: str) -> Callable[[Any], str]:
         return NONE
 
     return cell
-
-
-def shorten_kernel(name: str) -> str:
-    """A kernel's name without the additions of compilers."""
-    return "matrix products" if "gemm" in name else name.rpartition("__")[2].removesuffix("_kernel").strip("_")
 
 
 def kernels() -> str:

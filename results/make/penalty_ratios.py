@@ -32,15 +32,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         of_failed, of_reached = (float(sums[some].mean()) if some.any() else None for some in (failed, reached))
         ratio = of_failed / of_reached if of_failed is not None and of_reached else None
         ratios[name] = {"failing": of_failed, "reached": of_reached, "ratio": ratio}
-    return script.write(
-        {
-            "terrains": terrains,
-            "episodes": int(failed.size),
-            "invalid_episodes": int(result.invalid.sum()),
-            "failing_episodes": int(failed.sum()),
-            "penalties": ratios,
-        }
-    )
+    counts = {"invalid_episodes": int(result.invalid.sum()), "failing_episodes": int(failed.sum())}
+    return script.write({"terrains": terrains, "episodes": int(failed.size), **counts, "penalties": ratios})
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     robot, named = ready(name, folder, runs, compute)
     policy = str(robot.policy_file)
     with Crosser(robot, compute, cache=runs / "crossings") as crosser:
-        checked = check_numbers(walk(crosser, policy, seed), robot.speed)
+        walked = walk(crosser, policy, seed)
         agreed = agree(crosser, named, seed, 1 if small else 40)
     sizes: dict[str, Any] = {"terrains": 6 if small else 300, "episodes": 2 if small else 20}
     out = runs / f"{name}-rates.json"
@@ -118,7 +118,11 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "contract": {key: value for key, value in read_toml(Path(policy)).items() if key != "policy"},
         "space": named,
         "height": float(named.partition("@")[2] or MAX_HEIGHT),
-        "check": checked,
+        "check": {
+            f"flat_{key}{suffix}": value
+            for way, suffix in (("searched", ""), ("mujoco_c", "_mujoco_c"))
+            for key, value in {**walked[way], "vx_error": abs(walked[way]["speed"] - robot.speed)}.items()
+        },
         "hand_crafted": rates["hand_crafted"],
         "agreement": agreed,
         "archive": {count: summary.get(count) for count in (*COUNTS, "wall_s")},
@@ -126,15 +130,6 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "episodes_per_s_32768": speed["episodes_per_s"],
         "dose": dose["dose"],
         "half": dose["half"],
-    }
-
-
-def check_numbers(walked: dict[str, dict[str, float]], speed: float) -> dict[str, float]:
-    """Numbers of :func:`qd.check.walk`, of both simulators by names; ``vx_error`` is off ``speed`` [m/s]."""
-    return {
-        f"flat_{key}{suffix}": value
-        for way, suffix in (("searched", ""), ("mujoco_c", "_mujoco_c"))
-        for key, value in {**walked[way], "vx_error": abs(walked[way]["speed"] - speed)}.items()
     }
 
 

@@ -7,6 +7,7 @@ other number is made.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,15 +21,6 @@ from train.cfg import FinetuneCfg, PpoCfg, TaskCfg
 RECIPES = ("today's", "the base's own")
 
 
-def recipe_of(script: Script, name: str) -> FinetuneCfg:
-    """A fine-tuning by a recipe: today's, or with rewards and learner of the base's training."""
-    cfg = FinetuneCfg.of(script.robot)
-    if name == "today's":
-        return cfg
-    task = TaskCfg.of(script.robot, crosses=True, start_spread=cfg.task.start_spread)
-    return replace(cfg, task=task, ppo=replace(PpoCfg.of(script.robot), steps_per_env=cfg.ppo.steps_per_env))
-
-
 TRAININGS = {f"{recipe}: {kind}": (recipe, kind) for recipe in RECIPES for kind in MIXES}
 
 
@@ -38,8 +30,11 @@ def train_by(script: Script, training: str) -> str:
     if recipe == RECIPES[0] and not script.small:
         return train_controllers(script, [f"tables: {kind}-{SEEDS[0]}"])[kind]
     sizes = {"num_envs": 4, "terrains": 4, "iterations": 1} if script.small else SIZES["tables"]
-    run = script.runs / "recipes" / file_name(training)
-    return train(script, replace(recipe_of(script, recipe), **sizes), kind, script.seed, run)
+    cfg = FinetuneCfg.of(script.robot)
+    if recipe == RECIPES[1]:  # rewards and learner of the base's training
+        task = TaskCfg.of(script.robot, crosses=True, start_spread=cfg.task.start_spread)
+        cfg = replace(cfg, task=task, ppo=replace(PpoCfg.of(script.robot), steps_per_env=cfg.ppo.steps_per_env))
+    return train(script, replace(cfg, **sizes), kind, script.seed, script.runs / "recipes" / file_name(training))
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -56,12 +51,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     controllers = {"base": script.policy} | controllers
     cache = script.runs / "crossings"
     crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, cache=cache)
-    goal = {
-        controller: {
-            name: float(np.nanmean(crossing_rates(crossed[name][controller].outcome, "goal"))) for name in sets
-        }
-        for controller in controllers
-    }
+    goal: dict[str, dict[str, float]] = {name: {} for name in controllers}
+    for name, controller in product(sets, controllers):
+        rates = crossing_rates(crossed[name][controller].outcome, "goal")
+        goal[controller][name] = float(np.nanmean(rates))
     score = {
         recipe: float(np.mean([[*goal[name].values()] for name in names if TRAININGS[name][0] == recipe]))
         for recipe in dict.fromkeys(TRAININGS[name][0] for name in names)

@@ -85,13 +85,6 @@ def harden_here(script: Script, name: str = "hardening") -> dict[str, Any]:
     return harden(script.robot, cfg, script.runs / name, script.compute, certifiers=certifiers)
 
 
-def policy_of(script: Script, name: str) -> Path | None:
-    """The controller that further searches are of; None for the shipped one, and where no round was kept."""
-    if name == "base":
-        return None
-    return train_at_once(script) if name == "at_once" else last_policy(script, name)
-
-
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
 
@@ -106,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         train_at_once(script)
     searches: dict[str, list[dict[str, Any]]] = {name: [] for name in ("base", *TRAINED)}
     for name, seed in (SEARCHES[part] for part in parts if part in SEARCHES):
-        policy = policy_of(script, name)
+        policy = None if name == "base" else train_at_once(script) if name == "at_once" else last_policy(script, name)
         if name == "base" or policy is not None:
             searches[name].append(search_again(script, name, policy, seed))
     if COMPARED in parts and (policy := last_policy(script)) is not None:

@@ -58,24 +58,11 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         wide = replace(one_process, num_terrains=terrains * count, compute=on_ray)
         rate = terrains * count * replicas / time_evaluation(wide, script.seed, rounds)
         iteration_s = time_evaluation(replace(shared, compute=on_ray), script.seed, rounds)
-        rows.append(
-            {
-                "workers": count,
-                "num_envs": terrains * count * replicas,
-                "episodes_per_s": rate,
-                "efficiency": rate / rate_alone / count,
-                "paper_size_iteration_s": iteration_s,
-                "speedup_paper_size": shared_alone_s / iteration_s,
-            }
-        )
-    return script.write(
-        {
-            "paper_size": search.preset,
-            "episodes_per_s_without_ray": rate_alone,
-            "iteration_s_without_ray": shared_alone_s,
-            "rows": rows,
-        }
-    )
+        row = {"workers": count, "num_envs": terrains * count * replicas, "episodes_per_s": rate}
+        row["efficiency"] = rate / rate_alone / count
+        rows.append(row | {"paper_size_iteration_s": iteration_s, "speedup_paper_size": shared_alone_s / iteration_s})
+    without_ray = {"episodes_per_s_without_ray": rate_alone, "iteration_s_without_ray": shared_alone_s}
+    return script.write({"paper_size": search.preset, **without_ray, "rows": rows})
 
 
 if __name__ == "__main__":

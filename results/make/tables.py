@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
 from qd.evaluate.measures import kind_mean
-from qd.evaluate.sets import TerrainSet, elites_sha256, make_sets, paper_terrains
+from qd.evaluate.sets import elites_sha256, make_sets, paper_terrains
 from qd.evaluate.tables import by_kind
 from qd.search.archive import read_archive
 from results.make.common import (
@@ -85,11 +85,6 @@ def differences_of(rates: Mapping[str, NDArray[np.float64]], families: NDArray[n
     return differences
 
 
-def families_of(terrains: TerrainSet) -> NDArray[np.int64]:
-    """Family of each terrain; each its own where they are independent."""
-    return np.arange(len(terrains)) if terrains.families is None else terrains.families
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Trains and evaluates; parts are trainings alone, a trial evaluates what is published on few terrains."""
     script = parse(__doc__, argv, "tables.json", parts=tuple(TRAININGS))
@@ -132,7 +127,9 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
         for name, row in crossed.items()
     }
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
-    family = {name: families_of(of_set) for name, of_set in sets.items()}
+    family = {  # each terrain is its own where they are independent
+        name: np.arange(len(of_set)) if of_set.families is None else of_set.families for name, of_set in sets.items()
+    }
     arrays |= {f"{name}_family": of_set for name, of_set in family.items()} | {"controllers": np.array([*controllers])}
     write_atomically(script.out.with_suffix(".npz"), npz_bytes(arrays))
     differences = {name: differences_of(rates[name], family[name], cfg.seed) for name in sets}
