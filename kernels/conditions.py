@@ -7,12 +7,14 @@ Warp functions, which read their numbers from column ``first`` on:
     disturb(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int)
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import warp as wp
 
 from kernels.episode import Episodes
+from kernels.launch import kernel_over
 from kernels.observation import Noise
 
 Effects = tuple[tuple[Any, int], ...]
@@ -79,11 +81,16 @@ class DisturbedStep:
 
 
 @cache
-def _make_begin_kernel(effects: Effects) -> Any:
+def make_begin(effects: Effects) -> Callable[..., None]:
+    """What varies robots by the conditions of their terrains where ``begins`` (num_envs,) is not 0.
+
+    ``conditions`` has shape (num_terrains, number of values). The weights by which the solver softens constraints stay
+    those of the robot by its model.
+    """
     functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def begin_kernel(
+    @kernel_over("begins", module="unique")
+    def begin_conditions(
         begins: wp.array[int],
         terrain_of_env: wp.array[int],
         conditions: wp.array2d[float],
@@ -102,38 +109,20 @@ def _make_begin_kernel(effects: Effects) -> Any:
         for k in range(count):
             wp.static(functions[k])(robots_out, conditions[t], wp.static(firsts[k]), t, env)
 
-    return begin_kernel
-
-
-def begin_conditions(
-    effects: Effects, begins: Any, terrain_of_env: Any, conditions: Any, robots_out: VariedRobots,
-    disturbed_out: Disturbed,
-) -> None:  # fmt: skip
-    """Vary robots by the conditions of their terrains where ``begins`` (num_envs,) is not 0.
-
-    ``conditions`` has shape (num_terrains, number of values). The weights by which the solver softens constraints stay
-    those of the robot by its model.
-    """
-    inputs, outputs = [begins, terrain_of_env, conditions], [robots_out, disturbed_out]
-    wp.launch(_make_begin_kernel(effects), begins.shape[0], inputs, outputs=outputs, device=begins.device)
+    return begin_conditions
 
 
 @cache
-def _make_disturb_kernel(effects: Effects) -> Any:
+def make_disturb(effects: Effects) -> Callable[..., None]:
+    """What disturbs the next control step of all robots: their velocities ``joint_qd`` and what they observe."""
     functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def disturb_kernel(step: DisturbedStep):
+    @kernel_over("step.observation", module="unique")
+    def disturb(step: DisturbedStep):
         """Grid (num_envs, num_columns): the columns of an observation."""
         env, column = wp.tid()
         for k in range(count):
             wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env, column)
         step.memory.age[env, column] += 1
 
-    return disturb_kernel
-
-
-def disturb(effects: Effects, step: DisturbedStep) -> None:
-    """Disturb the next control step of all robots: their velocities ``joint_qd`` and what they observe."""
-    shape, device = step.observation.shape, step.observation.device
-    wp.launch(_make_disturb_kernel(effects), shape, [step], device=device)
+    return disturb

@@ -12,7 +12,7 @@ import warp as wp
 
 from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
-from kernels.state import make_zeros
+from kernels.launch import kernel_over, make_zeros
 
 vec5 = wp.types.vector(5, float)
 """MuJoCo's frictions of a contact, or an impedance."""
@@ -176,42 +176,32 @@ def _collide_strips_kernel(
 
 
 def collide_strips(
-    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any,
-    contacts_out: Contacts,
-) -> None:  # fmt: skip
-    """Find every robot's terrain contacts, all of ``contacts_out`` but the forces.
+    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any, contacts: Contacts
+) -> None:
+    """Find every robot's terrain contacts, all of ``contacts`` but the forces.
 
     ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
     the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
-    num_envs = body_q.shape[0]
-    if terrain_of_env.shape[0] != num_envs:
-        raise ValueError(f"body_q must hold {terrain_of_env.shape[0]} robots, one a terrain_of_env, got {num_envs}")
-    contacts_out.count.zero_()
-    inputs = [body_q, terrain_of_env, terrain, probes, ground, parked]
-    size = (probes.bundle_body.shape[0], num_envs)
-    wp.launch(_collide_strips_kernel, size, inputs, outputs=[contacts_out], device=body_q.device)
+    contacts.count.zero_()
+    inputs = [body_q, terrain_of_env, terrain, probes, ground, parked, contacts]
+    wp.launch(_collide_strips_kernel, (len(probes.bundle_body), len(body_q)), inputs, device=body_q.device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:
     """Room for so many contacts of each robot, on the current device."""
-    fields = dict.fromkeys(Contacts.vars, (num_envs, capacity)) | {"count": (num_envs,)}
-    return make_zeros(Contacts, None, **fields)
+    return make_zeros(Contacts, None, **dict.fromkeys(Contacts.vars, (num_envs, capacity)) | {"count": (num_envs,)})
 
 
-@wp.kernel
-def _sum_forces_kernel(contacts: Contacts, column_of_shape: wp.array[int], geom_force_out: wp.array2d[wp.vec3]):
-    """Grid (num_envs, num_geoms)."""
+@kernel_over("geom_force_out")
+def sum_forces(contacts: Contacts, column_of_shape: wp.array[int], geom_force_out: wp.array2d[wp.vec3]):
+    """Grid (num_envs, num_geoms): sum the contact forces on each geom.
+
+    ``column_of_shape`` is the geom's column for each collision shape, -1 for none.
+    """
     env, column = wp.tid()
     force = wp.vec3(0.0)
     for c in range(wp.min(contacts.count[env], contacts.shape.shape[1])):
         if column_of_shape[contacts.shape[env, c]] == column:
             force += contacts.force[env, c]
     geom_force_out[env, column] = force
-
-
-def sum_forces(contacts: Contacts, column_of_shape: Any, geom_force_out: Any) -> None:
-    """Sum the contact forces on each geom; ``column_of_shape`` is its column for each collision shape, -1 for none."""
-    size = geom_force_out.shape
-    inputs = [contacts, column_of_shape]
-    wp.launch(_sum_forces_kernel, size, inputs, outputs=[geom_force_out], device=geom_force_out.device)

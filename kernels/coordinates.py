@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from kernels.contact import Contacts, Surfaces, vec5
+from kernels.launch import kernel_over
 from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 
@@ -103,16 +104,18 @@ def _to_solver_kernel(
 def to_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState) -> None:
     """Write coordinates, velocities and the targets in effect to mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
-    inputs = [joint_q, joint_qd, targets]
-    outputs = [delay_out, solver_out]
-    wp.launch(_to_solver_kernel, (joint_q.shape[0], threads), inputs, outputs=outputs, device=joint_q.device)
+    inputs = [joint_q, joint_qd, targets, delay_out, solver_out]
+    wp.launch(_to_solver_kernel, (len(joint_q), threads), inputs, device=joint_q.device)
 
 
-@wp.kernel
-def _limit_torques_kernel(
+@kernel_over("ranges_out")
+def limit_torques(
     joint_qd: wp.array2d[float], solver: SolverState, motors: wp.array[wp.vec3], ranges_out: wp.array2d[wp.vec2]
 ):
-    """Grid (num_envs, num_actuators)."""
+    """Grid (num_envs, num_actuators): write the torque limits [N m] of DC motors at the present velocities.
+
+    ``motors`` are effort limit [N m], stall torque [N m] and speed limit [rad/s] of each, shape (num_actuators,).
+    """
     env, k = wp.tid()
     effort = motors[k][0]
     saturation = motors[k][1]
@@ -120,15 +123,6 @@ def _limit_torques_kernel(
     lower = wp.clamp(-saturation - lost, -effort, effort)
     upper = wp.clamp(saturation - lost, -effort, effort)
     ranges_out[env, k] = wp.vec2(lower, upper)
-
-
-def limit_torques(joint_qd: Any, solver: SolverState, motors: Any, ranges_out: Any) -> None:
-    """Write the torque limits [N m] of DC motors at the present velocities, shape (num_envs, num_actuators).
-
-    ``motors`` are effort limit [N m], stall torque [N m] and speed limit [rad/s] of each, shape (num_actuators,).
-    """
-    inputs = [joint_qd, solver, motors]
-    wp.launch(_limit_torques_kernel, ranges_out.shape, inputs, outputs=[ranges_out], device=joint_qd.device)
 
 
 @wp.kernel
@@ -156,23 +150,17 @@ def _from_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], joi
 
 def from_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
     """Read coordinates and velocities from mujoco_warp's data."""
-    size = (joint_q_out.shape[0], 1 + len(solver.column_of_joint))
-    outputs = [joint_q_out, joint_qd_out]
-    wp.launch(_from_solver_kernel, size, [solver], outputs=outputs, device=joint_q_out.device)
+    size = (len(joint_q_out), 1 + len(solver.column_of_joint))
+    wp.launch(_from_solver_kernel, size, [solver, joint_q_out, joint_qd_out], device=joint_q_out.device)
 
 
-@wp.kernel
-def _poses_from_solver_kernel(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
-    """Grid (num_envs, bodies_per_env)."""
+@kernel_over("body_q_out")
+def poses_from_solver(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
+    """Grid (num_envs, bodies_per_env): read the poses of bodies, world-local frame, from mujoco_warp's data."""
     env, body = wp.tid()
     column = solver.column_of_body[body]
     turned = solver.xquat[env, column]  # wxyz
     body_q_out[env, body] = wp.transform(solver.xpos[env, column], wp.quat(turned[1], turned[2], turned[3], turned[0]))
-
-
-def poses_from_solver(solver: SolverState, body_q_out: Any) -> None:
-    """Read the poses of bodies, world-local frame, shape (num_envs, bodies_per_env), from mujoco_warp's data."""
-    wp.launch(_poses_from_solver_kernel, body_q_out.shape, [solver], outputs=[body_q_out], device=body_q_out.device)
 
 
 @wp.struct
@@ -202,9 +190,9 @@ class SolverContacts:
     """Index of each contact of a robot in the arrays above, shape (num_envs, capacity)."""
 
 
-@wp.kernel
-def _contacts_to_solver_kernel(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts):
-    """Grid (num_envs, capacity)."""
+@kernel_over("contacts.shape")
+def contacts_to_solver(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts):
+    """Grid (num_envs, capacity): write terrain contacts into mujoco_warp's data, whose ``count`` is 0."""
     env, c = wp.tid()
     if c == 0:
         solver_out.overflow[env] = 0
@@ -242,17 +230,9 @@ def _contacts_to_solver_kernel(contacts: Contacts, surfaces: Surfaces, solver_ou
         solver_out.efc_address[slot, row] = -1
 
 
-def contacts_to_solver(contacts: Contacts, surfaces: Surfaces, solver_out: SolverContacts) -> None:
-    """Write terrain contacts into mujoco_warp's data."""
-    solver_out.count.zero_()
-    inputs = [contacts, surfaces]
-    size = contacts.shape.shape
-    wp.launch(_contacts_to_solver_kernel, size, inputs, outputs=[solver_out], device=contacts.count.device)
-
-
-@wp.kernel
-def _forces_from_solver_kernel(solver: SolverContacts, contacts_out: Contacts):
-    """Grid (num_envs, capacity)."""
+@kernel_over("contacts_out.shape")
+def forces_from_solver(solver: SolverContacts, contacts_out: Contacts):
+    """Grid (num_envs, capacity): read the forces of terrain contacts from mujoco_warp's data."""
     env, c = wp.tid()
     if c >= contacts_out.count[env]:
         return
@@ -264,9 +244,3 @@ def _forces_from_solver_kernel(solver: SolverContacts, contacts_out: Contacts):
         if row >= 0:
             force += solver.efc_force[env, row] * solver.frame[slot][k]
     contacts_out.force[env, c] = force
-
-
-def forces_from_solver(solver: SolverContacts, contacts_out: Contacts) -> None:
-    """Read the forces of terrain contacts from mujoco_warp's data."""
-    size = contacts_out.shape.shape
-    wp.launch(_forces_from_solver_kernel, size, [solver], outputs=[contacts_out], device=contacts_out.count.device)

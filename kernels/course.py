@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from kernels.launch import kernel_over
+
 SPACING = 0.05
 """Distance of neighbouring nodes [m], for which courses are made."""
 FIRST_COL = 80
@@ -149,11 +151,14 @@ def _decode(gene: float, low: float, high: float, whole: float) -> float:
     return low + share * (high - low)
 
 
-@wp.kernel
-def _decode_elements_kernel(
-    genes: wp.array2d[float], numbers: wp.array[int], ranges: wp.array2d[wp.vec3], lead: wp.vec3,
+@kernel_over("elements_out")
+def _decode_elements(
+    genes: wp.array2d[float],
+    numbers: wp.array[int],
+    ranges: wp.array2d[wp.vec3],
+    lead: wp.vec3,
     elements_out: wp.array2d[Element],
-):  # fmt: skip
+):
     """Grid (num_terrains, 6)."""
     t, e = wp.tid()
     g = e * GENES_PER_ELEMENT
@@ -200,8 +205,8 @@ def _make_kernels(kinds: Kinds) -> tuple[Any, Any]:
             col += element.cells
             ground += element.rise
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def rasterise_kernel(elements: wp.array2d[Element], factor: float, heights_out: wp.array3d[float]):
+    @kernel_over("heights_out", module="unique")
+    def rasterise(elements: wp.array2d[Element], factor: float, heights_out: wp.array3d[float]):
         """Grid (num_terrains, nrow, ncol)."""
         t, row, col = wp.tid()
         height = float(0.0)
@@ -217,7 +222,7 @@ def _make_kernels(kinds: Kinds) -> tuple[Any, Any]:
                         height = element.ground + wp.static(reliefs[k])(element, s, row)
         heights_out[t, row, col] = factor * height
 
-    return lay_kernel, rasterise_kernel
+    return lay_kernel, rasterise
 
 
 @cache
@@ -241,8 +246,8 @@ def lay_out(genes: Any, all_kinds: Kinds, kinds: Sequence[ElementKind]) -> Any:
             f"elements of {GENES_PER_ELEMENT}"
         )
     elements = wp.empty((genes.shape[0], MAX_ELEMENTS), dtype=Element, device=genes.device)
-    inputs = [genes, *_make_tables(all_kinds, tuple(kinds), str(genes.device)), wp.vec3(*map(float, LEAD[:3]))]
-    wp.launch(_decode_elements_kernel, elements.shape, inputs, outputs=[elements], device=genes.device)
+    tables = _make_tables(all_kinds, tuple(kinds), str(genes.device))
+    _decode_elements(genes, *tables, wp.vec3(*map(float, LEAD[:3])), elements)
     lay_elements(elements, all_kinds, FIRST_COL)
     return elements
 
@@ -253,7 +258,7 @@ def lay_elements(elements: Any, all_kinds: Kinds, first_col: int = 0) -> None:
     Of :class:`Element`, shape (num_terrains, num_elements), they have kind, first, size, length, detail and turn. One
     that does not fit before x = 12 m is cut, or becomes flat.
     """
-    wp.launch(_make_kernels(all_kinds)[0], elements.shape[0], [first_col], outputs=[elements], device=elements.device)
+    wp.launch(_make_kernels(all_kinds)[0], len(elements), [first_col, elements], device=elements.device)
 
 
 def rasterise_elements(elements: Any, all_kinds: Kinds, heights_out: Any, factor: float = 1.0) -> None:
@@ -267,5 +272,4 @@ def rasterise_elements(elements: Any, all_kinds: Kinds, heights_out: Any, factor
             f"heights_out must have shape ({elements.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}: "
             "one grid per course"
         )
-    inputs, size = [elements, factor], heights_out.shape
-    wp.launch(_make_kernels(all_kinds)[1], size, inputs, outputs=[heights_out], device=elements.device)
+    _make_kernels(all_kinds)[1](elements, factor, heights_out)

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels import lanes
+from kernels.launch import fill_snippet, launch_lanes
 
 LANES = 16  # two robots a warp: few bodies of a robot are at the same depth
 _BODY = Path(__file__).with_suffix(".cu")
@@ -117,7 +117,7 @@ class TreeSizes:
 
 @cache
 def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
-    snippet = lanes.snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **asdict(sizes), **dict(codes))
+    snippet = fill_snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **asdict(sizes), **dict(codes))
 
     @wp.func_native(snippet=snippet)
     def find_one(tree: Tree, robots: Robots, thread: int): ...
@@ -133,9 +133,8 @@ def _kernel(sizes: TreeSizes, codes: tuple[tuple[str, Any], ...]) -> Any:
 def find_dynamics(tree: Tree, robots: Robots, sizes: TreeSizes, codes: dict[str, Any]) -> None:
     """Compute poses, inertias and all forces but those of constraints, of every world.
 
-    The shared memory of ``sizes`` must pass :func:`kernels.lanes.fits_block` with ``LANES``. ``codes`` are the solver's
-    numbers of the joint types, by their names in dynamics.cu.
+    The shared memory of ``sizes`` must pass :func:`kernels.launch.fits_block` with ``LANES``. ``codes`` are the
+    solver's numbers of the joint types, by their names in dynamics.cu.
     """
     kernel = _kernel(sizes, tuple(codes.items()))
-    num_worlds = robots.qpos.shape[0]
-    lanes.launch(kernel, num_worlds, [tree, robots], lanes=LANES, device=robots.qpos.device)
+    launch_lanes(kernel, len(robots.qpos), [tree, robots], lanes=LANES, device=robots.qpos.device)

@@ -1,22 +1,12 @@
 """An episode on the device, in crossings and in training: its task, its command, and the latch that ends it."""
 
 from enum import IntEnum
-from typing import Any
 
 import warp as wp
 
+from kernels.launch import kernel_over, make_zeros
 from kernels.penalties import max_base_force
-from kernels.state import (
-    RobotStep,
-    base_position,
-    base_rotation,
-    base_yaw,
-    is_too_fast,
-    make_zeros,
-    projected_gravity,
-    row_is_finite,
-    wrap_angle,
-)
+from kernels.state import RobotStep, base_pose, base_yaw, is_too_fast, projected_gravity, row_is_finite, wrap_angle
 
 
 class Outcome(IntEnum):
@@ -114,17 +104,12 @@ def begin_episode(env: int, episodes_out: Episodes):
     episodes_out.final_pose[env] = wp.transform_identity()
 
 
-@wp.kernel
-def _begin_episodes_kernel(mask: wp.array[int], episodes_out: Episodes):
-    """Grid (num_envs,)."""
+@kernel_over("mask")
+def begin_episodes(mask: wp.array[int], episodes_out: Episodes):
+    """Grid (num_envs,): set episodes running where the mask is not 0; moves no robot."""
     env = wp.tid()
     if mask[env] != 0:
         begin_episode(env, episodes_out)
-
-
-def begin_episodes(mask: Any, episodes_out: Episodes) -> None:
-    """Set episodes running where the int ``mask`` (num_envs,) is not 0; moves no robot."""
-    wp.launch(_begin_episodes_kernel, mask.shape[0], inputs=[mask], outputs=[episodes_out], device=mask.device)
 
 
 @wp.func
@@ -139,23 +124,15 @@ def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
     )
 
 
-@wp.kernel
-def _command_goal_kernel(
-    joint_q: wp.array2d[float], outcome: wp.array[int], task: Task, command_out: wp.array2d[float]
-):
-    """Grid (num_envs,)."""
+@kernel_over("outcome")
+def command_goal(joint_q: wp.array2d[float], outcome: wp.array[int], task: Task, command_out: wp.array2d[float]):
+    """Grid (num_envs,): write each environment's command, zero once its episode has ended."""
     env = wp.tid()
     command = wp.vec3(0.0)
     if outcome[env] == Outcome.RUNNING:
         command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), task)
     for k in range(3):
         command_out[env, k] = command[k]
-
-
-def command_goal(joint_q: Any, outcome: Any, task: Task, command_out: Any) -> None:
-    """Write each environment's command, zero once its episode has ended; shape (num_envs, 3)."""
-    inputs = [joint_q, outcome, task]
-    wp.launch(_command_goal_kernel, outcome.shape[0], inputs, outputs=[command_out], device=joint_q.device)
 
 
 @wp.func
@@ -181,40 +158,33 @@ def judge_state(step: RobotStep, base_force: float, invalidity: int, steps: int,
         return int(Outcome.BASE_COLLISION)
     if projected_gravity(step.joint_q, env)[2] > task.max_gravity_z:
         return int(Outcome.TILT)
-    position = base_position(step.joint_q, env)
-    if wp.length(task.goal - wp.vec2(position[0], position[1])) < task.goal_radius:
+    x = step.joint_q[env, 0]
+    y = step.joint_q[env, 1]
+    if wp.length(task.goal - wp.vec2(x, y)) < task.goal_radius:
         return int(Outcome.GOAL)
-    left_sideways = position[1] < task.lower[1] or position[1] > task.upper[1]
-    if left_sideways or position[0] < task.lower[0] or position[0] > task.upper[0]:
+    if x < task.lower[0] or x > task.upper[0] or y < task.lower[1] or y > task.upper[1]:
         return int(Outcome.OUT)
     if steps >= task.max_steps:
         return int(Outcome.TIME_OUT)
     return int(Outcome.RUNNING)
 
 
-@wp.kernel
-def _note_base_forces_kernel(step: RobotStep, episodes_out: Episodes):
-    """Grid (num_envs,)."""
+@kernel_over("episodes_out.base_force")
+def note_base_forces(step: RobotStep, episodes_out: Episodes):
+    """Grid (num_envs,): raise ``base_force`` to the force on the base, after a physics step that is not judged."""
     env = wp.tid()
-    force = max_base_force(step.geom_force, step.geom_role, env)
-    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], force)
+    episodes_out.base_force[env] = wp.max(episodes_out.base_force[env], max_base_force(step, env))
 
 
-def note_base_forces(step: RobotStep, episodes_out: Episodes) -> None:
-    """Raise ``base_force`` to the contact force on the base, after a physics step that is not judged."""
-    forces = step.geom_force
-    wp.launch(_note_base_forces_kernel, forces.shape[0], [step], outputs=[episodes_out], device=forces.device)
-
-
-@wp.kernel
-def _latch_outcomes_kernel(step: RobotStep, task: Task, episodes_out: Episodes):
-    """Grid (num_envs,)."""
+@kernel_over("episodes_out.outcome")
+def latch_outcomes(step: RobotStep, task: Task, episodes_out: Episodes):
+    """Grid (num_envs,): judge every running episode after a step and latch its end; clear the noted ``base_force``."""
     env = wp.tid()
     episodes_out.counted[env] = 0
     if episodes_out.outcome[env] != Outcome.RUNNING:
         return
     steps = episodes_out.steps[env] + 1
-    force = wp.max(episodes_out.base_force[env], max_base_force(step.geom_force, step.geom_role, env))
+    force = wp.max(episodes_out.base_force[env], max_base_force(step, env))
     invalidity = find_invalidity(step, task, env)
     outcome = judge_state(step, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
@@ -224,17 +194,11 @@ def _latch_outcomes_kernel(step: RobotStep, task: Task, episodes_out: Episodes):
     if outcome != Outcome.RUNNING:
         episodes_out.outcome[env] = outcome
         episodes_out.invalidity[env] = invalidity
-        episodes_out.final_pose[env] = wp.transform(base_position(step.joint_q, env), base_rotation(step.joint_q, env))
+        episodes_out.final_pose[env] = base_pose(step.joint_q, env)
 
 
-def latch_outcomes(step: RobotStep, task: Task, episodes_out: Episodes) -> None:
-    """Judge every running episode after a step and latch its end; clear the noted ``base_force``."""
-    num_envs = step.overflow.shape[0]
-    wp.launch(_latch_outcomes_kernel, num_envs, [step, task], outputs=[episodes_out], device=step.overflow.device)
-
-
-@wp.kernel
-def _park_ended_kernel(
+@kernel_over("outcome")
+def park_ended(
     outcome: wp.array[int],
     default_joint_pos: wp.array[float],
     joint_q_out: wp.array2d[float],
@@ -242,7 +206,11 @@ def _park_ended_kernel(
     targets_out: wp.array2d[float],
     parked_out: wp.array[int],
 ):
-    """Grid (num_envs,)."""
+    """Grid (num_envs,): hold robots whose episodes have ended at rest, high up, where they touch nothing.
+
+    ``parked_out`` says for how many control steps they have been there, 2 for more. From then on the physics leaves
+    them out. Call it every control step.
+    """
     env = wp.tid()
     if outcome[env] == Outcome.RUNNING:
         parked_out[env] = 0
@@ -257,16 +225,3 @@ def _park_ended_kernel(
     for j in range(default_joint_pos.shape[0]):
         joint_q_out[env, 7 + j] = default_joint_pos[j]
         targets_out[env, 7 + j] = default_joint_pos[j]
-
-
-def park_ended(
-    outcome: Any, default_joint_pos: Any, joint_q_out: Any, joint_qd_out: Any, targets_out: Any, parked_out: Any
-) -> None:
-    """Hold the robots whose episodes have ended at rest, high above the ground, where they touch nothing.
-
-    ``parked_out`` (num_envs,) says for how many control steps they have been there, 2 for more. From then on the
-    physics leaves them out. Call it every control step.
-    """
-    inputs = [outcome, default_joint_pos]
-    outputs = [joint_q_out, joint_qd_out, targets_out, parked_out]
-    wp.launch(_park_ended_kernel, outcome.shape[0], inputs, outputs=outputs, device=outcome.device)

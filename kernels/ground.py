@@ -6,9 +6,9 @@ constant of a contact [s], critically damped, at MuJoCo's constant impedance: at
 grows with the time constant's square.
 """
 
-from typing import Any
-
 import warp as wp
+
+from kernels.launch import kernel_over
 
 ROWS, COLS = 4, 8
 """Patches along y and along x."""
@@ -51,43 +51,23 @@ def _share(gene: float) -> float:
     return (wp.clamp(gene, -1.0, 1.0) + 1.0) * 0.5
 
 
-@wp.kernel
-def _decode_friction_kernel(genes: wp.array2d[float], friction_out: wp.array3d[float]):
-    """Grid (num_terrains, 4, 8)."""
+@kernel_over("friction_out")
+def decode_friction(genes: wp.array2d[float], friction_out: wp.array3d[float]):
+    """Grid (num_terrains, 4, 8): genes, shape (num_terrains, 32), as a map of friction, linear from the least to 1."""
     t, row, col = wp.tid()
     missing = 1.0 - _share(genes[t, row * COLS + col])
     friction_out[t, row, col] = 1.0 - missing * (1.0 - MIN_FRICTION)
 
 
-@wp.kernel
-def _decode_softness_kernel(genes: wp.array2d[float], time_constant_out: wp.array3d[float]):
-    """Grid (num_terrains, 4, 8)."""
+@kernel_over("time_constant_out")
+def decode_softness(genes: wp.array2d[float], time_constant_out: wp.array3d[float]):
+    """Grid (num_terrains, 4, 8): genes as time constants [s]; equal steps are equal ratios."""
     t, row, col = wp.tid()
     share = _share(genes[t, row * COLS + col])
     tau = FIRM
     if share > 0.0:
         tau = MIN_TIME_CONSTANT_S * wp.pow(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S, share)
     time_constant_out[t, row, col] = tau
-
-
-def decode_friction(genes: Any, friction_out: Any) -> None:
-    """Turn genes, shape (num_terrains, 32), into a map of friction: linear from the least to 1."""
-    _decode(_decode_friction_kernel, genes, friction_out)
-
-
-def decode_softness(genes: Any, time_constant_out: Any) -> None:
-    """Turn genes, shape (num_terrains, 32), into time constants [s]: equal steps are equal ratios."""
-    _decode(_decode_softness_kernel, genes, time_constant_out)
-
-
-def _decode(kernel: Any, genes: Any, values_out: Any) -> None:
-    expected = (genes.shape[0], ROWS, COLS)
-    if genes.shape[1] != NUM_PATCHES or tuple(values_out.shape) != expected:
-        raise ValueError(
-            f"a map must have shape {expected} and {NUM_PATCHES} genes a terrain, got {tuple(values_out.shape)} and "
-            f"genes of shape {tuple(genes.shape)}"
-        )
-    wp.launch(kernel, expected, [genes], outputs=[values_out], device=genes.device)
 
 
 def make_ground(num_terrains: int, device: str) -> Ground:

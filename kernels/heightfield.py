@@ -6,9 +6,9 @@ other one (:mod:`sim.terrains.maps.hfield` hands it the same surface). Beyond th
 node continues.
 """
 
-from typing import Any
-
 import warp as wp
+
+from kernels.launch import kernel_over
 
 BLOCK = 8
 """Cells along each side of a block of the ceiling grid."""
@@ -132,22 +132,6 @@ def nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.ve
 
 
 @wp.func
-def nearest_in_cell(terrain: Terrain, h00: float, h10: float, h01: float, h11: float, x: float, y: float,
-                    p: wp.vec3, nearest: wp.vec3) -> wp.vec3:  # fmt: skip
-    """The nearer to ``p`` of ``nearest`` and the two triangles of the cell with low corner (x, y) [m]."""
-    low_high = wp.vec3(x, y + terrain.spacing, h01)
-    high_low = wp.vec3(x + terrain.spacing, y, h10)
-    first = nearest_on_triangle(p, wp.vec3(x, y, h00), high_low, low_high)
-    second = nearest_on_triangle(p, wp.vec3(x + terrain.spacing, y + terrain.spacing, h11), low_high, high_low)
-    best = nearest
-    if wp.length_sq(p - first) < wp.length_sq(p - best):
-        best = first
-    if wp.length_sq(p - second) < wp.length_sq(p - best):
-        best = second
-    return best
-
-
-@wp.func
 def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) -> SurfacePoint:
     """Nearest point of the triangulated surface within ``reach`` [m] of ``p`` (world-local), exact over all cells.
 
@@ -169,7 +153,15 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
                 searched = True
                 x = float(col) * terrain.spacing
                 y = float(row) * terrain.spacing
-                nearest = nearest_in_cell(terrain, h00, h10, h01, h11, x, y, p, nearest)
+                low_high = wp.vec3(x, y + terrain.spacing, h01)
+                high_low = wp.vec3(x + terrain.spacing, y, h10)
+                first = nearest_on_triangle(p, wp.vec3(x, y, h00), high_low, low_high)
+                high_high = wp.vec3(x + terrain.spacing, y + terrain.spacing, h11)
+                second = nearest_on_triangle(p, high_high, low_high, high_low)
+                if wp.length_sq(p - first) < wp.length_sq(p - nearest):
+                    nearest = first
+                if wp.length_sq(p - second) < wp.length_sq(p - nearest):
+                    nearest = second
     point = SurfacePoint()
     point.normal = wp.vec3(0.0, 0.0, 1.0)
     point.distance = _FAR
@@ -191,9 +183,9 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
     return point
 
 
-@wp.kernel
-def _max_blocks_kernel(heights: wp.array3d[float], ceilings_out: wp.array3d[float]):
-    """Grid (num_terrains, block rows, block cols)."""
+@kernel_over("ceilings_out")
+def max_blocks(heights: wp.array3d[float], ceilings_out: wp.array3d[float]):
+    """Grid (num_terrains, block rows, block cols): the highest node [m] of each block, shape :func:`ceiling_shape`."""
     t, block_row, block_col = wp.tid()
     highest = float(-1.0e6)
     for i in range(BLOCK + 1):
@@ -207,14 +199,3 @@ def _max_blocks_kernel(heights: wp.array3d[float], ceilings_out: wp.array3d[floa
 def ceiling_shape(num_terrains: int, nrow: int, ncol: int) -> tuple[int, int, int]:
     """Shape of the ceiling grid of ``num_terrains`` grids of ``nrow`` x ``ncol`` nodes."""
     return num_terrains, -(-(nrow - 1) // BLOCK), -(-(ncol - 1) // BLOCK)
-
-
-def max_blocks(heights: Any, ceilings_out: Any) -> None:
-    """Write the highest node of each block of ``heights`` (num_terrains, nrow, ncol) [m] to ``ceilings_out``."""
-    expected = ceiling_shape(*heights.shape)
-    if tuple(ceilings_out.shape) != expected:
-        raise ValueError(
-            f"ceilings_out must have shape {expected} for heights {tuple(heights.shape)}, got {ceilings_out.shape}: "
-            "allocate it with ceiling_shape()"
-        )
-    wp.launch(_max_blocks_kernel, dim=expected, inputs=[heights], outputs=[ceilings_out], device=heights.device)

@@ -5,11 +5,10 @@ frame, x 0.25), projected gravity (3), command vx, vy, yaw rate (3, x 2, 2, 0.25
 joint rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5.
 """
 
-from typing import Any
-
 import warp as wp
 
 from kernels.heightfield import Terrain, height_at
+from kernels.launch import kernel_over
 from kernels.state import base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 
 NUM_BASE_COLUMNS = 12
@@ -91,8 +90,8 @@ def noise_width(noise: Noise, k: int, num_joints: int) -> float:
     return noise.scan * SCAN_SCALE
 
 
-@wp.kernel
-def _write_observation_kernel(
+@kernel_over("observation_out")
+def write_observation(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
     command: wp.array2d[float],
@@ -104,7 +103,10 @@ def _write_observation_kernel(
     noise_seed: wp.array[int],
     observation_out: wp.array2d[float],
 ):
-    """Grid (num_envs, num_columns)."""
+    """Grid (num_envs, 12 + 3 * num_joints + num_scan_points): write one row an environment (columns: module docstring).
+
+    The command is in the base's yaw frame; ``noise_seed`` is one integer that the caller advances, shape (1,).
+    """
     env, k = wp.tid()
     num_joints = last_action.shape[1]
     column = float(0.0)
@@ -126,43 +128,21 @@ def _write_observation_kernel(
     observation_out[env, k] = wp.clamp(column, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-def write_observation(
-    joint_q: Any, joint_qd: Any, command: Any, last_action: Any, terrain_of_env: Any, terrain: Terrain,
-    sensors: Sensors, noise: Noise, noise_seed: Any, observation_out: Any,
-) -> None:  # fmt: skip
-    """Write one observation row an environment (columns: module docstring).
+@kernel_over("action")
+def apply_action(
+    action: wp.array2d[float],
+    sensors: Sensors,
+    scale: float,
+    last_action_out: wp.array2d[float],
+    targets_out: wp.array2d[float],
+):
+    """Grid (num_envs, num_joints): turn actions into targets [rad], default pose + ``scale`` * clip(action, -100, 100).
 
-    The command is in the base's yaw frame. ``noise_seed`` is one integer on the device that the caller advances, shape
-    (1,); ``observation_out`` has shape (num_envs, 12 + 3 * num_joints + num_scan_points).
+    One that is not finite becomes NaN, and its episode invalid. ``last_action_out`` is the clipped action.
     """
-    num_envs, num_joints = last_action.shape
-    expected = (num_envs, NUM_BASE_COLUMNS + 3 * num_joints + sensors.scan_x.shape[0])
-    if tuple(observation_out.shape) != expected:
-        raise ValueError(f"observation_out must have shape {expected}, got {tuple(observation_out.shape)}")
-    inputs = [joint_q, joint_qd, command, last_action, terrain_of_env, terrain, sensors, noise, noise_seed]
-    wp.launch(_write_observation_kernel, expected, inputs, outputs=[observation_out], device=joint_q.device)
-
-
-@wp.kernel
-def _apply_action_kernel(
-    action: wp.array2d[float], default_joint_pos: wp.array[float], scale: float,
-    last_action_out: wp.array2d[float], targets_out: wp.array2d[float],
-):  # fmt: skip
-    """Grid (num_envs, num_joints)."""
     env, joint = wp.tid()
     clipped = wp.clamp(action[env, joint], -ACTION_LIMIT, ACTION_LIMIT)
     if not wp.isfinite(action[env, joint]):  # of which clamp would make a limit: a wild action, but a valid one
         clipped = wp.nan
     last_action_out[env, joint] = clipped
-    targets_out[env, 7 + joint] = default_joint_pos[joint] + scale * clipped
-
-
-def apply_action(action: Any, sensors: Sensors, scale: float, last_action_out: Any, targets_out: Any) -> None:
-    """Turn actions into joint position targets [rad]: default pose + ``scale`` * clip(action, -100, 100).
-
-    One that is not finite becomes NaN, and its episode invalid. ``last_action_out`` is the clipped action.
-    """
-    if tuple(action.shape) != tuple(last_action_out.shape):
-        raise ValueError(f"action must have shape {tuple(last_action_out.shape)}, got {tuple(action.shape)}")
-    inputs = [action, sensors.default_joint_pos, scale]
-    wp.launch(_apply_action_kernel, action.shape, inputs, outputs=[last_action_out, targets_out], device=action.device)
+    targets_out[env, 7 + joint] = sensors.default_joint_pos[joint] + scale * clipped

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from kernels.launch import kernel_over
 from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b
 
 BASE = 1
@@ -24,33 +25,12 @@ COLLISION_FORCE = wp.constant(0.1)
 
 
 @wp.func
-def excess_contact_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], limit: float, env: int) -> float:
-    """Sum over the feet of the contact force beyond ``limit`` [N]."""
-    excess = float(0.0)
-    for g in range(geom_role.shape[0]):
-        if (geom_role[g] & FOOT) != 0:
-            excess += wp.max(0.0, wp.length(geom_force[env, g]) - limit)
-    return excess
-
-
-@wp.func
-def is_stumbling(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
-    """1 if the contact force of any foot is more horizontal than 5 to 1 (it hits a vertical surface), else 0."""
-    stumbling = float(0.0)
-    for g in range(geom_role.shape[0]):
-        force = geom_force[env, g]
-        if (geom_role[g] & FOOT) != 0 and wp.length(wp.vec2(force[0], force[1])) > STUMBLE_RATIO * wp.abs(force[2]):
-            stumbling = 1.0
-    return stumbling
-
-
-@wp.func
-def max_base_force(geom_force: wp.array2d[wp.vec3], geom_role: wp.array[int], env: int) -> float:
+def max_base_force(step: RobotStep, env: int) -> float:
     """Largest contact force on a base geom [N]."""
     largest = float(0.0)
-    for g in range(geom_role.shape[0]):
-        if (geom_role[g] & BASE) != 0:
-            largest = wp.max(largest, wp.length(geom_force[env, g]))
+    for g in range(step.geom_role.shape[0]):
+        if (step.geom_role[g] & BASE) != 0:
+            largest = wp.max(largest, wp.length(step.geom_force[env, g]))
     return largest
 
 
@@ -173,15 +153,25 @@ def _vel_y(step: RobotStep, env: int) -> float:
     unit="N s",
     color="#000000",
 )
-def _contact_force(step: RobotStep, env: int) -> float:
+def excess_contact_force(step: RobotStep, env: int) -> float:
     """Sum over the feet of the contact force beyond the limit [N]."""
-    return excess_contact_force(step.geom_force, step.geom_role, step.force_limit, env)
+    excess = float(0.0)
+    for g in range(step.geom_role.shape[0]):
+        if (step.geom_role[g] & FOOT) != 0:
+            excess += wp.max(0.0, wp.length(step.geom_force[env, g]) - step.force_limit)
+    return excess
 
 
 @penalty("stumble", plain=_plain_stumble, label="stumble", unit="s", color="#e69f00")
-def _stumble(step: RobotStep, env: int) -> float:
-    """1 if any foot hits a vertical surface, else 0."""
-    return is_stumbling(step.geom_force, step.geom_role, env)
+def is_stumbling(step: RobotStep, env: int) -> float:
+    """1 if the contact force of any foot is more horizontal than 5 to 1 (it hits a vertical surface), else 0."""
+    stumbling = float(0.0)
+    for g in range(step.geom_role.shape[0]):
+        force = step.geom_force[env, g]
+        sideways = wp.length(wp.vec2(force[0], force[1]))
+        if (step.geom_role[g] & FOOT) != 0 and sideways > STUMBLE_RATIO * wp.abs(force[2]):
+            stumbling = 1.0
+    return stumbling
 
 
 @penalty(
@@ -203,19 +193,19 @@ def _collision(step: RobotStep, env: int) -> float:
 
 
 @cache
-def _kernel(functions: tuple[Any, ...]) -> Any:
+def _make_launcher(functions: tuple[Any, ...]) -> Callable[..., None]:
     count = len(functions)
     options = {"max_unroll": max(16, count)}  # the loop calls another function each time
 
-    @wp.kernel(module="unique", module_options=options)
-    def add_penalties_kernel(step: RobotStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
+    @kernel_over("counted", module="unique", module_options=options)
+    def add_penalties(step: RobotStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
         """Grid (num_envs,)."""
         env = wp.tid()
         if counted[env] != 0:
             for k in range(wp.static(count)):
                 sums_out[env, k] += dt * wp.static(functions[k])(step, env)
 
-    return add_penalties_kernel
+    return add_penalties
 
 
 def add_penalties(step: RobotStep, dt: float, counted: Any, sums_out: Any) -> None:
@@ -223,11 +213,4 @@ def add_penalties(step: RobotStep, dt: float, counted: Any, sums_out: Any) -> No
 
     Where the int ``counted`` (num_envs,) is 0, nothing is added.
     """
-    expected = (counted.shape[0], len(PENALTIES))
-    if tuple(sums_out.shape) != expected:
-        raise ValueError(
-            f"sums_out must have shape {expected}, one column for each of {', '.join(PENALTIES)}, "
-            f"got {tuple(sums_out.shape)}"
-        )
-    kernel = _kernel(tuple(entry.function for entry in PENALTIES.values()))
-    wp.launch(kernel, counted.shape[0], inputs=[step, dt, counted], outputs=[sums_out], device=sums_out.device)
+    _make_launcher(tuple(entry.function for entry in PENALTIES.values()))(step, dt, counted, sums_out)

@@ -1,22 +1,26 @@
-"""The queue of episodes: a robot whose episode has ended stores its result and takes the next one.
+"""The queue of episodes: a robot whose episode has ended stores its result, takes the next one and starts anew.
 
 Any number of episodes runs through a fixed number of robots, on the device, without the host. Which robot takes which
 episode changes nothing: a start depends on the terrain's seed and the number of the replica alone.
 
 The terrains are a ring of slots. New terrains take the slots behind the former ones: episode number ``n`` since the
 ring was empty is replica ``n % num_replicas`` of slot ``n // num_replicas % num_slots``.
+
+In training, too, a robot restarts at a randomised start without memory of the episode before.
 """
 
 from typing import Any
 
 import warp as wp
 
-from kernels.episode import Episodes, Outcome
+from kernels.episode import Episodes, Outcome, begin_episode
+from kernels.heightfield import Terrain, node_height
+from kernels.launch import kernel_over, make_zeros
+from kernels.observation import Sensors
 from kernels.rewards import Rewards
-from kernels.state import make_zeros
+from kernels.state import velocity_beside
 
-_TAKEN = wp.constant(0)
-_READY = wp.constant(1)
+_CLEARING_THREADS = 64  # a row
 
 
 @wp.struct
@@ -25,8 +29,10 @@ class EpisodeQueue:
 
     num_replicas: int
     """Episodes of a terrain."""
-    counts: wp.array[int]
-    """Episodes taken and episodes ready to be taken since the ring was empty, less whole rounds of it; shape (2,)."""
+    taken: wp.array[int]
+    """Episodes taken since the ring was empty, less whole rounds of it; shape (1,)."""
+    ready: wp.array[int]
+    """Episodes that may be taken, counted likewise; shape (1,)."""
     seed: wp.array[wp.uint32]
     """Seed of each slot's terrain, shape (num_slots,)."""
     num_ended: wp.array[int]
@@ -56,7 +62,7 @@ def make_queue(
 ) -> EpisodeQueue:
     """Allocate an empty queue for ``num_slots`` terrains at once; ``rewarded`` queues keep rewards too."""
     rows = num_slots * num_replicas
-    shapes = {"counts": 2, "penalty_sums": (rows, num_penalties), "reward": rows if rewarded else 0}
+    shapes = {"taken": 1, "ready": 1, "penalty_sums": (rows, num_penalties), "reward": rows if rewarded else 0}
     shapes |= dict.fromkeys(("seed", "num_ended"), num_slots)
     shapes |= dict.fromkeys(("episode_of_env", "begins", "busy"), num_envs)
     shapes |= dict.fromkeys(("outcome", "invalidity", "steps", "final_pose"), rows)
@@ -91,17 +97,17 @@ def _store_result(
 @wp.func
 def _take_next(queue_out: EpisodeQueue) -> int:
     """Row of the next episode, -1 where none is ready."""
-    ready = queue_out.counts[_READY]
-    if queue_out.counts[_TAKEN] >= ready:  # waiting robots must not increment it for ever
+    ready = queue_out.ready[0]
+    if queue_out.taken[0] >= ready:  # waiting robots must not increment it for ever
         return -1
-    number = wp.atomic_add(queue_out.counts, _TAKEN, 1)
+    number = wp.atomic_add(queue_out.taken, 0, 1)
     if number >= ready:
         return -1
     return number % (queue_out.seed.shape[0] * queue_out.num_replicas)
 
 
-@wp.kernel
-def _turn_over_kernel(
+@kernel_over("stepped")
+def turn_over(
     stepped: wp.array[int],
     rewards: Rewards,
     episodes_out: Episodes,
@@ -109,7 +115,13 @@ def _turn_over_kernel(
     terrain_of_env_out: wp.array[int],
     queue_out: EpisodeQueue,
 ):
-    """Grid (num_envs,)."""
+    """Grid (num_envs,): store the results of the episodes that ended, and let their robots take the next ones.
+
+    It moves no robot: :func:`restart_episodes` does, where ``begins`` is 1.
+
+    ``stepped`` is the outcome that ends a robot's stepping; it differs from ``episodes_out.outcome`` where a robot goes
+    on after its crossing has ended. Where an episode begins, ``rng`` and terrain are written and penalty sums are zero.
+    """
     env = wp.tid()
     queue_out.begins[env] = 0
     row = queue_out.episode_of_env[env]
@@ -132,33 +144,127 @@ def _turn_over_kernel(
         penalty_sums_out[env, k] = 0.0
 
 
-def turn_over(
-    stepped: Any, rewards: Rewards, episodes_out: Episodes, penalty_sums_out: Any, terrain_of_env_out: Any,
-    queue_out: EpisodeQueue,
-) -> None:  # fmt: skip
-    """Store the results of the episodes that ended, and let their robots take the next ones.
-
-    It moves no robot: :func:`kernels.restart.restart_episodes` does, where ``begins`` is 1.
-
-    ``stepped`` is the outcome that ends a robot's stepping; it differs from ``episodes_out.outcome`` where a robot goes
-    on after its crossing has ended. Where an episode begins, ``rng`` and terrain are written and penalty sums are zero.
-    """
-    outputs = [episodes_out, penalty_sums_out, terrain_of_env_out, queue_out]
-    wp.launch(_turn_over_kernel, stepped.shape[0], [stepped, rewards], outputs=outputs, device=stepped.device)
-
-
-@wp.kernel
-def _make_ready_kernel(count: int, queue_out: EpisodeQueue):
-    """Grid (1,)."""
-    ready = queue_out.counts[_READY]
-    taken = wp.min(queue_out.counts[_TAKEN], ready)  # robots that found none have incremented it
+@kernel_over("queue_out.ready")
+def make_ready(count: int, queue_out: EpisodeQueue):
+    """Grid (1,): let robots take ``count`` more episodes."""
+    ready = queue_out.ready[0]
+    taken = wp.min(queue_out.taken[0], ready)  # robots that found none have incremented it
     # Whole rounds change no row; left in, they would outgrow an int in a search of many days.
     size = queue_out.seed.shape[0] * queue_out.num_replicas
     rounds = taken // size * size
-    queue_out.counts[_TAKEN] = taken - rounds
-    queue_out.counts[_READY] = ready - rounds + count
+    queue_out.taken[0] = taken - rounds
+    queue_out.ready[0] = ready - rounds + count
 
 
-def make_ready(count: int, queue_out: EpisodeQueue) -> None:
-    """Let robots take ``count`` more episodes."""
-    wp.launch(_make_ready_kernel, 1, inputs=[count], outputs=[queue_out], device=queue_out.counts.device)
+@wp.struct
+class StartRanges:
+    """Randomised start of an episode: half widths round the nominal start, uniform."""
+
+    position: wp.vec2
+    """Nominal start, world-local x, y [m]."""
+    position_range: float
+    ahead: float
+    """Starts are up to this further along x, uniform [m]."""
+    yaw_range: float
+    joint_scale_range: float
+    """Joint angles are the default pose times 1 +- this."""
+    velocity_range: float
+    """Each component of the base's linear [m/s] and angular [rad/s] velocity, world frame."""
+    base_height: float
+    """Base height over the highest ground under the robot [m]."""
+    footprint: wp.vec2
+    """Half length and half width of the ground under the robot [m]."""
+
+
+@wp.func
+def highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> float:
+    """Highest node [m] of the world-local rectangle ``centre`` +- ``half`` [m]."""
+    col0 = int(wp.floor((centre[0] - half[0]) / terrain.spacing))
+    col1 = int(wp.ceil((centre[0] + half[0]) / terrain.spacing))
+    row0 = int(wp.floor((centre[1] - half[1]) / terrain.spacing))
+    row1 = int(wp.ceil((centre[1] + half[1]) / terrain.spacing))
+    highest = node_height(terrain, t, row0, col0)
+    for row in range(row0, row1 + 1):
+        for col in range(col0, col1 + 1):
+            highest = wp.max(highest, node_height(terrain, t, row, col))
+    return highest
+
+
+@wp.func
+def _write_start(
+    rng: wp.uint32, terrain: Terrain, t: int, ranges: StartRanges, sensors: Sensors, env: int,
+    joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float],
+):  # fmt: skip
+    """Write the joint coordinates and velocities of a start drawn from ``rng`` (base velocity: at the link origin)."""
+    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    if ranges.ahead > 0.0:  # else no number is drawn, and starts are those of a crossing
+        x += ranges.ahead * wp.randf(rng)
+    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
+    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
+    joint_q_out[env, 0] = x
+    joint_q_out[env, 1] = y
+    joint_q_out[env, 2] = ranges.base_height + highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
+    for k in range(4):
+        joint_q_out[env, 3 + k] = rotation[k]
+    for j in range(sensors.default_joint_pos.shape[0]):
+        scale = 1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0)
+        joint_q_out[env, 7 + j] = sensors.default_joint_pos[j] * scale
+        joint_qd_out[env, 6 + j] = 0.0
+    v = ranges.velocity_range
+    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    com_velocity = velocity_beside(lin_vel, ang_vel, rotation, sensors.base_com)
+    for k in range(3):
+        joint_qd_out[env, k] = com_velocity[k]
+        joint_qd_out[env, 3 + k] = ang_vel[k]
+
+
+@kernel_over("mask")
+def restart_episodes(
+    mask: wp.array[int],
+    terrain_of_env: wp.array[int],
+    terrain: Terrain,
+    ranges: StartRanges,
+    sensors: Sensors,
+    joint_q_out: wp.array2d[float],
+    joint_qd_out: wp.array2d[float],
+    last_action_out: wp.array2d[float],
+    episodes_out: Episodes,
+    rewards_out: Rewards,
+):
+    """Grid (num_envs,): put robots at a new randomised start where the mask is not 0, and clear their memory.
+
+    Starts are drawn from ``rng`` of the episodes, which run from then on. ``rewards_out`` is empty where nothing is
+    rewarded.
+    """
+    env = wp.tid()
+    if mask[env] == 0:
+        return
+    _write_start(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
+    episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
+    begin_episode(env, episodes_out)
+    for j in range(last_action_out.shape[1]):
+        last_action_out[env, j] = 0.0
+    if rewards_out.total.shape[0] == 0:
+        return
+    rewards_out.running[env] = 1
+    rewards_out.total[env] = 0.0
+    for g in range(rewards_out.air_time.shape[1]):
+        rewards_out.air_time[env, g] = 0.0
+        rewards_out.touched[env, g] = 0
+
+
+@wp.kernel
+def _clear_rows_kernel(mask: wp.array[int], stride: int, rows_out: wp.array2d[float]):
+    """Grid (num_envs, stride); rows are long and seldom cleared: a thread for each number would mostly read masks."""
+    env, first = wp.tid()
+    if mask[env] != 0:
+        for k in range(first, rows_out.shape[1], stride):
+            rows_out[env, k] = 0.0
+
+
+def clear_rows(mask: Any, rows_out: Any) -> None:
+    """Set the rows of ``rows_out`` (num_envs, num_columns) to zero where the int ``mask`` (num_envs,) is not 0."""
+    stride = min(_CLEARING_THREADS, rows_out.shape[1])
+    wp.launch(_clear_rows_kernel, (len(mask), stride), [mask, stride, rows_out], device=rows_out.device)

@@ -11,8 +11,9 @@ from typing import Any
 import warp as wp
 
 from kernels.episode import Outcome
+from kernels.launch import kernel_over, make_zeros
 from kernels.penalties import COLLISION_FORCE, FOOT, LIMB, excess_contact_force, is_stumbling
-from kernels.state import base_ang_vel_b, base_lin_vel_b, make_zeros, projected_gravity
+from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b, projected_gravity
 
 TRACKING_VARIANCE = wp.constant(0.25)
 TOUCH_FORCE = wp.constant(1.0)
@@ -21,21 +22,12 @@ MIN_COMMANDED_SPEED = wp.constant(0.1)
 
 @wp.struct
 class Motion:
-    """Robots at the end of a control step, one row each; :mod:`kernels` has the arrays without a line."""
+    """Robots at the end of a control step."""
 
-    joint_q: wp.array2d[float]
-    joint_qd: wp.array2d[float]
+    step: RobotStep
+    """Of its last physics step; the command is the one that the action followed."""
     joint_torque: wp.array2d[float]
-    """Actuator torques [N m] in columns 6 and up."""
-    geom_force: wp.array2d[wp.vec3]
-    geom_role: wp.array[int]
-    command: wp.array2d[float]
-    """The command that the action followed."""
-    action: wp.array2d[float]
-    """Clipped."""
-    base_com: wp.vec3
-    force_limit: float
-    """Foot contact force beyond which it is penalised [N]."""
+    """Actuator torques [N m] in columns 6 and up, shape (num_envs, 6 + num_joints)."""
     dt: float
     """Control step [s]."""
     min_air_time_s: float
@@ -82,47 +74,37 @@ def _term(function: Callable[..., Any]) -> Any:
 
 
 @wp.func
-def _lin_vel(motion: Motion, env: int) -> wp.vec3:
-    return base_lin_vel_b(motion.joint_q, motion.joint_qd, motion.base_com, env)
-
-
-@wp.func
-def _ang_vel(motion: Motion, env: int) -> wp.vec3:
-    return base_ang_vel_b(motion.joint_q, motion.joint_qd, env)
-
-
-@wp.func
 def _shall_stand(motion: Motion, env: int) -> bool:
     """Whether the commanded velocity is at most 0.1 m/s."""
-    return wp.length(wp.vec2(motion.command[env, 0], motion.command[env, 1])) <= MIN_COMMANDED_SPEED
+    return wp.length(wp.vec2(motion.step.command[env, 0], motion.step.command[env, 1])) <= MIN_COMMANDED_SPEED
 
 
 @_term
 def tracking_lin_vel(motion: Motion, rewards: Rewards, env: int) -> float:
     """``exp(-|v_xy - v_xy,cmd|^2 / 0.25)``, base frame."""
-    velocity = _lin_vel(motion, env)
-    error = wp.vec2(motion.command[env, 0] - velocity[0], motion.command[env, 1] - velocity[1])
+    velocity = base_lin_vel_b(motion.step.joint_q, motion.step.joint_qd, motion.step.base_com, env)
+    error = wp.vec2(motion.step.command[env, 0] - velocity[0], motion.step.command[env, 1] - velocity[1])
     return wp.exp(-wp.length_sq(error) / TRACKING_VARIANCE)
 
 
 @_term
 def tracking_ang_vel(motion: Motion, rewards: Rewards, env: int) -> float:
     """``exp(-(w_z - w_z,cmd)^2 / 0.25)``, base frame."""
-    error = motion.command[env, 2] - _ang_vel(motion, env)[2]
+    error = motion.step.command[env, 2] - base_ang_vel_b(motion.step.joint_q, motion.step.joint_qd, env)[2]
     return wp.exp(-error * error / TRACKING_VARIANCE)
 
 
 @_term
 def lin_vel_z(motion: Motion, rewards: Rewards, env: int) -> float:
     """Square of the base's velocity along its own z axis [m^2/s^2]."""
-    velocity = _lin_vel(motion, env)
+    velocity = base_lin_vel_b(motion.step.joint_q, motion.step.joint_qd, motion.step.base_com, env)
     return velocity[2] * velocity[2]
 
 
 @_term
 def ang_vel_xy(motion: Motion, rewards: Rewards, env: int) -> float:
     """Square of the base's roll and pitch rates [rad^2/s^2]."""
-    rate = _ang_vel(motion, env)
+    rate = base_ang_vel_b(motion.step.joint_q, motion.step.joint_qd, env)
     return rate[0] * rate[0] + rate[1] * rate[1]
 
 
@@ -130,7 +112,7 @@ def ang_vel_xy(motion: Motion, rewards: Rewards, env: int) -> float:
 def torques(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the joints of the squared torque [N^2 m^2]."""
     total = float(0.0)
-    for j in range(motion.action.shape[1]):
+    for j in range(motion.step.action.shape[1]):
         total += motion.joint_torque[env, 6 + j] * motion.joint_torque[env, 6 + j]
     return total
 
@@ -139,8 +121,8 @@ def torques(motion: Motion, rewards: Rewards, env: int) -> float:
 def dof_acc(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the joints of the squared mean acceleration over the control step [rad^2/s^4]."""
     total = float(0.0)
-    for j in range(motion.action.shape[1]):
-        acceleration = (motion.joint_qd[env, 6 + j] - rewards.previous_joint_vel[env, j]) / motion.dt
+    for j in range(motion.step.action.shape[1]):
+        acceleration = (motion.step.joint_qd[env, 6 + j] - rewards.previous_joint_vel[env, j]) / motion.dt
         total += acceleration * acceleration
     return total
 
@@ -152,10 +134,10 @@ def feet_air_time(motion: Motion, rewards: Rewards, env: int) -> float:
     A foot is on the ground if it touches now or did in the step before: one missed step is no take-off.
     """
     total = float(0.0)
-    for g in range(motion.geom_role.shape[0]):
-        if (motion.geom_role[g] & FOOT) != 0:
+    for g in range(motion.step.geom_role.shape[0]):
+        if (motion.step.geom_role[g] & FOOT) != 0:
             touching = int(0)
-            if motion.geom_force[env, g][2] > TOUCH_FORCE:
+            if motion.step.geom_force[env, g][2] > TOUCH_FORCE:
                 touching = 1
             air_time = rewards.air_time[env, g]
             if touching == 1 or rewards.touched[env, g] == 1:
@@ -174,8 +156,8 @@ def feet_air_time(motion: Motion, rewards: Rewards, env: int) -> float:
 def collision(motion: Motion, rewards: Rewards, env: int) -> float:
     """Number of limb geoms touched with more than 0.1 N."""
     count = float(0.0)
-    for g in range(motion.geom_role.shape[0]):
-        if (motion.geom_role[g] & LIMB) != 0 and wp.length(motion.geom_force[env, g]) > COLLISION_FORCE:
+    for g in range(motion.step.geom_role.shape[0]):
+        if (motion.step.geom_role[g] & LIMB) != 0 and wp.length(motion.step.geom_force[env, g]) > COLLISION_FORCE:
             count += 1.0
     return count
 
@@ -184,8 +166,8 @@ def collision(motion: Motion, rewards: Rewards, env: int) -> float:
 def action_rate(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the joints of the squared change of the action."""
     total = float(0.0)
-    for j in range(motion.action.shape[1]):
-        change = motion.action[env, j] - rewards.previous_action[env, j]
+    for j in range(motion.step.action.shape[1]):
+        change = motion.step.action[env, j] - rewards.previous_action[env, j]
         total += change * change
     return total
 
@@ -193,13 +175,13 @@ def action_rate(motion: Motion, rewards: Rewards, env: int) -> float:
 @_term
 def stumble(motion: Motion, rewards: Rewards, env: int) -> float:
     """1 if any foot hits a vertical surface (:func:`kernels.penalties.is_stumbling`), else 0."""
-    return is_stumbling(motion.geom_force, motion.geom_role, env)
+    return is_stumbling(motion.step, env)
 
 
 @_term
 def feet_contact_forces(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the feet of the contact force beyond the limit [N]."""
-    return excess_contact_force(motion.geom_force, motion.geom_role, motion.force_limit, env)
+    return excess_contact_force(motion.step, env)
 
 
 @_term
@@ -207,7 +189,7 @@ def dof_pos_limits(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the joints of how far they are beyond their soft limits [rad]."""
     total = float(0.0)
     for j in range(motion.joint_lower.shape[0]):
-        angle = motion.joint_q[env, 7 + j]
+        angle = motion.step.joint_q[env, 7 + j]
         total += wp.max(motion.joint_lower[j] - angle, 0.0) + wp.max(angle - motion.joint_upper[j], 0.0)
     return total
 
@@ -216,8 +198,8 @@ def dof_pos_limits(motion: Motion, rewards: Rewards, env: int) -> float:
 def no_fly(motion: Motion, rewards: Rewards, env: int) -> float:
     """1 if exactly one foot is pushed up, by more than 0.1 N; 0 at a command to stand, unlike legged_gym's."""
     count = int(0)
-    for g in range(motion.geom_role.shape[0]):
-        if (motion.geom_role[g] & FOOT) != 0 and motion.geom_force[env, g][2] > COLLISION_FORCE:
+    for g in range(motion.step.geom_role.shape[0]):
+        if (motion.step.geom_role[g] & FOOT) != 0 and motion.step.geom_force[env, g][2] > COLLISION_FORCE:
             count += 1
     return wp.where(count == 1 and not _shall_stand(motion, env), 1.0, 0.0)
 
@@ -225,7 +207,7 @@ def no_fly(motion: Motion, rewards: Rewards, env: int) -> float:
 @_term
 def orientation(motion: Motion, rewards: Rewards, env: int) -> float:
     """Square of the sine of the base's tilt."""
-    gravity = projected_gravity(motion.joint_q, env)
+    gravity = projected_gravity(motion.step.joint_q, env)
     return gravity[0] * gravity[0] + gravity[1] * gravity[1]
 
 
@@ -235,7 +217,7 @@ def joint_deviation(motion: Motion, rewards: Rewards, env: int) -> float:
     total = float(0.0)
     for j in range(motion.joint_is_steady.shape[0]):
         if motion.joint_is_steady[j] != 0:
-            total += wp.abs(motion.joint_q[env, 7 + j] - motion.default_joint_pos[j])
+            total += wp.abs(motion.step.joint_q[env, 7 + j] - motion.default_joint_pos[j])
     return total
 
 
@@ -281,9 +263,13 @@ def make_rewards(num_envs: int, num_joints: int, num_geoms: int, device: str | N
     return rewards
 
 
-@wp.kernel
-def _reward_steps_kernel(motion: Motion, weights: RewardWeights, outcome: wp.array[int], rewards_out: Rewards):
-    """Grid (num_envs,)."""
+@kernel_over("outcome")
+def reward_steps(motion: Motion, weights: RewardWeights, outcome: wp.array[int], rewards_out: Rewards):
+    """Grid (num_envs,): reward one control step by the weighted sum of all terms times the control step.
+
+    A step is paid if its episode had not ended before. A step that ends in an invalid state pays no term; one that ends
+    in a fall pays its price too. ``outcome`` is that after the step.
+    """
     env = wp.tid()
     ended = outcome[env]
     running = rewards_out.running[env]
@@ -303,29 +289,13 @@ def _reward_steps_kernel(motion: Motion, weights: RewardWeights, outcome: wp.arr
     rewards_out.total[env] += motion.dt * reward
 
 
-def reward_steps(motion: Motion, weights: RewardWeights, outcome: Any, rewards_out: Rewards) -> None:
-    """Reward one control step: the weighted sum of all terms times the control step.
-
-    A step is paid if its episode had not ended before. A step that ends in an invalid state pays no term; one that ends
-    in a fall pays its price too. ``outcome`` is that after the step.
-    """
-    inputs = [motion, weights, outcome]
-    wp.launch(_reward_steps_kernel, outcome.shape[0], inputs, outputs=[rewards_out], device=outcome.device)
-
-
-@wp.kernel
-def _remember_steps_kernel(
+@kernel_over("action")
+def remember_steps(
     action: wp.array2d[float], joint_qd: wp.array2d[float], rewards_out: Rewards, counter_out: wp.array[int]
 ):
-    """Grid (num_envs, num_joints)."""
+    """Grid (num_envs, num_joints): keep action and joint rates for the rewards of the next step, and count the step."""
     env, j = wp.tid()
     rewards_out.previous_action[env, j] = action[env, j]
     rewards_out.previous_joint_vel[env, j] = joint_qd[env, 6 + j]
     if env == 0 and j == 0:
         counter_out[0] = counter_out[0] + 1
-
-
-def remember_steps(action: Any, joint_qd: Any, rewards_out: Rewards, counter_out: Any) -> None:
-    """Keep action and joint rates for the rewards of the next step, and count the step in ``counter_out`` (1,)."""
-    inputs = [action, joint_qd]
-    wp.launch(_remember_steps_kernel, action.shape, inputs, outputs=[rewards_out, counter_out], device=action.device)

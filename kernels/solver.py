@@ -18,9 +18,9 @@ from typing import Any
 
 import warp as wp
 
-from kernels import lanes
 from kernels.contact import Contacts, Surfaces, vec5
 from kernels.dynamics import Robots
+from kernels.launch import fill_snippet, launch_lanes
 
 LANES = 32
 _REGISTERS = 96  # a thread, so that 20 robots fit on a multiprocessor
@@ -123,7 +123,7 @@ def _round_up_to_4(count: int) -> int:
 def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
     values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower()}
     values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride}
-    snippet = lanes.snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
+    snippet = fill_snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
 
     @wp.func_native(snippet=snippet)
     def step_one(robots: Robots, problem: Problem, thread: int): ...
@@ -142,10 +142,9 @@ def step_robots(robots: Robots, problem: Problem, sizes: Sizes, codes: dict[str,
     """Move every robot on by a step, under the forces ``qfrc_smooth`` and those of its constraints.
 
     It writes ``qpos``, ``qvel``, the warm start of the next step, the contacts' forces, the number of iterations and
-    the overflow bits. The shared memory of ``sizes`` must pass :func:`kernels.lanes.fits_block` with ``LANES``.
+    the overflow bits. The shared memory of ``sizes`` must pass :func:`kernels.launch.fits_block` with ``LANES``.
     ``codes`` are MuJoCo's numbers, by their names in solver.cu: the type of a free joint, overflow bits, limits of
     impedances, the smallest divisor.
     """
     kernel = _kernel(sizes, tuple(codes.items()))
-    num_worlds = robots.qvel.shape[0]
-    lanes.launch(kernel, num_worlds, [robots, problem], lanes=LANES, device=robots.qvel.device)
+    launch_lanes(kernel, len(robots.qvel), [robots, problem], lanes=LANES, device=robots.qvel.device)

@@ -4,17 +4,7 @@ Row layout of ``joint_q``: base position (3), base quaternion xyzw (4), joints; 
 centre of mass (3) and angular velocity (3), both in the world frame, joints.
 """
 
-from typing import Any
-
 import warp as wp
-
-
-def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...]) -> Any:
-    """A kernel argument whose arrays have these shapes, with zeros of the types that its struct names."""
-    made = struct()
-    for name, shape in shapes.items():
-        setattr(made, name, wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device))
-    return made
 
 
 @wp.struct
@@ -36,15 +26,15 @@ class RobotStep:
 
 
 @wp.func
-def base_position(joint_q: wp.array2d[float], env: int) -> wp.vec3:
-    """Position of the base link's origin, world-local frame [m]."""
-    return wp.vec3(joint_q[env, 0], joint_q[env, 1], joint_q[env, 2])
-
-
-@wp.func
 def base_rotation(joint_q: wp.array2d[float], env: int) -> wp.quat:
     """Rotation of the base link, base to world frame."""
     return wp.quat(joint_q[env, 3], joint_q[env, 4], joint_q[env, 5], joint_q[env, 6])
+
+
+@wp.func
+def base_pose(joint_q: wp.array2d[float], env: int) -> wp.transform:
+    """Pose of the base link, world-local frame."""
+    return wp.transform(wp.vec3(joint_q[env, 0], joint_q[env, 1], joint_q[env, 2]), base_rotation(joint_q, env))
 
 
 @wp.func

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from kernels.launch import kernel_over
+
 PARAMETERS = ("mu_x", "mu_y", "sigma_x", "sigma_y", "p_x", "p_y", "theta", "w")
 """Parameters of one bump in gene order: centre [m], half widths [m], exponents, rotation [rad], height [m]."""
 GENES_PER_BUMP = len(PARAMETERS)
@@ -36,11 +38,6 @@ class Bump:
 
 
 @wp.func
-def _decode_gene(gene: float, lower: float, upper: float) -> float:
-    return lower + (wp.clamp(gene, -1.0, 1.0) + 1.0) * 0.5 * (upper - lower)
-
-
-@wp.func
 def super_gaussian(bump: Bump, x: float, y: float) -> float:
     """Height [m] one bump adds at (x, y) [m] (equation 1)."""
     offset = wp.vec2(x, y) - bump.centre
@@ -51,13 +48,14 @@ def super_gaussian(bump: Bump, x: float, y: float) -> float:
     return bump.height * wp.exp(-wp.pow(u, bump.power[0]) - wp.pow(v, bump.power[1]))
 
 
-@wp.kernel
-def _decode_genes_kernel(genes: wp.array2d[float], lower: _genes, upper: _genes, bumps_out: wp.array2d[Bump]):
+@kernel_over("bumps_out")
+def _decode_genes(genes: wp.array2d[float], lower: _genes, upper: _genes, bumps_out: wp.array2d[Bump]):
     """Grid (num_terrains, num_bumps)."""
     t, b = wp.tid()
     value = _genes()
     for k in range(GENES_PER_BUMP):
-        value[k] = _decode_gene(genes[t, b * GENES_PER_BUMP + k], lower[k], upper[k])
+        share = (wp.clamp(genes[t, b * GENES_PER_BUMP + k], -1.0, 1.0) + 1.0) * 0.5
+        value[k] = lower[k] + share * (upper[k] - lower[k])
     cos_theta = wp.cos(value[6])
     sin_theta = wp.sin(value[6])
     bump = Bump()
@@ -70,8 +68,8 @@ def _decode_genes_kernel(genes: wp.array2d[float], lower: _genes, upper: _genes,
     bumps_out[t, b] = bump
 
 
-@wp.kernel
-def _rasterise_bumps_kernel(bumps: wp.array2d[Bump], spacing: float, factor: float, heights_out: wp.array3d[float]):
+@kernel_over("heights_out")
+def _rasterise_bumps(bumps: wp.array2d[Bump], spacing: float, factor: float, heights_out: wp.array3d[float]):
     """Grid (num_terrains, nrow, ncol)."""
     t, row, col = wp.tid()
     x = float(col) * spacing
@@ -101,7 +99,5 @@ def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0,
     num_bumps = genes.shape[1] // GENES_PER_BUMP
     bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
     shift = np.pad(origin, (0, GENES_PER_BUMP - len(origin)))
-    inputs = [genes, _genes(*(LOWER - shift)), _genes(*(UPPER - shift))]
-    wp.launch(_decode_genes_kernel, bumps.shape, inputs, outputs=[bumps], device=genes.device)
-    inputs = [bumps, spacing, factor]
-    wp.launch(_rasterise_bumps_kernel, heights_out.shape, inputs, outputs=[heights_out], device=genes.device)
+    _decode_genes(genes, _genes(*(LOWER - shift)), _genes(*(UPPER - shift)), bumps)
+    _rasterise_bumps(bumps, spacing, factor, heights_out)

@@ -9,13 +9,13 @@ from typing import Any
 import warp as wp
 
 from kernels.episode import Episodes, Outcome, Task, goal_command
+from kernels.launch import kernel_over, make_zeros
 from kernels.rewards import Rewards
-from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b, base_yaw, make_zeros, wrap_angle
+from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b, base_yaw, wrap_angle
 
-STATISTICS = (
-    "steps", "episodes", *(outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING), "overflow",
-    "episode_steps", "episode_reward", "lin_vel_error", "yaw_rate_error",
-)  # fmt: skip
+_OUTCOMES = tuple(outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING)
+_SUMS = ("overflow", "episode_steps", "episode_reward", "lin_vel_error", "yaw_rate_error")
+STATISTICS = ("steps", "episodes", *_OUTCOMES, *_SUMS)
 """Columns of the sums that training progress is read from; the outcomes count episodes."""
 _COLUMN = {name: column for column, name in enumerate(STATISTICS)}
 
@@ -90,11 +90,9 @@ def make_training(
     return training
 
 
-@wp.kernel
-def _record_steps_kernel(
-    step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rewards, training_out: TrainingState
-):
-    """Grid (num_envs,)."""
+@kernel_over("episodes.outcome")
+def record_steps(step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rewards, training_out: TrainingState):
+    """Grid (num_envs,): keep the outcome of a judged and rewarded step, and add it to the statistics."""
     env = wp.tid()
     outcome = episodes.outcome[env]
     training_out.ended[env] = outcome
@@ -115,15 +113,6 @@ def _record_steps_kernel(
         training_out.statistics[env, wp.static(_COLUMN["yaw_rate_error"])] += error_yaw
 
 
-def record_steps(
-    step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rewards, training_out: TrainingState
-) -> None:
-    """Keep the outcome of a judged and rewarded step, and add it to the statistics."""
-    inputs = [step, rules, episodes, rewards]
-    num_envs = step.overflow.shape[0]
-    wp.launch(_record_steps_kernel, num_envs, inputs, outputs=[training_out], device=step.overflow.device)
-
-
 @wp.func
 def _random_stream(counter: int, stream: int, num_envs: int, env: int) -> wp.uint32:
     # Observation noise takes the offsets from 0 up (kernels.observation); these lie below.
@@ -140,12 +129,15 @@ def next_level(level: int, walked: float, commanded_speed: float, drawn: int, ru
     return level
 
 
-@wp.kernel
-def _promote_episodes_kernel(
-    joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, terrain_of_env_out: wp.array[int],
+@kernel_over("terrain_of_env_out")
+def promote_episodes(
+    joint_q: wp.array2d[float],
+    episodes: Episodes,
+    rules: Rules,
+    terrain_of_env_out: wp.array[int],
     training_out: TrainingState,
-):  # fmt: skip
-    """Grid (num_envs,)."""
+):
+    """Grid (num_envs,): move ended episodes up or down the levels by the distance walked; invalid ones stay."""
     env = wp.tid()
     outcome = episodes.outcome[env]
     if outcome == Outcome.RUNNING:
@@ -161,27 +153,12 @@ def _promote_episodes_kernel(
     terrain_of_env_out[env] = level * rules.num_columns + training_out.column[env]
 
 
-def promote_episodes(
-    joint_q: Any, episodes: Episodes, rules: Rules, terrain_of_env_out: Any, training_out: TrainingState
-) -> None:
-    """Move ended episodes up or down the terrain levels by the distance walked; invalid ones stay."""
-    inputs = [joint_q, episodes, rules]
-    outputs = [terrain_of_env_out, training_out]
-    wp.launch(_promote_episodes_kernel, joint_q.shape[0], inputs, outputs=outputs, device=joint_q.device)
-
-
-@wp.kernel
-def _seed_restarts_kernel(training: TrainingState, episodes_out: Episodes):
-    """Grid (num_envs,)."""
+@kernel_over("episodes_out.rng")
+def seed_restarts(training: TrainingState, episodes_out: Episodes):
+    """Grid (num_envs,): let the starts of this control step be drawn from its counter; writes ``rng``."""
     env = wp.tid()
     num_envs = episodes_out.rng.shape[0]
     episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
-
-
-def seed_restarts(training: TrainingState, episodes_out: Episodes) -> None:
-    """Let the starts of this control step be drawn from its counter; writes ``rng``."""
-    rng = episodes_out.rng
-    wp.launch(_seed_restarts_kernel, rng.shape[0], inputs=[training], outputs=[episodes_out], device=rng.device)
 
 
 @wp.func
@@ -194,12 +171,20 @@ def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: Training
     training_out.command[env, 1] = moving * vy
 
 
-@wp.kernel
-def _command_episodes_kernel(
-    joint_q: wp.array2d[float], episodes: Episodes, rules: Rules, task: Task, joint_qd_out: wp.array2d[float],
+@kernel_over("episodes.steps")
+def command_episodes(
+    joint_q: wp.array2d[float],
+    episodes: Episodes,
+    rules: Rules,
+    task: Task,
+    joint_qd_out: wp.array2d[float],
     training_out: TrainingState,
-):  # fmt: skip
-    """Grid (num_envs,)."""
+):
+    """Grid (num_envs,): write the next command of every robot, and push where a push is due.
+
+    Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
+    and headings become yaw rates. A push overwrites vx and vy of ``joint_qd_out``.
+    """
     env = wp.tid()
     counter = training_out.counter[0]
     num_envs = joint_q.shape[0]
@@ -218,17 +203,3 @@ def _command_episodes_kernel(
         rng = _random_stream(counter, _STREAM_PUSH, num_envs, env)
         joint_qd_out[env, 0] = wp.randf(rng, -rules.push_speed, rules.push_speed)
         joint_qd_out[env, 1] = wp.randf(rng, -rules.push_speed, rules.push_speed)
-
-
-def command_episodes(
-    joint_q: Any, episodes: Episodes, rules: Rules, task: Task, joint_qd_out: Any, training_out: TrainingState
-) -> None:
-    """Write the next command of every robot, and push where a push is due.
-
-    Where robots cross, the command is to go to the goal; else a new one is drawn where it is due (at the start too),
-    and headings become yaw rates. A push overwrites vx and vy of ``joint_qd_out``.
-    """
-    inputs = [joint_q, episodes, rules, task]
-    wp.launch(
-        _command_episodes_kernel, joint_q.shape[0], inputs, outputs=[joint_qd_out, training_out], device=joint_q.device
-    )

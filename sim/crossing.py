@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import warp as wp
 
 from kernels.episode import Task
-from kernels.restart import StartRanges
+from kernels.queue import StartRanges
 from sim.robots.robot import RobotCfg
 
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)

@@ -12,10 +12,9 @@ import torch
 import warp as wp
 
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
-from kernels.observation import Noise, apply_action, write_observation
+from kernels.observation import Noise, apply_action
 from kernels.penalties import PENALTIES, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
-from kernels.restart import restart_episodes
 from kernels.rewards import Rewards, remember_steps
 from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.controllers.runner import Memory, PolicyRunner
@@ -213,12 +212,11 @@ class Rollout:
         self._latches = [(self._task, self._episode)]
         self._reward = None
         if self.cfg.reward:
-            from sim.reward import Reward
+            from sim.simulation import Reward
 
             # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
             # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
-            io = {"command": self.command, "action": self._last_action}
-            self._reward = Reward(sim, robot.training, falls=(Outcome.BASE_COLLISION,), **io)
+            self._reward = Reward(sim, robot.training, self._robot_step, falls=(Outcome.BASE_COLLISION,))
             self._stepped = make_episodes(num_envs)
             self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
         self._rewards = Rewards() if self._reward is None else self._reward.state
@@ -245,21 +243,13 @@ class Rollout:
         turn_over(
             self._stepped.outcome, self._rewards, self._episode, self.penalty_sums, sim.terrain_of_env, self._queue
         )
-        restart_episodes(
-            begins, sim.terrain_of_env, sim.bank.terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
-            self._last_action, self._episode, self._rewards,
-        )  # fmt: skip
+        sim.restart(begins, self._robot_step, self._ranges, self._episode, self._rewards)
         if self._reward is not None:
             begin_episodes(begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
-        sim.clear_solver(begins)
-        sim.begin_conditions(begins)
         command_goal(sim.joint_q, self._episode.outcome, self._task, self.command)
-        write_observation(
-            sim.joint_q, sim.joint_qd, self.command, self._last_action, sim.terrain_of_env, sim.bank.terrain,
-            sim.sensors, Noise(), self._counter, self._observation,
-        )  # fmt: skip
-        sim.disturb(self._episode, self.robot.physics_dt, self._observation)
+        dt = self.robot.physics_dt
+        sim.observe(self._robot_step, self._episode, dt, Noise(), self._counter, self._observation)
 
     @property
     def num_free(self) -> int:
@@ -313,7 +303,8 @@ class Rollout:
         self._next_slot = (first + count) % self.num_terrains
         self._num_unreleased += num_episodes
         if idle:
-            self._queue.counts.zero_()
+            self._queue.taken.zero_()
+            self._queue.ready.zero_()
             self._queue.busy.zero_()
             self._began_at = self._taken_at = self._step
             self._taken_s = time.perf_counter()

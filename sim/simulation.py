@@ -1,8 +1,8 @@
-"""Parallel robots on height grids, one world each: Newton's MuJoCo model, terrain contact and steps of our own."""
+"""Parallel robots on height grids, one world each: Newton's MuJoCo model, contact, steps and rewards of our own."""
 
 import gc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from typing import Any
 
@@ -10,22 +10,24 @@ import newton
 import numpy as np
 import warp as wp
 
-from kernels.conditions import Disturbed, DisturbedStep, begin_conditions, disturb
+from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
-from kernels.episode import Episodes
+from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
-from kernels.observation import Sensors
+from kernels.launch import make_zeros
+from kernels.observation import Noise, Sensors, write_observation
 from kernels.penalties import BASE, FOOT, LIMB
-from kernels.restart import clear_rows
-from kernels.state import RobotStep, make_zeros
+from kernels.queue import StartRanges, clear_rows, restart_episodes
+from kernels.rewards import Motion, Rewards, make_rewards, make_weights, reward_steps
+from kernels.state import RobotStep
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
 from sim.robots.compiled import robot_spec
 from sim.robots.model import make_builder
 from sim.robots.probes import make_probes
 from sim.robots.robot import RobotCfg
-from sim.robots.training import NoiseCfg
+from sim.robots.training import NoiseCfg, TrainingCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.base import begin_effects, disturb_effects
@@ -251,36 +253,50 @@ class Simulation:
         coordinates.base_com = self.base_com
         return coordinates
 
-    def fill(self, struct: Any, **values: Any) -> Any:
-        """A kernel argument with this simulation's arrays under its names, and ``values``."""
-        filled = struct()
-        for name in struct.vars:
-            if name in values or hasattr(self, name):
-                setattr(filled, name, values.get(name, getattr(self, name, None)))
-        return filled
-
     def make_step(self, command: Any, action: Any) -> RobotStep:
         """A view of the robots at the end of a step that obeys the command (num_envs, 3) by the clipped action."""
-        return self.fill(RobotStep, command=command, action=action, force_limit=self.robot.contact_force_limit)
+        step = RobotStep()
+        step.command, step.action, step.force_limit = command, action, self.robot.contact_force_limit
+        for name in ("joint_q", "joint_qd", "base_com", "geom_force", "geom_role", "overflow"):
+            setattr(step, name, getattr(self, name))
+        return step
+
+    def restart(self, mask: Any, step: RobotStep, ranges: StartRanges, episodes: Episodes, rewards: Rewards) -> None:
+        """Begin episodes anew where the int ``mask`` (num_envs,) is not 0, under the conditions of their terrains.
+
+        Robots stand at new starts, and nothing is remembered of the episode before: its action, rewards, solver.
+        """
+        state = (self.joint_q, self.joint_qd, step.action, episodes, rewards)
+        restart_episodes(mask, self.terrain_of_env, self.bank.terrain, ranges, self.sensors, *state)
+        self.clear_solver(mask)
+        self.begin_conditions(mask)
+
+    def observe(
+        self, step: RobotStep, episodes: Episodes, dt: float, noise: Noise, noise_seed: Any, observation: Any
+    ) -> None:
+        """Write what robots observe before their next control step, (num_envs, observation_size).
+
+        By the conditions of their terrains they are pushed, and what they observe is disturbed. Episodes count steps of
+        ``dt`` [s]. Noise is drawn from ``noise_seed``, (1,), and the environment's index.
+        """
+        state = (self.joint_q, self.joint_qd, step.command, step.action, self.terrain_of_env)
+        write_observation(*state, self.bank.terrain, self.sensors, noise, noise_seed, observation)
+        self.disturb(episodes, dt, observation)
 
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""
         if self.disturbed is not None:
-            begin_conditions(
-                begin_effects(), begins, self.terrain_of_env, self.bank.conditions, self._varied, self.disturbed
-            )
+            begin = make_begin(begin_effects())
+            begin(begins, self.terrain_of_env, self.bank.conditions, self._varied, self.disturbed)
 
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
-        """Push robots and disturb observations, (num_envs, observation_size), as the conditions of their terrains say.
-
-        The episodes count steps of ``dt`` [s].
-        """
+        """Push robots and disturb observations as the conditions of their terrains say (:meth:`observe`)."""
         if self.disturbed is not None:
             step = DisturbedStep()
             step.memory, step.episodes, step.num_joints = self.disturbed, episodes, self.robot.num_joints
             step.dt, step.every = dt, round(self.robot.control_dt / dt)
             step.joint_qd, step.observation = self.joint_qd, observation
-            disturb(disturb_effects(), step)
+            make_disturb(disturb_effects())(step)
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""
@@ -349,3 +365,40 @@ class Simulation:
         """Run a captured graph once."""
         with wp.ScopedDevice(self.device):
             wp.capture_launch(graph)
+
+
+class Reward:
+    """Pays every control step of every robot.
+
+    Attributes:
+        motion: The state that rewards are computed from, a kernel argument; it shares the simulation's arrays.
+        state: Rewards so far (:class:`kernels.rewards.Rewards`).
+    """
+
+    def __init__(self, sim: Simulation, cfg: TrainingCfg, step: RobotStep, *, falls: Collection[Outcome]) -> None:
+        """Allocate on the simulation's device; ``falls`` are the outcomes that count as such.
+
+        The command of the ``step`` is what its clipped action answers.
+        """
+        robot = sim.robot
+        limits = (sim.model.joint_limit_lower, sim.model.joint_limit_upper)
+        lower, upper = (np.asarray(limit.numpy(), dtype=np.float64)[6 : 6 + robot.num_joints] for limit in limits)
+        # Soft limits span a share of each joint's range about its middle; a joint without limits has them far away.
+        middle = 0.5 * (lower + upper)
+        half = 0.5 * cfg.soft_joint_limit * (upper - lower)
+        steady = [int(name in cfg.steady_joints) for name in robot.joint_names]
+        self.motion = motion = Motion()
+        motion.step = step
+        motion.joint_torque = sim.joint_torque
+        motion.default_joint_pos = sim.sensors.default_joint_pos
+        motion.dt = robot.control_dt
+        motion.min_air_time_s = cfg.min_air_time_s
+        motion.joint_lower = wp.array(middle - half, dtype=float, device=sim.device)
+        motion.joint_upper = wp.array(middle + half, dtype=float, device=sim.device)
+        motion.joint_is_steady = wp.array(steady, dtype=int, device=sim.device)
+        self._weights = make_weights(asdict(cfg.rewards), only_positive=cfg.only_positive, falls=falls)
+        self.state = make_rewards(sim.num_envs, robot.num_joints, len(robot.geom_names), sim.device)
+
+    def pay(self, outcome: Any) -> None:
+        """Reward the control step just made, before the next command is written; ``outcome`` is that after it."""
+        reward_steps(self.motion, self._weights, outcome, self.state)

@@ -12,11 +12,12 @@ import warp as wp
 from mujoco_warp._src import types
 from numpy.typing import NDArray
 
-from kernels import dynamics, lanes, solver
+from kernels import dynamics, solver
 from kernels.conditions import BASE, VariedRobots
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, contacts_to_solver, forces_from_solver
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
+from kernels.launch import fits_block
 from kernels.solver import Problem, Sizes, step_robots
 
 _JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
@@ -127,8 +128,8 @@ def is_supported(m: Any, contacts: Contacts) -> bool:
         (m.actuator_trntype.numpy() != types.TrnType.JOINT).any() or (m.actuator_ctrlnum.numpy() != 1).any(),
         m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
         (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
-        not lanes.fits_block(_tree_sizes(m).shared_floats, dynamics.LANES),
-        not lanes.fits_block(_solver_sizes(m, contacts).shared_floats, solver.LANES),
+        not fits_block(_tree_sizes(m).shared_floats, dynamics.LANES),
+        not fits_block(_solver_sizes(m, contacts).shared_floats, solver.LANES),
     )
     return not any(unsupported)
 
@@ -249,6 +250,7 @@ class StockDynamics:
 
     def step(self) -> None:
         """Make the whole step; it computes poses once more."""
+        self._data.nacon.zero_()
         contacts_to_solver(self._contacts, self.surfaces, self._solver_contacts)
         mujoco_warp.step(self._model, self._data)
         forces_from_solver(self._solver_contacts, self._contacts)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES, penalty_columns
-from kernels.queue import make_queue, make_ready, turn_over
-from kernels.restart import restart_episodes
+from kernels.queue import make_queue, make_ready, restart_episodes, turn_over
 from kernels.rewards import Rewards
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.heightfield import Terrain, ceiling_over, max_blocks, nearest_surface_point
+from kernels.heightfield import Terrain, ceiling_over, nearest_surface_point
 from tests.kernels import oracle
 from tests.kernels.states import SPACING, make_terrain, rough
 
@@ -94,9 +94,3 @@ def test_ceiling_is_an_upper_bound(nrow, ncol):
         cols = np.clip(np.arange(first[0], last[0] + 1), 0, ncol - 1)
         rows = np.clip(np.arange(first[1], last[1] + 1), 0, nrow - 1)
         assert ceiling >= grid[np.ix_(rows, cols)].max() - 1e-6
-
-
-def test_wrong_ceiling_shape_is_named():
-    heights = wp.zeros((2, 17, 33), dtype=float)
-    with pytest.raises(ValueError, match="ceilings_out"):
-        max_blocks(heights, wp.zeros((2, 2, 5), dtype=float))

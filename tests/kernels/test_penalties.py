@@ -76,8 +76,3 @@ def test_steps_that_do_not_count_add_nothing():
     np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
     velocities = penalty_columns(["yaw_rate", "vel_x", "vel_y"])
     assert (after[[1, 3]] > before[[1, 3]])[:, velocities].all()
-
-
-def test_wrong_number_of_columns_is_named():
-    with pytest.raises(ValueError, match="sums_out"):
-        sums_after(upright(2, 3), np.zeros((2, 3)), np.zeros((2, 5, 3)), sums=np.zeros((2, 5), np.float32))

@@ -9,6 +9,7 @@ import warp as wp
 from kernels.episode import Outcome
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.rewards import REWARDS, Motion, make_rewards, make_weights, remember_steps, reward_steps
+from kernels.state import RobotStep
 from sim.robots.training import RewardCfg
 from tests.kernels.states import filled
 
@@ -30,10 +31,10 @@ class Robots:
         self.rewards = make_rewards(num_envs, JOINTS, len(ROLES), str(wp.get_device()))
         self.num_envs = num_envs
         self.motion = filled(
-            Motion, geom_role=ROLES, base_com=(0.05, -0.02, 0.1), force_limit=500.0, dt=DT,
-            min_air_time_s=least_air_time, joint_lower=(-0.5, -1e10, 0.2), joint_upper=(0.5, 1e10, 0.8),
+            Motion, dt=DT, min_air_time_s=least_air_time, joint_lower=(-0.5, -1e10, 0.2), joint_upper=(0.5, 1e10, 0.8),
             default_joint_pos=(0.1, -0.2, 0.3), joint_is_steady=[1, 0, 1],
         )  # fmt: skip
+        self.motion.step = filled(RobotStep, geom_role=ROLES, base_com=(0.05, -0.02, 0.1), force_limit=500.0)
         widths = {"joint_qd": 6 + JOINTS, "joint_torque": 6 + JOINTS, "command": 3, "action": JOINTS}
         self.set(joint_q=(*STANDING, *REST), geom_force=np.zeros((5, 3)), **{n: np.zeros(w) for n, w in widths.items()})
         self.set(**arrays)
@@ -41,7 +42,8 @@ class Robots:
     def set(self, **arrays):
         for name, rows in arrays.items():
             shape = (self.num_envs, 5, 3) if name == "geom_force" else (self.num_envs, np.shape(rows)[-1])
-            owner = self.rewards if name.startswith("previous") else self.motion
+            owner = self.rewards if name.startswith("previous") else self.motion.step
+            owner = self.motion if name == "joint_torque" else owner
             values = wp.array(np.broadcast_to(np.float32(rows), shape), dtype=float if len(shape) == 2 else wp.vec3)
             setattr(owner, name, values)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from sim.reward import Reward
 from sim.robots.training import RewardCfg, TrainingCfg
+from sim.simulation import Reward
 from sim.terrains.terrains import Terrains
 from tests.sim.policies import stand
 from tests.sim.scenes import FLAT, crossing, positions, put, spike
@@ -99,11 +99,11 @@ def test_asking_for_the_reward_changes_nothing_else(anymal):
 
 def test_a_robots_settings_reach_the_kernels(eight, robot):
     soft = replace(robot.training, soft_joint_limit=0.9)
-    motion = Reward(eight, soft, command=None, action=None, falls=()).motion
+    motion = Reward(eight, soft, eight.make_step(None, None), falls=()).motion
     steady = {name for name, flag in zip(robot.joint_names, motion.joint_is_steady.numpy(), strict=True) if flag}
     hips = {f"hip_{joint}_{side}" for joint in ("abduction", "rotation") for side in ("left", "right")}
     assert steady == (hips if robot.name == "cassie" else set())
-    assert motion.force_limit == robot.contact_force_limit and motion.dt == pytest.approx(0.02)
+    assert motion.step.force_limit == robot.contact_force_limit and motion.dt == pytest.approx(0.02)
     lower, upper = motion.joint_lower.numpy(), motion.joint_upper.numpy()
     # Cassie's abduction spans -.2618 to .3927, ANYmal's -.72 to .49; its other joints turn freely.
     middle, half = {"anymal": (-0.115, 0.605), "cassie": (0.06545, 0.32725)}[robot.name]

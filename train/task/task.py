@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
-from kernels.observation import Noise, apply_action, write_observation
-from kernels.restart import StartRanges, restart_episodes
+from kernels.observation import Noise, apply_action
+from kernels.queue import StartRanges
 from kernels.rewards import REWARDS, remember_steps
 from kernels.training import (
     STATISTICS,
@@ -26,9 +26,8 @@ from kernels.training import (
 from sim import crossing
 from sim.controllers.loaders import prepare_torch
 from sim.crossing import CAPACITY_OVERFLOWS
-from sim.reward import Reward
 from sim.robots.robot import RobotCfg
-from sim.simulation import Simulation
+from sim.simulation import Reward, Simulation
 from sim.terrains.bank import TerrainBank
 from train.cfg import TaskCfg
 from train.task.tiles import Tiles, make_tiles
@@ -85,8 +84,8 @@ class CommandTask:
             first_count=first_count,
             device=device,
         )
-        self._reward = Reward(self.sim, cfg, command=training.command, action=training.last_action, falls=_FALLS)
         self._robot_step = self.sim.make_step(training.command, training.last_action)
+        self._reward = Reward(self.sim, cfg, self._robot_step, falls=_FALLS)
         rewards = self._reward.state
         self._action = torch.from_dlpack(training.action)
         self.observation = torch.from_dlpack(training.observation)
@@ -195,20 +194,11 @@ class CommandTask:
         sim = self.sim
         episodes = self._episodes
         training = self._training
-        terrain = sim.bank.terrain
         seed_restarts(training, episodes)
-        restart_episodes(
-            training.ended, sim.terrain_of_env, terrain, self._ranges, sim.sensors, sim.joint_q, sim.joint_qd,
-            training.last_action, episodes, self._reward.state,
-        )  # fmt: skip
-        sim.clear_solver(training.ended)
-        sim.begin_conditions(training.ended)
+        sim.restart(training.ended, self._robot_step, self._ranges, episodes, self._reward.state)
         command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)
-        write_observation(
-            sim.joint_q, sim.joint_qd, training.command, training.last_action, sim.terrain_of_env, terrain,
-            sim.sensors, self._noise, training.counter, training.observation,
-        )  # fmt: skip
-        sim.disturb(episodes, self.robot.control_dt, training.observation)
+        dt = self.robot.control_dt
+        sim.observe(self._robot_step, episodes, dt, self._noise, training.counter, training.observation)
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 

@@ -1,0 +1,69 @@
+"""How kernels are launched: over the entries of an array, or with some threads of a GPU's warp for each world.
+
+Threads of a warp share the world's memory and leave out parked worlds; on a CPU one thread does their work. Bodies of
+such kernels are C++ (``.cu`` files), for shuffles and barriers, which Warp's language does not have. A block is one
+warp, so that a world that is done early frees its multiprocessor.
+"""
+
+from collections.abc import Callable
+from inspect import signature
+from operator import attrgetter
+from pathlib import Path
+from string import Template
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+_WARP = 32
+_BLOCK_FLOATS = 12 * 1024  # 48 KiB: what a block may have without asking
+_PROLOGUE = Path(__file__).with_name("lanes.cu")
+
+
+def kernel_over(array: str, **options: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a Warp kernel of a function, and of its name a function that launches it on arguments in the same order.
+
+    The grid is the shape of one ``array``: an argument, or a field of one ("episodes_out.outcome"). ``options`` are
+    those of ``warp.kernel``.
+    """
+
+    def make_launcher(function: Callable[..., None]) -> Callable[..., None]:
+        kernel = wp.kernel(function, **options)
+        names = signature(function).parameters
+
+        def launch_kernel(*arguments: Any) -> None:
+            over = attrgetter(array)(SimpleNamespace(**dict(zip(names, arguments, strict=True))))
+            wp.launch(kernel, over.shape, inputs=arguments, device=over.device)
+
+        launch_kernel.__doc__ = function.__doc__
+        return launch_kernel
+
+    return make_launcher
+
+
+def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...]) -> Any:
+    """A kernel argument whose arrays have these shapes, with zeros of the types that its struct names."""
+    made = struct()
+    for name, shape in shapes.items():
+        setattr(made, name, wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device))
+    return made
+
+
+def fits_block(num_floats: int, lanes: int) -> bool:
+    """Whether a block has shared memory for its worlds, of ``lanes`` threads and ``num_floats`` floats each."""
+    return 0 < num_floats * (_WARP // lanes) <= _BLOCK_FLOATS
+
+
+def fill_snippet(body: Path, *, num_floats: int, lanes: int, **values: Any) -> str:
+    """The body of a native function of ``robots`` and an int ``thread``: lanes.cu, then the C++ file ``body``.
+
+    On a GPU a world has ``lanes`` threads, a power of 2 up to 32, and ``num_floats`` floats of memory. ``values``
+    replace the ``$names`` in the file.
+    """
+    source = Template(_PROLOGUE.read_text() + body.read_text())
+    return source.substitute(values, num_floats=num_floats, lanes=lanes, worlds=_WARP // lanes)
+
+
+def launch_lanes(kernel: Any, num_worlds: int, inputs: list[Any], *, lanes: int, device: Any) -> None:
+    """Launch a kernel of grid (num_worlds * lanes,), with one thread a world on a CPU."""
+    wp.launch(kernel, num_worlds * (1 if device.is_cpu else lanes), inputs=inputs, block_dim=_WARP, device=device)
