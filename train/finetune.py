@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
-from qd.evaluate.sets import elites_sha256, read_space, split_elites
+from qd.evaluate.sets import TRAINED_ON, elites_sha256, hash_elites, read_space, read_trained_on, split_elites
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.directory import RunDirectory, find_directory, find_run, read_robot_archive

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from kernels.episode import Outcome
 from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
-from qd.evaluate.sets import TerrainSet, set_rng
-from qd.evaluate.show import show_table
+from qd.evaluate.sets import TerrainSet, draw_seeds, set_rng
+from qd.evaluate.tables import show_table
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
@@ -34,7 +34,9 @@ from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.names import join_name
 from sim.terrains.spaces.on_ground import ground_genes
+from sim.terrains.spaces.registry import load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
@@ -231,9 +233,11 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
     There are ``num_terrains`` a value. The seed draws their episodes, the same ones for all doses.
     """
     rng = set_rng("dose", seed)
-    seeds = rng.integers(2**32, size=num_terrains, dtype=np.uint32).repeat(len(dose.values))
-    terrains, numbers = dose.terrains(num_terrains, rng), np.arange(len(seeds))
-    return TerrainSet(terrains=terrains, seeds=seeds, numbers=numbers, space=dose.space)
+    seeds = draw_seeds(rng, num_terrains).repeat(len(dose.values))
+    values = dose.terrains(num_terrains, rng)
+    kind: dict[str, Any] = {"heights" if values.ndim == 3 else "genes": values}
+    terrains = Terrains(seeds=seeds, space=load_space(dose.space), **kind)
+    return TerrainSet(terrains=terrains, numbers=np.arange(len(seeds)))
 
 
 def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.labels import COMPARED, HELD_OUT, SetsCfg
-from qd.evaluate.marks import check_untrained, read_trained_on
+from qd.evaluate.labels import COMPARED, HELD_OUT, MEASURES, RATES, SETS, SetsCfg
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise_crossings, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     TerrainSet,
+    check_untrained,
     make_sets,
     paper_terrains,
     plain_set,
     random_elites,
     read_independent,
+    read_trained_on,
     split_elites,
 )
-from qd.evaluate.show import show_comparison, show_rates, show_tables
-from qd.evaluate.tables import Tables, check_seeds, make_tables
+from qd.evaluate.tables import Tables, check_seeds, make_tables, rate_cells, show_comparison, show_table, show_tables
 from qd.faults.numbers import EPISODES
 from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, read_robot_archive, search_seed
@@ -30,6 +30,7 @@ from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine
 from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, resolve_policy
 from sim.files.command import publish
+from sim.files.intervals import format_value
 from sim.robots.find import get_robot, read_penalty_scales
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
@@ -78,9 +79,15 @@ def cross_sets(
         for number, ((controller, policy), (name, terrains)) in enumerate(crossings, 1):
             label = f"{controller} on {name}{note}" + (f" ({engine})" if engine != "search" else "")
             result = crosser.cross(
-                policy, terrains.to_cross, replicas=episodes, engine=engine, reward=reward,
-                penalties_from_s=penalties_from_s, label=f"{number} of {len(crossings)}: {label}", room=largest,
-            )  # fmt: skip
+                policy,
+                terrains.terrains,
+                replicas=episodes,
+                engine=engine,
+                reward=reward,
+                penalties_from_s=penalties_from_s,
+                label=f"{number} of {len(crossings)}: {label}",
+                room=largest,
+            )
             rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
             print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)
             results[name][controller] = result
@@ -154,7 +161,7 @@ def evaluate_tables(
     else:
         sets = make_sets(cfg.sets, terrains, cfg.seed, archive=archive, independent=independent, space=space)
     for name in set(HELD_OUT).intersection(sets):
-        check_untrained(controllers, sets[name].terrains, f"{cfg.archive} held out for the test")
+        check_untrained(controllers, sets[name].terrains.values, f"{cfg.archive} held out for the test")
     if independent is not None:  # all of its elites: those of a search that was trained on share ancestors
         check_untrained(controllers, independent.genes, str(cfg.independent))
 
@@ -213,10 +220,9 @@ def evaluate_rates(
     controller = crosser_name(robot, policy)
 
     def make_report() -> dict[str, Any]:
-        results = cross_sets(
-            {controller: policy}, sets, robot, compute, episodes,
-            penalties_from_s=VELOCITY_FROM_S, cache=crossings_folder(robot),
-        )  # fmt: skip
+        cache = crossings_folder(robot)
+        policies = {controller: policy}
+        results = cross_sets(policies, sets, robot, compute, episodes, penalties_from_s=VELOCITY_FROM_S, cache=cache)
         hand_crafted, hard_random, flat = (results[name][controller] for name in sets)
         types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
         return {
@@ -229,3 +235,16 @@ def evaluate_rates(
         }
 
     return publish(out or RUNS / f"{controller}-rates.json", make_report, show_rates)
+
+
+def show_rates(report: dict[str, Any]) -> None:
+    """Prints the rates of one controller, as ``base.json`` has them."""
+    rows = []
+    for name in ("hand_crafted", "hard_random"):
+        groups = {SETS[name]: report[name]}
+        groups |= {f"  {key}": group for key, group in (report[name]["by_type"] or {}).items()}
+        groups |= {f"  level {key}": group for key, group in (report[name]["by_level"] or {}).items()}
+        rows += [(label, *rate_cells(group), group["terrains"]) for label, group in groups.items()]
+    show_table(report["policy"], ("", *map(MEASURES.__getitem__, RATES), "terrains"), rows)
+    error = format_value(report["flat"]["vx_error_mean"], None)
+    print(f"flat ground: v_x is off its command by {error} m/s (root mean square)")

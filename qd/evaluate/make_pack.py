@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder
-from qd.evaluate.marks import hash_elites, read_trained_on
 from qd.evaluate.pack import (
     PACK_FILE,
     TERRAINS_FILE,
@@ -22,10 +21,11 @@ from qd.evaluate.pack import (
     add_rates,
     pack_set,
     round_heights,
+    show_pack_rates,
     summarise_rates,
     write_terrains,
 )
-from qd.evaluate.show import show_pack
+from qd.evaluate.sets import hash_elites, read_trained_on
 from qd.faults.families import VERDICTS, find_families, find_verdicts, rank
 from qd.faults.minimise.results import read_minimal
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers
@@ -104,7 +104,7 @@ def make_pack(
             "terrains": crossed,
         }
 
-    return publish(out / PACK_FILE, make_report, show_pack)
+    return publish(out / PACK_FILE, make_report, _show_pack)
 
 
 def _read_judged(search: Search) -> Archive:
@@ -198,3 +198,10 @@ def choose_terrains(entries: Sequence[Entry], size: int) -> list[int]:
         chosen.append(best)
         counts.update((name, entries[best][name]) for name in _SPREAD_OVER)
     return chosen
+
+
+def _show_pack(report: dict[str, Any]) -> None:
+    """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
+    verdicts = Counter(entry["verdict"] for entry in report["terrains"])
+    title = ", ".join(f"{verdict}: {count} terrains" for verdict, count in verdicts.items())
+    show_pack_rates(title, report["rates"])

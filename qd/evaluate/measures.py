@@ -57,7 +57,8 @@ def valid_interval(
 ) -> list[float] | None:
     """95 % interval of :func:`valid_mean`: bootstrap over terrains, or over their families."""
     valid = ~np.isnan(values)
-    return bootstrap_interval(values[valid], seed, families=select_families(families, valid), bounds=bounds)
+    families = None if families is None else families[valid]
+    return bootstrap_interval(values[valid], seed, families=families, bounds=bounds)
 
 
 def measure_bounds(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
@@ -88,7 +89,7 @@ def kind_mean(
     kinds = [sign * kind[:, valid] for sign, kind in zip((1.0, -1.0), values, strict=False)]
     by_terrain = np.sum([kind.mean(axis=0) for kind in kinds], axis=0)
     bounds = measure_bounds(measure, differences=len(kinds) > 1)
-    bootstrap = valid_interval(by_terrain, seed, select_families(families, valid), bounds)
+    bootstrap = valid_interval(by_terrain, seed, None if families is None else families[valid], bounds)
     variances = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in kinds if len(kind) > 1]
     variance = sum(value for value, _ in variances)
     if bootstrap is not None:
@@ -103,11 +104,6 @@ def kind_mean(
     if interval and bounds:
         interval = np.clip(interval, *bounds).tolist()
     return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in kinds]}
-
-
-def select_families(families: Families, mask: NDArray[np.bool_]) -> Families:
-    """Families of the terrains of a mask, shape (T,)."""
-    return None if families is None else families[mask]
 
 
 def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
@@ -134,27 +130,30 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
     )
 
 
-def _summarise_group(rates: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-    return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
-
-
 def summarise_crossings(
     result: RolloutResult, seed: int, *, types: np.ndarray | None = None, levels: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Rates over a set of terrains, with 95 % intervals and, where known, by type and level."""
     rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
-    summary = _summarise_group(rates, np.ones(len(result.outcome), bool))
-    summary |= {f"{name}_interval": valid_interval(values, seed, None, RATES) for name, values in rates.items()}
-    summary["episodes"] = int(result.outcome.size)
-    outcomes = [outcome for outcome in Outcome if outcome != Outcome.TILT]
-    summary["outcomes"] = {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in outcomes}
-    summary["invalid_terrains"] = int(np.isnan(rates["success_rate"]).sum())
-    summary["by_type"] = summary["by_level"] = None
+
+    def summarise(mask: NDArray[np.bool_]) -> dict[str, Any]:
+        return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
+
+    by_type = by_level = None
     if types is not None:
-        summary["by_type"] = {CROSSING_TYPES[k]: _summarise_group(rates, types == k) for k in np.unique(types)}
+        by_type = {CROSSING_TYPES[k]: summarise(types == k) for k in np.unique(types)}
     if levels is not None:
-        summary["by_level"] = {str(level): _summarise_group(rates, levels == level) for level in np.unique(levels)}
-    return summary
+        by_level = {str(level): summarise(levels == level) for level in np.unique(levels)}
+    outcomes = [outcome for outcome in Outcome if outcome != Outcome.TILT]
+    return {
+        **summarise(np.ones(len(result.outcome), bool)),
+        **{f"{name}_interval": valid_interval(values, seed, None, RATES) for name, values in rates.items()},
+        "episodes": int(result.outcome.size),
+        "outcomes": {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in outcomes},
+        "invalid_terrains": int(np.isnan(rates["success_rate"]).sum()),
+        "by_type": by_type,
+        "by_level": by_level,
+    }
 
 
 def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
-from qd.evaluate.labels import RATES
+from qd.evaluate.labels import MEASURES, RATES
 from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
-from qd.evaluate.sets import TerrainSet, set_rng
-from qd.evaluate.show import show_pack_test
+from qd.evaluate.sets import TerrainSet, draw_seeds, set_rng
+from qd.evaluate.tables import rate_cells, show_table
 from qd.faults.numbers import EPISODES
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
@@ -35,6 +35,7 @@ from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.rollout import RolloutResult
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.terrains import Terrains
 
 PACK_FILE = "pack.json"
 TERRAINS_FILE = "pack.npz"
@@ -119,8 +120,9 @@ def round_heights(heights: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     """The first ``count`` terrains of a pack; ``seed`` draws their episodes."""
-    seeds = set_rng("pack", seed).integers(2**32, size=len(heights), dtype=np.uint32)
-    return TerrainSet(terrains=heights[:count], seeds=seeds[:count], numbers=np.arange(count))
+    seeds = draw_seeds(set_rng("pack", seed), len(heights))
+    terrains = Terrains(heights=heights[:count], seeds=seeds[:count])
+    return TerrainSet(terrains=terrains, numbers=np.arange(count))
 
 
 def evaluate_pack(
@@ -179,17 +181,15 @@ def add_rates(entries: Sequence[Entry], results: Mapping[str, RolloutResult]) ->
 
     Each controller has three rates, the interval of the goal rate (Wilson), and how many episodes are valid.
     """
-    rates: list[dict[str, Any]] = [{} for _ in entries]
+    crossed: list[dict[str, Any]] = [{} for _ in entries]
     for controller, result in results.items():
         counted = counted_episodes(result.invalid)
         goals = (result.reached_goal & counted).sum(axis=1).tolist()
-        episodes = counted.sum(axis=1).tolist()
-        for name, values in terrain_rates(result).items():
-            for row, value, valid in zip(rates, values.tolist(), episodes, strict=True):
-                row.setdefault(controller, {})[f"{name}_rate"] = value if valid else None
-        for row, hits, valid in zip(rates, goals, episodes, strict=True):
-            row[controller] |= {"goal_interval": list(wilson_interval(hits, valid)), "valid_episodes": valid}
-    return [entry | {"rates": row} for entry, row in zip(entries, rates, strict=True)]
+        rates = terrain_rates(result)
+        for k, (row, valid) in enumerate(zip(crossed, counted.sum(axis=1).tolist(), strict=True)):
+            row[controller] = {f"{name}_rate": float(values[k]) if valid else None for name, values in rates.items()}
+            row[controller] |= {"goal_interval": list(wilson_interval(goals[k], valid)), "valid_episodes": valid}
+    return [entry | {"rates": row} for entry, row in zip(entries, crossed, strict=True)]
 
 
 def _read_rates(entries: Sequence[Entry], controller: str, name: str) -> NDArray[np.float64]:
@@ -227,3 +227,21 @@ def count_failing(entries: Sequence[Entry], controller: str, group: str) -> dict
     failing = Counter(value for value, fail in zip(values, fails, strict=True) if fail)
     by_frequency = sorted(Counter(values).items(), key=lambda item: (-item[1], item[0]))
     return {value: {"terrains": count, "failing": failing[value]} for value, count in by_frequency}
+
+
+def show_pack_test(report: dict[str, Any]) -> None:
+    """Prints how many terrains of a pack a controller fails, beside the pack's controllers."""
+    title = f"pack {report['pack']['folder']} of {report['pack']['robot']}"
+    show_pack_rates(title, {"this": report["rates"], **report["beside"]})
+    for group, counts in report["by"].items():
+        rows = [(value, count["failing"], count["terrains"]) for value, count in counts.items()]
+        show_table(f"failed, by {group}", ("", "fails", "of"), rows)
+
+
+def show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
+    """Prints the rates of controllers on a pack."""
+    rows = []
+    for name, row in rates.items():
+        families = f"{row['failing_families']} of {row['families']}"
+        rows.append((name, *rate_cells(row), f"{row['failing']} of {row['terrains']}", families))
+    show_table(title, ("", *map(MEASURES.__getitem__, RATES), "fails", "families"), rows)

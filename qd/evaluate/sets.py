@@ -5,11 +5,11 @@ the same terrains with the same episode seeds. Validation sets, by which setting
 same kinds: no setting is chosen by the reported terrains.
 
 The archive determines which elites are held out. An archive that grew holds out others, and a controller may have been
-trained on some of them before; :mod:`qd.evaluate.marks` finds these.
+trained on some of them before: the marks of its elites, in its file or in its training record, say so.
 """
 
 import hashlib
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,20 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
-from qd.evaluate.marks import hash_elites
 from qd.faults.families import find_families, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_robot_archive, search_seed
+from sim.controllers.formats.rsl_rl import read_weights
+from sim.controllers.spec import ControllerSpec
+from sim.files.atomic import read_json
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.robots.training import PaperCfg
 from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space, load_space
+from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
+TRAINED_ON = "trained_on"
+"""Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""
+_MARK_LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
 Purpose = Literal["test", "validation"]
 """What terrains are for: numbers to report, or the choice of settings."""
 MIN_ELITES = 5
@@ -58,46 +63,36 @@ class EliteSplit:
 
 @dataclass(frozen=True, kw_only=True)
 class TerrainSet:
-    """T terrains with the seeds of their episodes."""
+    """T terrains to cross, and what is known of each."""
 
-    terrains: NDArray[np.float32]
-    """Genes, shape (T, num_genes), or heights [m], shape (T, NUM_ROWS, NUM_COLS)."""
-    seeds: NDArray[np.uint32]
-    """Seed of each terrain's episodes, shape (T,)."""
+    terrains: Terrains
     numbers: NDArray[np.int64]
     """Number of each terrain, shape (T,): an elite's row in the archive, else the index in the set."""
     types: NDArray[np.int64] | None = None
     """Index into :data:`sim.terrains.hand_crafted.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
     levels: NDArray[np.int64] | None = None
     """Level of each hand-crafted terrain, shape (T,)."""
-    space: str = SUPER_GAUSSIAN.name
-    """Terrain space of genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
-    families: NDArray[np.int64] | None = None
-    """Number of each elite's family (:func:`qd.faults.families.find_families`), shape (T,); None of independent
-    terrains."""
     elites: Archive | None = None
-    """The elites as an archive; None of other terrains."""
+    """The elites as an archive, with their families; None of other terrains."""
 
     def __len__(self) -> int:
-        return len(self.seeds)
+        return len(self.numbers)
 
     @property
-    def to_cross(self) -> Terrains:
-        """The terrains as what crosses them takes them."""
-        kind: dict[str, Any] = {"heights" if self.terrains.ndim == 3 else "genes": self.terrains}
-        return Terrains(seeds=self.seeds, space=load_space(self.space), **kind)
+    def families(self) -> NDArray[np.int64] | None:
+        """Number of each elite's family, shape (T,); None of independent terrains."""
+        return None if self.elites is None else self.elites.family
 
     @property
     def certified(self) -> NDArray[np.bool_] | None:
         """Whether another controller crosses each elite that the searched one fails, shape (T,); None if unknown."""
         return self.elites.certified if self.elites is not None and self.elites.certifiers else None
 
-    def rows(self, indices: NDArray[np.int64]) -> "TerrainSet":
-        """The terrains at some indices."""
-        arrays: dict[str, Any] = {
-            name: value[indices] for name, value in vars(self).items() if isinstance(value, np.ndarray)
-        }
-        return replace(self, **arrays, elites=None if self.elites is None else self.elites.rows(indices))
+    def rows(self, chosen: NDArray[np.int64]) -> "TerrainSet":
+        """Some of the terrains alone."""
+        values = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray | Terrains)}
+        chosen_values: dict[str, Any] = {name: value[chosen] for name, value in values.items()}
+        return replace(self, **chosen_values, elites=self.elites and self.elites.rows(chosen))
 
 
 def paper_terrains(robot: str) -> int:
@@ -168,7 +163,8 @@ def set_rng(name: str, seed: int, purpose: Purpose = "test") -> np.random.Genera
     return np.random.default_rng([_KEYS[purpose], _NAMES.index(name), seed])
 
 
-def _episode_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint32]:
+def draw_seeds(rng: np.random.Generator, count: int) -> NDArray[np.uint32]:
+    """Seeds of the episodes of a set, shape (count,)."""
     return rng.integers(2**32, size=count, dtype=np.uint32)
 
 
@@ -177,32 +173,30 @@ def plain_set(
 ) -> TerrainSet:
     """``count`` terrains of a set that needs no archive: ``hand_crafted``, ``hard_random`` of a space, or ``flat``."""
     rng = set_rng(name, seed, purpose)
+    values: dict[str, Any] = {"heights": np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)}
     types = levels = None
     if name == "hand_crafted":
-        terrains, types, levels = hand_crafted_crossings(count, rng)
-        terrains *= np.float32(space.height_share)
+        values["heights"], types, levels = hand_crafted_crossings(count, rng)
+        values["heights"] *= np.float32(space.height_share)
     elif name == "hard_random":
-        terrains = space.hard_random(count, rng)
-    else:
-        terrains = np.zeros((count, NUM_ROWS, NUM_COLS), np.float32)
-    seeds = _episode_seeds(rng, count)
-    numbers = np.arange(count)
-    return TerrainSet(terrains=terrains, seeds=seeds, numbers=numbers, types=types, levels=levels, space=space.name)
+        values = {"genes": space.hard_random(count, rng)}
+    terrains = Terrains(seeds=draw_seeds(rng, count), space=space, **values)
+    return TerrainSet(terrains=terrains, numbers=np.arange(count), types=types, levels=levels)
 
 
 def generated_set(archive: Archive, count: int, seed: int, purpose: Purpose = "test") -> TerrainSet:
     """Held-out elites: the first ``count`` drawn, or all of them; ``seed`` is that of their episodes."""
     split = split_elites(archive)
     held_out = split.test if purpose == "test" else split.validation
-    seeds = _episode_seeds(set_rng("generated", seed, purpose), len(held_out))
+    seeds = draw_seeds(set_rng("generated", seed, purpose), len(held_out))
     return _set_of_elites(archive, held_out[:count], seeds[:count])
 
 
 def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on: Set[str] = frozenset()) -> TerrainSet:
-    """``count`` elites, or all, without those of some hashes (:mod:`qd.evaluate.marks`); ``seed`` draws them."""
+    """``count`` elites, or all, without those of some marks (:func:`hash_elites`); ``seed`` draws them."""
     rng = set_rng(name, seed)
     rows = _sort_by_genes(archive)[rng.permutation(len(archive))]
-    seeds = _episode_seeds(rng, len(archive))
+    seeds = draw_seeds(rng, len(archive))
     untrained = ~np.isin(hash_elites(archive.genes[rows]), [*trained_on])
     return _set_of_elites(archive, rows[untrained][:count], seeds[untrained][:count])
 
@@ -211,23 +205,14 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
     """A set of elites with their families in the whole archive, if it was judged: kin of kin may not be in the set."""
     elites = archive.rows(rows)
     space = read_space(archive)
-    families = find_families(elites.genes, space) if elites.family is None else elites.family
-    return TerrainSet(
-        terrains=elites.genes, seeds=seeds, numbers=rows, space=space.name, families=families, elites=elites
-    )
+    if elites.family is None:
+        elites = replace(elites, family=find_families(elites.genes, space))
+    return TerrainSet(terrains=Terrains(genes=elites.genes, seeds=seeds, space=space), numbers=rows, elites=elites)
 
 
 def read_space(archive: Archive) -> TerrainSpace:
     """The terrain space of an archive."""
     return get_space(archive.space, archive.space_sha256)
-
-
-def far_third(whole: TerrainSet, distance: NDArray[np.float64]) -> TerrainSet:
-    """The third of a set that is farthest from training terrains, in the set's order and with the same episodes.
-
-    ``distance`` is that of each terrain to its nearest training terrain, shape (T,).
-    """
-    return whole.rows(np.sort(np.argsort(-distance, kind="stable")[: -(-len(distance) // 3)]))
 
 
 def nearest_distance(
@@ -274,8 +259,49 @@ def make_sets(
         sets["generated"] = whole = generated_set(archive, count, seed, purpose)
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
-            distance = nearest_distance(whole.terrains, training_genes, read_space(archive))
-            sets["generated_far"] = far_third(whole, distance)
+            distance = nearest_distance(whole.terrains.values, training_genes, whole.terrains.space)
+            third = np.sort(np.argsort(-distance, kind="stable")[: -(-len(whole) // 3)])
+            sets["generated_far"] = whole.rows(third)
     if independent is not None and INDEPENDENT in names:
         sets[INDEPENDENT] = random_elites(INDEPENDENT, independent, count, seed)
     return {name: sets[name] for name in SETS if name in names}
+
+
+def hash_elites(genes: NDArray[np.float32]) -> list[str]:
+    """A short mark of each elite that depends on its genes, shape (E, num_genes), alone."""
+    rows = np.ascontiguousarray(genes, np.float32)
+    return [hashlib.sha256(row.tobytes()).hexdigest()[:_MARK_LENGTH] for row in rows]
+
+
+def read_trained_on(policy: str) -> set[str]:
+    """Marks of the elites that a controller was trained on, by its file and the record beside it; none if none are."""
+    marks: set[str] = set()
+    for file in ControllerSpec.parse(policy).files:
+        record = file.with_suffix(".train.json")
+        for content in (read_json(record) if record.is_file() else {}, _content_of(file)):
+            recorded = content.get(TRAINED_ON, [])
+            if not isinstance(recorded, list) or not all(isinstance(mark, str) for mark in recorded):
+                raise ValueError(f"{file} or the record beside it is damaged at {TRAINED_ON}: put a copy of it back")
+            marks.update(recorded)
+    return marks
+
+
+def _content_of(file: Path) -> dict[str, Any]:
+    """What a file of weights holds; nothing of another kind of file."""
+    try:
+        content = read_weights(file)
+    except Exception:  # another kind of file, which has no marks
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:
+    """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on."""
+    marks = hash_elites(genes)
+    for name, policy in controllers.items():
+        count = len(read_trained_on(policy).intersection(marks))
+        if count:
+            raise ValueError(
+                f"{name} must not be tested on what it was trained on, got {count} of the {len(marks)} elites of "
+                f"{elites}: give the archive as it was when it was trained, or another search"
+            )

@@ -7,21 +7,25 @@ be chance. A change is *clear* if the 95 % intervals (Wilson) of the two goal ra
 """
 
 import re
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
-from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES
-from qd.evaluate.measures import Performance, kind_mean, measure_bounds, select_families, valid_interval, valid_mean
+from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, RATES, SETS
+from qd.evaluate.measures import Performance, kind_mean, measure_bounds, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet
 from qd.search.fitness import FAILING_GOAL_RATE
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
-from sim.files.intervals import wilson_interval
+from sim.files.command import say
+from sim.files.intervals import format_value, wilson_interval
 from sim.robots.robot import RobotCfg, check_robot_digest
 
 Tables = dict[str, Any]
@@ -41,6 +45,8 @@ Tables = dict[str, Any]
 - ``controllers``: ``policy`` and ``sha256`` by name.
 """
 _MEASURES = (*MEASURES, *CERTIFIED)
+_WIDTH = 160  # of tables in a file
+_FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 
 Value = TypeVar("Value")
 Performances = Mapping[str, Mapping[str, Performance]]
@@ -83,7 +89,26 @@ def make_tables(
     seed: int,
 ) -> Tables:
     """The tables of controllers on sets of terrains."""
-    means = _compute_statistics(performances, sets, lambda values, *_: valid_mean(values))
+    means: dict[str, dict[str, Any]] = {key: {} for key in (*_MEASURES, "penalties")}
+    intervals: dict[str, dict[str, Any]] = {key: {} for key in means}
+    for name, row in performances.items():
+        families = sets[name].families
+        for key, values in _list_measures(sets[name], row):
+            bounds = measure_bounds(key)
+            means[key][name] = {controller: valid_mean(value) for controller, value in values.items()}
+            intervals[key][name] = {
+                controller: valid_interval(value, seed, families, bounds) for controller, value in values.items()
+            }
+        means["penalties"][name] = {
+            controller: {penalty: valid_mean(value) for penalty, value in measured.penalties.items()}
+            for controller, measured in row.items()
+        }
+        intervals["penalties"][name] = {
+            controller: {
+                penalty: valid_interval(value, seed, families, None) for penalty, value in measured.penalties.items()
+            }
+            for controller, measured in row.items()
+        }
     return {
         "robot": robot.name,
         "episodes": episodes,
@@ -91,47 +116,28 @@ def make_tables(
         **means,
         "certified": _count_certified(sets, controllers),
         "over_seeds": over_seeds(performances, sets, seed),
-        "intervals": _compute_statistics(
-            performances, sets, lambda values, families, bounds: valid_interval(values, seed, families, bounds)
-        ),
+        "intervals": intervals,
         "terrains": {name: len(terrains) for name, terrains in sets.items()},
         "differences": {
             name: {
                 f"{first} -> {second}": difference(row[first], row[second], sets[name], seed)
-                for first, second in combinations(_first_names(row), 2)
+                for (first, *_), (second, *_) in combinations(by_kind({name: name for name in row}).values(), 2)
             }
             for name, row in performances.items()
         },
     }
 
 
-def _compute_statistics(
-    performances: Performances, sets: Mapping[str, TerrainSet], statistic: Callable[..., Any]
-) -> dict[str, Any]:
-    """Each measure and ``penalties``: set -> controller -> a statistic of the terrains' values, families and bounds."""
-    tables: dict[str, Any] = {key: {} for key in (*MEASURES, "penalties", *CERTIFIED)}
-    for name, row in performances.items():
-        families = sets[name].families
-        for key, measure, mask in _list_measures(sets[name]):
-            masked = select_families(families, mask)
-            tables[key][name] = {
-                controller: statistic(performance.values[measure][mask], masked, measure_bounds(measure))
-                for controller, performance in row.items()
-            }
-        tables["penalties"][name] = {
-            controller: {key: statistic(values, families, None) for key, values in performance.penalties.items()}
-            for controller, performance in row.items()
-        }
-    return tables
-
-
-def _list_measures(terrains: TerrainSet) -> list[tuple[str, str, NDArray[np.bool_]]]:
-    """Key of each number of a set, its measure, and the mask of its terrains, shape (T,)."""
-    everywhere = np.ones(len(terrains), bool)
-    measures = [(key, key, everywhere) for key in MEASURES]
-    if terrains.certified is not None:
-        measures += [(key, measure, terrains.certified) for key, measure in CERTIFIED.items()]
-    return measures
+def _list_measures(
+    terrains: TerrainSet, row: Mapping[str, Performance]
+) -> Iterator[tuple[str, dict[str, NDArray[np.float64]]]]:
+    """Each measure of a set: its value on each terrain by controller, NaN where the terrain does not count."""
+    for measure in MEASURES:
+        yield measure, {name: measured.values[measure] for name, measured in row.items()}
+    certified = terrains.certified
+    if certified is not None:
+        for key, measure in CERTIFIED.items():
+            yield key, {name: np.where(certified, measured.values[measure], np.nan) for name, measured in row.items()}
 
 
 def _count_certified(
@@ -160,7 +166,6 @@ def _count_certified(
 def difference(before: Performance, after: Performance, terrains: TerrainSet, seed: int) -> dict[str, Any]:
     """What became of each terrain of a set from one controller to another, and the mean gain of the second."""
     valid = before.valid & after.valid
-    families = select_families(terrains.families, valid)
     failed, fails = (valid & (controller.values["goal"] < FAILING_GOAL_RATE) for controller in (before, after))
     limits = _wilson_limits(before)
     then_limits = _wilson_limits(after)
@@ -172,9 +177,9 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
         return {"count": int(mask.sum()), "terrains": np.sort(terrains.numbers[mask]).tolist()}
 
     def gain(name: str) -> dict[str, Any]:
-        values = (after.values[name] - before.values[name])[valid]
+        values = after.values[name] - before.values[name]
         bounds = measure_bounds(name, differences=True)
-        return {"mean": valid_mean(values), "interval": valid_interval(values, seed, families, bounds)}
+        return {"mean": valid_mean(values), "interval": valid_interval(values, seed, terrains.families, bounds)}
 
     return {
         "compared": int(valid.sum()),
@@ -228,21 +233,69 @@ def by_kind(row: Mapping[str, Value]) -> dict[str, list[Value]]:
     return kinds
 
 
-def _first_names(row: Mapping[str, Any]) -> list[str]:
-    """The first controller of each kind, in order."""
-    return [names[0] for names in by_kind({name: name for name in row}).values()]
-
-
 def over_seeds(performances: Performances, sets: Mapping[str, TerrainSet], seed: int) -> dict[str, Any]:
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for name, row in performances.items():
-        families = sets[name].families
-        for kind, trainings in by_kind(row).items():
-            for key, measure, mask in _list_measures(sets[name]) if len(trainings) > 1 else ():
-                values = np.array([training.values[measure][mask] for training in trainings])
-                mean = kind_mean([values], select_families(families, mask), seed, measure)
-                summary = {number: mean and mean[number] for number in ("mean", "interval")}
-                summary["values"] = [valid_mean(training) for training in values]
-                summaries.setdefault(key, {}).setdefault(name, {})[kind] = summary
+        for key, values in _list_measures(sets[name], row):
+            for kind, trainings in by_kind(values).items():
+                if len(trainings) > 1:
+                    mean = kind_mean([np.array(trainings)], sets[name].families, seed, key)
+                    summary = {number: mean and mean[number] for number in ("mean", "interval")}
+                    summary["values"] = [valid_mean(training) for training in trainings]
+                    summaries.setdefault(key, {}).setdefault(name, {})[kind] = summary
     return summaries
+
+
+def show_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Prints a table; its first column has the rows' names."""
+    console = Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
+    table = Table(*head[:1], box=None, pad_edge=False)
+    for column in head[1:]:
+        table.add_column(column, justify="right", overflow="fold")
+    for row in rows:
+        table.add_row(*map(str, row))
+    console.print(f"\n{title}", style="bold")
+    console.print(table)
+
+
+def rate_cells(row: Mapping[str, Any]) -> list[str]:
+    """Rates with their intervals, one cell each."""
+    return [format_value(row[f"{rate}_rate"], row.get(f"{rate}_interval")) for rate in RATES]
+
+
+def show_tables(report: dict[str, Any]) -> None:
+    """Prints the means of every set with every controller, and what became of terrains."""
+    for name, count in report["terrains"].items():
+        limits = {measure: report["intervals"][measure][name] for measure in _FORMS}
+        rows = [
+            (label, *(format_value(report[key][name][label], limits[key][label], form) for key, form in _FORMS.items()))
+            for label in report["controllers"]
+        ]
+        title = f"{SETS.get(name, name)}: {count} terrains x {report['episodes']} episodes"
+        show_table(title, ("", *map(MEASURES.__getitem__, _FORMS)), rows)
+    rows = []
+    for name, pairs in report["differences"].items():
+        for pair, change in pairs.items():
+            changed = (f"{change[fate]['count']} ({change[fate]['clear']})" for fate in ("mended", "newly_broken"))
+            gain = format_value(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+            rows.append((f"{name}, {pair}", *changed, change["still_failing"]["count"], change["compared"], gain))
+    if rows:
+        title = "terrains on which under half of the episodes reach the goal; in brackets beyond chance"
+        show_table(title, ("", "mended", "newly broken", "still failing", "of", "gain of the goal rate"), rows)
+
+
+def show_comparison(report: dict[str, Any]) -> None:
+    """Prints what became of elites from an old controller to a new one."""
+    change = report["differences"][COMPARED]["old -> new"]
+    for name in ("old", "new"):
+        goal = format_value(report["goal"][COMPARED][name], report["intervals"]["goal"][COMPARED][name])
+        say(f"{name}: {goal} of the robots reach the goal")
+    for fate, label, style in (("newly_broken", "newly failed", "red"), ("mended", "newly crossed", "green")):
+        count = change[fate]["count"]
+        numbers = ", ".join(map(str, change[fate]["terrains"]))
+        clear = f", {change[fate]['clear']} of them beyond chance: {numbers}" if count else ""
+        say((f"{count} of {change['compared']} elites {label}", style if count else ""), clear)
+    gain = format_value(change["gain"]["goal"]["mean"], change["gain"]["goal"]["interval"], "+.3f")
+    verdict = ("a regression", "bold red") if is_regression(report) else ("no regression", "bold green")
+    say(f"new - old: {gain}, 95 % interval over families: ", verdict)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.marks import hash_elites, read_trained_on
+from qd.evaluate.sets import hash_elites, read_trained_on
 from qd.faults.numbers import VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
 from qd.faults.searches import find_search
 from qd.faults.stages import STAGES, Judging, open_judging, with_families

@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.marks import hash_elites, read_trained_on
-from qd.evaluate.sets import make_sets, nearest_distance, paper_terrains, read_space, split_elites
+from qd.evaluate.sets import (
+    hash_elites,
+    make_sets,
+    nearest_distance,
+    paper_terrains,
+    read_space,
+    read_trained_on,
+    split_elites,
+)
 from results.make.common import parse, published_controllers
 
 
@@ -24,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     names = ("hard_random", "generated", "generated_far", "generated_independent")
     sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=read_space(archive))
     nearest = {
-        name: nearest_distance(terrains.terrains, trained_on, read_space(archive)) for name, terrains in sets.items()
+        name: nearest_distance(terrains.terrains.values, trained_on, read_space(archive))
+        for name, terrains in sets.items()
     }
     rows = {}
     for name, distances in nearest.items():

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from qd.evaluate.show import show_table
+from qd.evaluate.tables import show_table
 from sim.controllers.loaders import prepare_torch
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, to_json, write_atomically

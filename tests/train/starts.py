@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from qd.evaluate.marks import TRAINED_ON, hash_elites
+from qd.evaluate.sets import TRAINED_ON, hash_elites
 from train.cfg import PpoCfg
 from train.ppo.checkpoint import STD
 

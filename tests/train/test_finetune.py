@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.evaluate.marks import hash_elites, read_trained_on
-from qd.evaluate.sets import split_elites
+from qd.evaluate.sets import hash_elites, read_trained_on, split_elites
 from qd.search.archive import write_archive
 from sim.controllers.loaders import load_policy
 from sim.controllers.spec import controller_hash

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from qd.evaluate.marks import hash_elites, read_trained_on
-from qd.evaluate.sets import generated_set, make_sets, split_elites
+from qd.evaluate.sets import generated_set, hash_elites, make_sets, read_trained_on, split_elites
 from qd.search.archive import read_archive, write_archive
 from qd.workers.compute import Compute
 from sim.files.atomic import read_json, to_json
@@ -180,14 +179,14 @@ def test_the_choice_is_by_terrains_that_are_neither_reported_nor_trained_on(hard
     assert list(content["choices"]["tune-1"]["goal"]["after"]) == ["hand_crafted", "hard_random", "elites"]
     archive = read_archive(place / "run" / "search-0")
     validation = split_elites(archive).validation
-    assert set(hash_elites(seen["search-0"].terrains)) == set(hash_elites(archive.genes[validation]))
+    assert set(hash_elites(seen["search-0"].terrains.genes)) == set(hash_elites(archive.genes[validation]))
     reported = make_sets(("hand_crafted", "hard_random"), 3, 0)
-    assert not any(np.array_equal(seen[name].terrains, reported[name].terrains) for name in reported)
+    assert not any(np.array_equal(seen[name].terrains.values, reported[name].terrains.values) for name in reported)
     tested, trained = (
-        hash_elites(generated_set(archive, 3, 0).terrains),
+        hash_elites(generated_set(archive, 3, 0).terrains.genes),
         read_trained_on(f"{place}/run/tune-1/policy.pt"),
     )
-    assert trained and not {*tested, *trained} & set(hash_elites(seen["search-0"].terrains))
+    assert trained and not {*tested, *trained} & set(hash_elites(seen["search-0"].terrains.genes))
     assert not set(tested) & trained
 
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import torch
 
-from qd.evaluate.marks import TRAINED_ON
+from qd.evaluate.sets import TRAINED_ON
 from qd.search.archive import ARCHIVE_FILE
 from qd.search.directory import CHECKPOINT_FILE
 from qd.search.settings import differences

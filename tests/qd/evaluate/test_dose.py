@@ -48,8 +48,8 @@ def test_a_dose_from_end_to_end(anymal, tmp_path, monkeypatch):
 def test_seeds_and_places_are_the_same_for_all_values_and_doses():
     doses = parse_doses(["ditch=0.2,0.4 sill"], [])
     ditch, sill = (dose_set(doses[name], 3, 0) for name in ("ditch", "sill"))
-    np.testing.assert_array_equal(ditch.seeds, np.uint32([2133650207, 3412581510, 3220273462]).repeat(2))
-    np.testing.assert_array_equal(ditch.seeds[::2], sill.seeds[:: len(doses["sill"].values)])
+    np.testing.assert_array_equal(ditch.terrains.seeds, np.uint32([2133650207, 3412581510, 3220273462]).repeat(2))
+    np.testing.assert_array_equal(ditch.terrains.seeds[::2], sill.terrains.seeds[:: len(doses["sill"].values)])
 
 
 def test_rows_are_by_value():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from qd.evaluate.marks import TRAINED_ON, hash_elites, read_trained_on
+from qd.evaluate.sets import TRAINED_ON, hash_elites, read_trained_on
 from tests.builders import make_archive
 from tests.train.starts import write_actor, write_trained
 

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from qd.evaluate.labels import SETS
-from qd.evaluate.marks import hash_elites
 from qd.evaluate.sets import (
-    far_third,
     generated_set,
+    hash_elites,
     make_sets,
     nearest_distance,
-    plain_set,
     random_elites,
     read_independent,
     set_rng,
@@ -67,14 +65,14 @@ def test_sets_have_random_numbers_of_their_own():
 
 def test_sets_are_what_they_were():
     hand_crafted, hard_random = make_sets(["hand_crafted", "hard_random"], 3, 0).values()
-    assert hand_crafted.seeds.tolist() == [1984838927, 1048230665, 2803271684]
-    assert hard_random.seeds.tolist() == [2055184588, 2981959608, 3748095775]
-    assert hard_random.terrains[0, :4].tolist() == pytest.approx([0.2931203, 0.7102386, 0.6253537, -0.7938088])
+    assert hand_crafted.terrains.seeds.tolist() == [1984838927, 1048230665, 2803271684]
+    assert hard_random.terrains.seeds.tolist() == [2055184588, 2981959608, 3748095775]
+    assert hard_random.terrains.values[0, :4].tolist() == pytest.approx([0.2931203, 0.7102386, 0.6253537, -0.7938088])
     archive = make_archive(60)
     generated = generated_set(archive, 2, 0)
-    assert generated.numbers.tolist() == [10, 38] and generated.seeds.tolist() == [1519996775, 4170185451]
+    assert generated.numbers.tolist() == [10, 38] and generated.terrains.seeds.tolist() == [1519996775, 4170185451]
     independent = random_elites("generated_independent", archive, 2, 0)
-    assert independent.numbers.tolist() == [48, 42] and independent.seeds.tolist() == [2023635066, 1145927465]
+    assert independent.numbers.tolist() == [48, 42] and independent.terrains.seeds.tolist() == [2023635066, 1145927465]
 
 
 def test_a_set_is_the_same_whenever_it_is_made():
@@ -83,12 +81,13 @@ def test_a_set_is_the_same_whenever_it_is_made():
     assert list(all_at_once) == list(SETS)
     for name in SETS:
         alone = make_sets([name], 4, 0, **given)[name]
-        for field in ("terrains", "seeds", "numbers"):
-            np.testing.assert_array_equal(getattr(alone, field), getattr(all_at_once[name], field))
-        assert (other[name].seeds != all_at_once[name].seeds).all()
+        terrains, others = all_at_once[name].terrains, other[name].terrains
+        assert alone.terrains.digests() == terrains.digests()
+        np.testing.assert_array_equal(alone.numbers, all_at_once[name].numbers)
+        assert (others.seeds != terrains.seeds).all()
         # Which elites are held out does not depend on the seed of the sets.
         held_out = name in ("generated", "generated_far")
-        assert np.array_equal(other[name].terrains, all_at_once[name].terrains) == held_out
+        assert np.array_equal(others.values, terrains.values) == held_out
     for names, field in ((["easy"], "easy"), (["flat"], "flat"), (["generated"], "generated")):  # flat: of base.json
         with pytest.raises(ValueError, match=field):
             make_sets(names, 6, 0)
@@ -98,7 +97,7 @@ def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
     archive = make_archive(10)
     many = generated_set(archive, 300, 0)
     assert many.numbers.tolist() == split_elites(archive).test.tolist() and many.families.tolist() == [0, 1]
-    np.testing.assert_array_equal(many.terrains, archive.genes[many.numbers])
+    np.testing.assert_array_equal(many.terrains.genes, archive.genes[many.numbers])
     alike = replace(archive, genes=np.repeat(archive.genes[:2], 5, axis=0))
     assert np.unique(random_elites("elites", alike, 9, 0).families).tolist() == [0, 1]
     # Elites that somebody was trained on are left out.
@@ -117,8 +116,7 @@ def test_elites_carry_the_certificates_of_their_rows():
     generated = generated_set(archive, 300, 0)
     certified = split_elites(archive).test < 20
     np.testing.assert_array_equal(generated.certified, certified)
-    far = far_third(generated, np.array([0.0, 0.2, 0.1, 0.0, 0.0, 0.3]))
-    np.testing.assert_array_equal(far.certified, certified[[1, 5]])
+    np.testing.assert_array_equal(generated.rows(np.array([1, 5])).certified, certified[[1, 5]])
     assert generated_set(make_archive(30), 300, 0).certified is None
 
 
@@ -130,12 +128,15 @@ def test_the_far_third_is_the_farthest():
     maps, others = (make_heights(some, SUPER_GAUSSIAN).astype(np.float64) for some in (genes, training))
     by_hand = [min(np.sqrt(((terrain - other) ** 2).mean()) for other in others) for terrain in maps]
     np.testing.assert_allclose(distance, by_hand, atol=1e-6)
-    whole = replace(plain_set("hard_random", 4, 0), numbers=np.arange(100, 104))
-    far = far_third(whole, distance)  # a third of four, rounded up
-    places = np.sort(np.argsort(by_hand)[-2:])
-    assert far.numbers.tolist() == (100 + places).tolist()
-    for field in ("seeds", "terrains"):
-        np.testing.assert_array_equal(getattr(far, field), getattr(whole, field)[places])
+    # Of seven that are held out, the farthest three, with the same episodes.
+    archive = make_archive(35)
+    sets = make_sets(("generated", "generated_far"), 300, 0, archive=archive)
+    whole, far = sets.values()
+    chosen = np.sort(
+        np.argsort(nearest_distance(whole.terrains.genes, archive.genes[split_elites(archive).train]))[-3:]
+    )
+    assert far.numbers.tolist() == whole.numbers[chosen].tolist()
+    assert far.terrains.digests() == whole.terrains[chosen].digests()
 
 
 def test_an_independent_archive_is_of_another_search(tmp_path, anymal):

@@ -8,10 +8,9 @@ import pytest
 
 from qd.evaluate.labels import FATES
 from qd.evaluate.measures import measure
-from qd.evaluate.show import show_tables
-from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables
+from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables, show_tables
 from sim.robots.robot import robot_identity
-from tests.builders import judged_archive
+from tests.builders import judged_archive, make_archive
 from tests.qd.evaluate.made import make_measured, make_set
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
@@ -38,7 +37,7 @@ def certified(anymal):
     archive = replace(judged_archive(), policy_sha256="f" * 64).rows(np.array([2, 2, 3, 3]))
     goals = {"base": [4, 1, 0, 0], "C-G": [4, 2, 0, 4], "S": [4, 4, 4, 4]}
     row = {who: make_measured(counts, of=4) for who, counts in goals.items()}
-    elites = replace(make_set(4, 10), elites=archive, families=np.arange(4))
+    elites = replace(make_set(4, 10), elites=replace(archive, family=np.arange(4)))
     return tables_of(anymal, {"generated": row, "hard_random": row}, {"generated": elites})
 
 
@@ -62,7 +61,8 @@ def test_values_are_means_over_terrains(report):
 
 def test_intervals_over_elites_are_over_families_of_kin(anymal):
     measured = {"generated": dict.fromkeys(("base", "C-G"), make_measured([4] * 32 + [0] * 8, of=4))}
-    kin = replace(make_set(40), families=np.array([0] * 16 + [1] * 16 + [2] * 4 + [3] * 4))
+    family = np.array([0] * 16 + [1] * 16 + [2] * 4 + [3] * 4)
+    kin = replace(make_set(40), elites=replace(make_archive(40), family=family))
     by_terrains, by_families = (tables_of(anymal, measured, sets) for sets in ({}, {"generated": kin}))
     # Of four families 1 of 16 resamples has nothing but the two that fail; of 40 terrains hardly any has 20 that do.
     assert by_families["intervals"]["goal"]["generated"]["base"][0] == 0.0
@@ -129,7 +129,7 @@ def test_mean_and_interval_of_a_kind_with_several():
 def test_certified_terrains_have_intervals_over_families_and_trainings(anymal):
     archive = replace(judged_archive(), policy_sha256="f" * 64).rows(np.array([2, 2, 3, 3] * 6))
     row = {who: make_measured(counts * 6, of=4) for who, counts in {"C-G": [4, 0, 0, 4], "C-G@1": [4, 1, 0, 4]}.items()}
-    elites = replace(make_set(24, 10), elites=archive, families=np.arange(24))
+    elites = replace(make_set(24, 10), elites=replace(archive, family=np.arange(24)))
     summaries = over_seeds({"generated": row}, {"generated": elites}, 0)
     low, high = summaries["certified_goal"]["generated"]["C-G"]["interval"]
     assert archive.certified.sum() == 12 and low < 0.35 and high > 0.78  # twelve terrains, half of them crossed
