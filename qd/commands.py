@@ -99,9 +99,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         from qd.faults.judge import judge
         from qd.faults.searches import find_search
         from qd.search.directory import free_path
-        from qd.search.loop import search
-        from qd.search.start import start_search
-        from qd.search.summary import print_summary
+        from qd.search.loop import search, start_search
+        from qd.search.results import print_summary
         from sim.terrains.spaces.registry import load_space
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
@@ -173,7 +172,7 @@ class JudgeCommand(_RunFlags):
     def execute(self) -> None:
         """Judges the run."""
         from qd.faults.judge import judge
-        from qd.search.summary import print_summary
+        from qd.search.results import print_summary
 
         run, named = self.named()
         archive = judge(run, stages=self.stages, **named)

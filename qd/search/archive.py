@@ -16,6 +16,7 @@ from qd.search.descriptors import Cells
 from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
+from sim.files.settings import PositiveInt
 from sim.rates import MAX_INVALID_SHARE
 
 ARCHIVE_FILE = "archive.npz"
@@ -54,31 +55,42 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Archive(Evaluation):
+class Subject:
+    """What is searched: robot, controller and terrain space, and the intervals of the cells."""
+
+    robot: str
+    robot_sha256: str
+    """Hash of its settings, model and meshes."""
+    penalty_definition: str
+    """How the penalties are defined (:data:`sim.robots.robot.PENALTY_DEFINITION`)."""
+    policy_sha256: str | None = None
+    """Hash of the controller's files; None where there are none."""
+    space: str = "super_gaussian"
+    """Terrain space of the genes, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
+    space_sha256: str | None = None
+    """Hash of its code if it is a user's own."""
+    intervals: PositiveInt = 10
+    """Intervals of each ratio."""
+    collision_bit: bool
+    """Whether base collision is a descriptor of its own."""
+
+    def named(self) -> dict[str, Any]:
+        """Robot, controller and penalties: keys of :func:`sim.controllers.spec.controller_identity`."""
+        return {name: getattr(self, name) for name in ("robot", "robot_sha256", "policy_sha256", "penalty_definition")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Archive(Evaluation, Subject):
     """N elites by descending fitness: by the corrected one if there are fresh episodes, else as they were found.
 
     Outcomes count episodes by :data:`OUTCOMES`; they are 0 for an elite that was not crossed.
     """
 
-    robot: str
-    robot_sha256: str
-    penalty_definition: str
-    """How its penalties are defined (:data:`sim.robots.robot.PENALTY_DEFINITION`)."""
-    space: str
-    """Name of the terrain space of the genes (:func:`sim.terrains.spaces.registry.get_space`)."""
     penalties: tuple[str, ...]
     """Names of the P penalties, in the order of the ratios."""
     scales: tuple[float, ...]
     """What raw penalty sums were divided by."""
-    intervals: int
-    """Intervals of each ratio."""
-    collision_bit: bool
-    """Whether base collision is a descriptor too."""
     iterations: int
-    policy_sha256: str | None = None
-    """Hash of its controller; None where it has no file."""
-    space_sha256: str | None = None
-    """Hash of the code of the terrain space; None of a shipped one."""
 
     # As found, beside the evaluation.
     genes: NDArray[np.float32]
@@ -112,10 +124,6 @@ class Archive(Evaluation):
     """By the controller that was searched, shape (N, 4)."""
     certifier_varied_outcomes: NDArray[np.int64] | None = None
     """By the others, shape (N, C, 4)."""
-
-    def named(self) -> dict[str, Any]:
-        """Robot, controller and penalties: keys of :func:`sim.controllers.spec.controller_identity`."""
-        return {name: getattr(self, name) for name in ("robot", "robot_sha256", "policy_sha256", "penalty_definition")}
 
     def __len__(self) -> int:
         return len(self.fitness)
@@ -191,13 +199,9 @@ class Archive(Evaluation):
         tables = (self.rows(np.argsort(self.cell)), other.rows(np.argsort(other.cell)))
         return all(np.array_equal(*(getattr(table, name) for table in tables)) for name in _FOUND)
 
-    def rows(self, chosen: NDArray[np.int64]) -> "Archive":
+    def rows(self, chosen: NDArray[Any]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-        columns: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
-        columns = {name: values[chosen] for name, values in columns.items() if values is not None}
-        if self.fresh is not None:
-            columns["fresh"] = FreshValues(**{name: values[chosen] for name, values in vars(self.fresh).items()})
-        return replace(self, **columns)
+        return replace(super().rows(chosen), fresh=self.fresh and self.fresh.rows(chosen))
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with fresh values, by descending corrected fitness, the invalid elites last."""
@@ -215,30 +219,19 @@ def no_outcomes(num_elites: int) -> dict[str, Any]:
 
 
 # Arrays of the file by group, with their dimensions: N elites, G genes, P penalties, C certifiers, or a size.
-_TEXTS = ("robot", "robot_sha256", "penalty_definition", "space", "policy_sha256", "space_sha256")
 _OPTIONAL = ("policy_sha256", "space_sha256")
-_SETTINGS = {
-    **dict.fromkeys((*_TEXTS, "intervals", "collision_bit", "iterations"), ""),
-    **dict.fromkeys(("penalties", "scales"), "P"),
-}
-_VALUES = dict.fromkeys([field.name for field in fields(Evaluation)], "N") | {
-    **dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP"),
-    "end_position": "N2",
-}
+_SETTINGS = {field.name: "" for field in fields(Subject)} | {"iterations": "", "penalties": "P", "scales": "P"}
+_VALUES = {field.name: "N" for field in fields(Evaluation)} | {"end_position": "N2"}
+_VALUES |= dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP")
 _FOUND = {**_VALUES, "genes": "NG", "iteration": "N"}
 _PREFIX = "fresh_"
 _FRESH = {_PREFIX + name: shape for name, shape in {**_VALUES, "reproduced": "N"}.items()}
 _GROUPED = {"family": "N", "cause": "N"}
-_CERTIFIERS = ("certifiers", "certifier_sha256")
-_CROSSED = {
-    "resolved_outcomes": "N4",
-    **dict.fromkeys(_CERTIFIERS, "C"),
-    **dict.fromkeys(("certifier_outcomes", "certifier_resolved_outcomes"), "NC4"),
-}
+_CERTIFIERS = {"certifiers": "C", "certifier_sha256": "C"}
+_CROSSED = {"resolved_outcomes": "N4", "certifier_outcomes": "NC4", "certifier_resolved_outcomes": "NC4", **_CERTIFIERS}
 _VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
 _BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED)  # groups that a file has whole, or not at all
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
-_COLUMNS = [name for name in _SHAPES if _SHAPES[name].startswith("N") and name not in _FRESH]
 
 
 def write_archive(path: Path, archive: Archive) -> None:
@@ -247,9 +240,9 @@ def write_archive(path: Path, archive: Archive) -> None:
     values = {name: getattr(archive, name) for group in groups for name in group}
     if archive.fresh is not None:
         values |= {_PREFIX + name: column for name, column in vars(archive.fresh).items()}
+    values |= {name: np.array(values[name], np.str_) for name in _CERTIFIERS if name in values}  # of none, too
     arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
     if archive.is_judged:
-        arrays |= {name: np.array(getattr(archive, name), dtype=np.str_) for name in _CERTIFIERS}
         arrays |= {"confirmed": archive.confirmed, "certified": archive.certified}
     write_atomically(path, npz_bytes(arrays))
 
@@ -271,9 +264,8 @@ def read_archive(path: str | Path) -> Archive:
         values = no_outcomes(len(arrays["fitness"])) | values
         return Archive(**values, fresh=FreshValues(**fresh) if fresh else None)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
-        raise ValueError(
-            f"{file} must be the archive of a search, but it is damaged or another file: {error}"
-        ) from None
+        message = f"{file} must be the archive of a search, but it is damaged or another file: {error}"
+        raise ValueError(message) from None
 
 
 def _to_field(name: str, array: NDArray[Any]) -> Any:
@@ -287,8 +279,9 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
     """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
     sizes = {"2": 2, "4": len(OUTCOMES)}
     check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
+    texts = {*_SETTINGS, *_CERTIFIERS, "cause"} - {"intervals", "collision_bit", "iterations", "scales"}
     for name, array in arrays.items():
-        is_text = name in (*_TEXTS, *_CERTIFIERS, "penalties", "cause")
+        is_text = name in texts
         if array.dtype.kind not in ("U" if is_text else "bif"):
             raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")
         if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():

@@ -24,8 +24,7 @@ def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64
     valid = np.asarray(valid, dtype=bool)[..., None]
     penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)
     sums = penalties.sum(axis=-1, keepdims=True)
-    equal = np.full_like(penalties, 1.0 / penalties.shape[-1])
-    ratios = np.divide(penalties, sums, out=equal, where=sums > 0.0)
+    ratios = np.divide(penalties, sums, out=np.full_like(penalties, 1.0 / penalties.shape[-1]), where=sums > 0.0)
     count = valid.sum(axis=1)
     total = np.where(valid, ratios, 0.0).sum(axis=1)
     return np.divide(total, count, out=np.full_like(total, 1.0 / penalties.shape[-1]), where=count > 0)
@@ -51,10 +50,8 @@ class Cells:
         if num_ratios < 2:
             raise ValueError(f"num_ratios must be at least 2, got {num_ratios}: a single ratio is always 1")
         if math.comb(intervals + num_ratios - 1, intervals) > _MAX_CELLS:
-            raise ValueError(
-                f"intervals must leave fewer than {_MAX_CELLS:,} cells for {num_ratios} penalties, got {intervals}: "
-                "take fewer"
-            )
+            limit = f"fewer than {_MAX_CELLS:,} cells for {num_ratios} penalties"
+            raise ValueError(f"intervals must leave {limit}, got {intervals}: take fewer")
         self.num_ratios = num_ratios
         self.intervals = intervals
         self.collision_bit = collision_bit
@@ -69,11 +66,10 @@ class Cells:
         """The reachable interval tuples in lexicographic order, shape (num_tuples, num_ratios)."""
         tuples = np.zeros((1, 0), dtype=np.int64)
         for _ in range(self.num_ratios):
-            longer = [np.column_stack([tuples, np.full(len(tuples), index)]) for index in range(self.intervals)]
+            longer = [np.insert(tuples, 0, index, axis=1) for index in range(self.intervals)]
             tuples = np.vstack(longer)
             tuples = tuples[tuples.sum(axis=1) < self.intervals]
-        tuples = tuples[tuples.sum(axis=1) + self.num_ratios > self.intervals]
-        return tuples[np.lexsort(tuples.T[::-1])]
+        return tuples[tuples.sum(axis=1) + self.num_ratios > self.intervals]
 
     @cached_property
     def codes(self) -> NDArray[np.int64]:
@@ -92,32 +88,24 @@ class Cells:
             collided: The collision bit, shape (batch,); needed where there is one.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
-        self._check_ratios(ratios)
-        tuples = self._to_reachable(self._find_intervals(ratios), ratios)
-        cells = np.searchsorted(self.codes, self._code(tuples))
-        if not self.collision_bit:
-            return cells
-        if collided is None:
-            raise ValueError("collided must be given, got None: the cells of this robot have a collision bit")
-        return cells + len(self.tuples) * np.asarray(collided, dtype=bool)
-
-    def _check_ratios(self, ratios: NDArray[np.float64]) -> None:
         if ratios.ndim != 2 or ratios.shape[1] != self.num_ratios:
             raise ValueError(f"ratios must have shape (batch, {self.num_ratios}), got {ratios.shape}")
         good = (ratios >= 0.0).all(axis=1) & (np.abs(ratios.sum(axis=1) - 1.0) < _SUM_TOLERANCE)
         if not good.all():
             row = int(np.argmin(good))
             raise ValueError(f"ratios must not be negative and must sum to 1, got {ratios[row].tolist()} in row {row}")
+        cells = np.searchsorted(self.codes, self._code(self._find_tuples(ratios)))
+        if not self.collision_bit:
+            return cells
+        if collided is None:
+            raise ValueError("collided must be given, got None: the cells of this robot have a collision bit")
+        return cells + len(self.tuples) * np.asarray(collided, dtype=bool)
 
-    def _find_intervals(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Interval of each ratio: [i / intervals, (i + 1) / intervals), with 1.0 in the last."""
+    def _find_tuples(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The interval of each ratio; moved to a reachable neighbour where the plane only touches a corner of a box."""
         # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
         edges = np.arange(self.intervals + 1) / self.intervals
-        return np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
-
-    def _to_reachable(self, tuples: NDArray[np.int64], ratios: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Moves tuples that the plane only touches in a corner to a reachable neighbour."""
-        tuples = tuples.copy()
+        tuples = np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
         total = tuples.sum(axis=1)
         rows = np.flatnonzero(total >= self.intervals)  # every ratio on its lower edge: .2, .2, .2, .2, .2
         tuples[rows, ratios[rows].argmax(axis=1)] -= 1

@@ -1,8 +1,8 @@
 """Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ USUAL_SPREAD = 0.4
 """Standard deviation of a penalty over its mean, where nothing else is known."""
 FAILING_GOAL_RATE = 0.5
 """A controller fails a terrain on which it reaches the goal less often."""
+_MEANS = ("ratios", "penalty_mean", "collision_rate", "goal_rate", "fallen_rate")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,18 +104,16 @@ class Evaluation:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
 
+    def rows(self, chosen: NDArray[Any]) -> Self:
+        """Some of the terrains alone, in the order given; arrays are copied."""
+        columns = {name: values[chosen] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        return replace(self, **columns)
+
 
 def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Evaluations of terrains one after the other."""
-    names = [field.name for field in fields(Evaluation)]
-    return Evaluation(
-        **{name: np.concatenate([getattr(evaluation, name) for evaluation in evaluations]) for name in names}
-    )
-
-
-def select_terrains(terrains: Evaluation, rows: NDArray[Any]) -> Evaluation:
-    """Some rows of an evaluation, copied."""
-    return Evaluation(**{name: np.array(values[rows]) for name, values in vars(terrains).items()})
+    tables = [vars(evaluation) for evaluation in evaluations]
+    return Evaluation(**{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
 
 
 def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Evaluation:
@@ -153,21 +152,13 @@ def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: 
         shares = share if before.ndim == 1 else share[:, None]
         return (1.0 - shares) * before + shares * after
 
-    def mean(name: str) -> NDArray[np.float64]:
-        return weigh(getattr(first, name), getattr(second, name))
-
     between = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
-    ended = np.isfinite(second.end_position)
     return _with_fitness(
         cells,
         cfg,
-        ratios=mean("ratios"),
-        penalty_mean=mean("penalty_mean"),
+        **{name: weigh(getattr(first, name), getattr(second, name)) for name in _MEANS},
         penalty_std=np.sqrt(weigh(first.penalty_std**2, second.penalty_std**2) + between),
-        collision_rate=mean("collision_rate"),
-        goal_rate=mean("goal_rate"),
-        fallen_rate=mean("fallen_rate"),
-        end_position=np.where(ended, second.end_position, first.end_position),
+        end_position=np.where(np.isfinite(second.end_position), second.end_position, first.end_position),
         invalid_episodes=first.invalid_episodes + second.invalid_episodes,
         episodes=first.episodes + second.episodes,
     )
@@ -177,14 +168,9 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     """Adds what follows from the statistics, fitness and cell."""
     evaluation = Evaluation(fitness=np.zeros(0), cell=np.zeros(0, np.int64), **statistics)
     inconsistency = np.where(evaluation.collision_rate > 0.0, 1.0 - evaluation.collision_rate, 0.0)
-    fitness = (
-        evaluation.penalty_mean.sum(axis=1) - cfg.alpha * evaluation.penalty_std.sum(axis=1) - cfg.lam * inconsistency
-    )
-    return replace(
-        evaluation,
-        fitness=np.where(evaluation.valid, fitness, FITNESS_FLOOR),
-        cell=cells.find_cells(evaluation.ratios, evaluation.collides),
-    )
+    mean, std = (values.sum(axis=1) for values in (evaluation.penalty_mean, evaluation.penalty_std))
+    fitness = np.where(evaluation.valid, mean - cfg.alpha * std - cfg.lam * inconsistency, FITNESS_FLOOR)
+    return replace(evaluation, fitness=fitness, cell=cells.find_cells(evaluation.ratios, evaluation.collides))
 
 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.check import ensure_ready
 from qd.search.archive import Archive
 from qd.search.directory import Metrics, RunDirectory, claimed
 from qd.search.fitness import evaluate_rollout
@@ -21,7 +22,7 @@ from qd.search.results import (
     write_results,
 )
 from qd.search.scheduler import Scheduler
-from qd.search.settings import SearchCfg
+from qd.search.settings import SearchCfg, preset
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import refuse_all_invalid
@@ -31,8 +32,24 @@ from sim.controllers.spec import ControllerSpec, resolve_policy
 from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import get_space, is_user_space
+from sim.terrains.spaces.registry import at_height, get_space, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
+
+
+def start_search(
+    robot: str | None, policy: str | None, space: str | None, *, size: str, height: float | None, compute: Compute
+) -> tuple[SearchCfg, RobotCfg]:
+    """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
+
+    Robot, controller and space are as flags take them. ``height`` is the largest one of a bump [m]; None is that which
+    fits the robot.
+    """
+    terrain_space = load_space(space)
+    if height is not None:
+        terrain_space = at_height(terrain_space, height)
+    ready = ensure_ready(get_robot(robot), policy, compute)
+    terrain_space = space_at(terrain_space, height, ready)
+    return preset(size, ready, policy, space=terrain_space.name, space_sha256=terrain_space.sha256), ready
 
 
 def search(
@@ -74,8 +91,9 @@ def search(
             say(describe_search(cfg, path, cfg.iterations, compute.device, crossing.num_workers))
             return finished
         scheduler, metrics = run.load(cfg) or (
-            Scheduler(cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed), []
-        )  # fmt: skip
+            Scheduler(cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed),
+            [],
+        )
         scheduler.compute_on(compute.device)
         done = len(metrics)
         last = find_last_iteration(cfg, metrics, until)

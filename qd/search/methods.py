@@ -3,7 +3,7 @@
 Settings are shown by ``--help``, so this file loads nothing heavy before a method is made.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -58,6 +58,8 @@ class Setup:
     cells: "Cells"
     archive: "GridArchive"
     """The elites of the search."""
+    make_archive: Callable[..., "GridArchive"]
+    """Makes an empty archive alike, of the stream of its seed and pyribs' ``learning_rate`` and ``threshold_min``."""
     seed: int
     emitters: tuple[int, ...]
     """Numbers of the method's emitters among those of the search, ascending."""
@@ -230,10 +232,8 @@ class CmaMae(CmaMe):
 
     def __init__(self, cfg: Any, setup: Setup) -> None:
         from qd.search.fitness import FITNESS_FLOOR
-        from qd.search.grid import make_grid
 
-        learning = {"learning_rate": cfg.learning_rate, "threshold_min": FITNESS_FLOOR}
-        archive = make_grid(setup.space.num_genes, setup.cells, setup.stream(0), **learning)
+        archive = setup.make_archive(setup.stream(0), learning_rate=cfg.learning_rate, threshold_min=FITNESS_FLOOR)
         super().__init__(cfg, setup, archive, ranker="imp", selection_rule="mu", restart_rule=cfg.restart_rule)
 
     def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:

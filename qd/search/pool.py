@@ -18,7 +18,6 @@ from qd.search.fitness import (
     FitnessCfg,
     join_evaluations,
     merge_evaluations,
-    select_terrains,
 )
 
 DEPTH = 3
@@ -96,18 +95,18 @@ class Pool:
             crossed: What the crossings showed.
             iteration: In which they were, from 1.
         """
-        merged = select_terrains(crossed, np.arange(len(number)))
+        merged = crossed.rows(np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
         repeat = _rank(number[again], again)
         for k in range(repeat.max(initial=-1) + 1):
             assert self.terrains is not None
             chosen = again[repeat == k]
             rows = np.searchsorted(self.number, number[chosen])
-            before, after = select_terrains(self.terrains, rows), select_terrains(crossed, chosen)
+            before, after = self.terrains.rows(rows), crossed.rows(chosen)
             for name, values in vars(merge_evaluations(before, after, self.cells, self.fitness)).items():
                 getattr(self.terrains, name)[rows] = getattr(merged, name)[chosen] = values
             self._crossings[rows] += 1
-        first = select_terrains(crossed, new)
+        first = crossed.rows(new)
         self.terrains = first if self.terrains is None else join_evaluations([self.terrains, first])
         self.solutions = np.concatenate([self.solutions, solutions[new]])
         self.iteration = np.append(self.iteration, np.full(len(new), iteration))
@@ -139,7 +138,7 @@ class Pool:
         rank = _rank(self.terrains.cell, -score)
         holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
         stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, pending)
-        self.terrains = select_terrains(self.terrains, stays)
+        self.terrains = self.terrains.rows(stays)
         for name in ("solutions", "iteration", "number", "_crossings"):
             setattr(self, name, getattr(self, name)[stays])
         return np.flatnonzero(holds[stays])

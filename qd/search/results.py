@@ -1,10 +1,16 @@
-"""What a search has found, when it ends by that, and what it leaves: metrics, archive, numbers and figures."""
+"""What a search has found, when it ends by that, and what it leaves: metrics, archive, numbers, figures, last lines."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.markup import escape
+
+from qd.faults.families import rank, summarise_search
+from qd.faults.minimise.results import read_minimal
 from qd.faults.numbers import fault_numbers, found_numbers
-from qd.search.archive import Archive, no_outcomes, read_archive
+from qd.search.archive import Archive, Subject, no_outcomes, read_archive
 from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory
 from qd.search.fitness import Evaluation, join_evaluations
 from qd.search.pool import chance_to_stay
@@ -15,26 +21,28 @@ from qd.show.figures import write_figures
 from qd.workers.invalid import invalid_iterations, invalid_reasons
 from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
-from sim.files.command import say
+from sim.files.command import command_line, say
+from sim.files.settings import select_settings
+from sim.files.templates import open_templates
+from sim.robots.find import resolve_robot
 from sim.rollout import RolloutResult
+from sim.terrains.spaces.registry import get_space
 
 UNTIL_FROM = 20
 """Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
-_SETTINGS = (
-    "robot", "robot_sha256", "policy_sha256", "space", "space_sha256", "penalty_definition", "intervals",
-    "collision_bit",
-)  # fmt: skip
 _FRESH_NUMBERS = (
     "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
     "corrected_elites", "mean_fitness_corrected", "mean_std", "mean_std_interval",
 )  # fmt: skip
+_TEMPLATES = open_templates(Path(__file__).parent / "templates")
+_TEMPLATES.filters["escape_markup"] = escape
 
 
 def build_archive(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
     elites: dict[str, Any] = scheduler.elites()
     return Archive(
-        **{name: getattr(cfg, name) for name in _SETTINGS},
+        **vars(select_settings(Subject, cfg)),
         penalties=cfg.fitness.penalties,
         scales=cfg.fitness.scales,
         iterations=iterations,
@@ -133,3 +141,35 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
     print(f"Figures: {', '.join(map(str, figures))}")
     if invalid := invalid_iterations(metrics):
         print(f"Warning: {invalid}")
+
+
+def print_summary(
+    run: Path, archive: Archive, *, robot: str | None = None, policy: str | None = None, space: str | None = None
+) -> None:
+    """Prints what a run's archive says of the controller; nothing without elites.
+
+    Robot, controller and space are as the command line names them, if it does.
+    """
+    if not len(archive):
+        return
+    half_width = resolve_robot(archive.named(), robot, run).half_width
+    archive_space = get_space(archive.space, archive.space_sha256)
+    ranking = rank(archive, archive_space, read_minimal(run, archive), judged=True, half_width=half_width)
+    if not len(ranking):
+        return
+    number = ranking.worst(1)[0]
+    flags = {"run": run, "robot": robot, "space": space}
+    text = _TEMPLATES.get_template("summary.txt").render(
+        archive=archive,
+        ranking=ranking,
+        summary=summarise_search(ranking, archive),
+        number=number,
+        name=ranking.name(ranking.find_row(number)),
+        view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),
+        report=command_line("report", **flags, policy=policy),
+        replay=command_line("replay", **flags, elite=number, policy=policy),
+        judge=command_line("judge", **flags, policy=policy),
+        finetune=command_line("finetune", robot=robot, specialist=run, policy=policy, space=space),
+    )
+    console = Console(highlight=False)
+    console.print(text.rstrip(), soft_wrap=not console.is_terminal)

@@ -1,14 +1,18 @@
-"""The state of a Quality-Diversity search: methods that ask for terrains, and the archive of the best ones."""
+"""The state of a Quality-Diversity search: methods that ask for terrains, and the pyribs archive of the best ones.
 
-from itertools import cycle
+The reachable cells are numbered, so an archive has one dimension with one unit a cell, and a terrain's measure is the
+middle of its cell. It holds unclipped solutions, for evolution strategies, and the clipped genes as data.
+"""
+
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from ribs.archives import GridArchive
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, select_terrains
-from qd.search.grid import FIELDS, grid_rows, make_grid
+from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg
 from qd.search.methods import METHODS, Columns, Method, Setup
 from qd.search.pool import Pool
 from qd.search.presets import SchedulerCfg
@@ -16,6 +20,10 @@ from sim.terrains.spaces.base import TerrainSpace, clipped
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _INVALID_VALUE = -1e3  # an invalid terrain ranks below any other that was not accepted
+_STATISTICS = ("ratios", "penalty_mean", "penalty_std")
+_RATES = ("collision_rate", "goal_rate", "fallen_rate")
+_COUNTS = ("invalid_episodes", "episodes", "iteration")
+_FIELDS = ("genes", *_STATISTICS, *_RATES, *_COUNTS, "end_position")  # beside solution, objective and measures
 
 
 class Asked(NamedTuple):
@@ -47,15 +55,14 @@ class Scheduler:
     ) -> None:
         self._num_genes, self._num_emitters = space.num_genes, cfg.emitters
         self._terrains_per_emitter = cfg.batch_size + cfg.again
+        make_archive = partial(_make_archive, space.num_genes, cells)
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
-        self._archive = make_grid(space.num_genes, cells, np.random.SeedSequence(seed, spawn_key=(1,)))
-        emitters: dict[str, tuple[int, ...]] = {}
-        for emitter, name in zip(range(cfg.emitters), cycle(cfg.methods), strict=False):
-            emitters[name] = (*emitters.get(name, ()), emitter)
-        self.methods: list[Method] = [
-            METHODS[name](cfg, Setup(space, cells, self._archive, seed, numbers)) for name, numbers in emitters.items()
-        ]
+        self._archive = make_archive(np.random.SeedSequence(seed, spawn_key=(1,)))
+        self.methods: list[Method] = []
+        for first, name in enumerate(cfg.methods[: cfg.emitters]):
+            numbers = tuple(range(first, cfg.emitters, len(cfg.methods)))
+            self.methods.append(METHODS[name](cfg, Setup(space, cells, self._archive, make_archive, seed, numbers)))
         self._pool = Pool(space.num_genes, cells, fitness) if cfg.again else None
         self._asked: list[Asked | None] = [None] * cfg.num_groups
 
@@ -119,8 +126,12 @@ class Scheduler:
         self._asked[group] = None
         if self._pool is not None:
             evaluation = self._pool.tell(*asked, evaluation, iteration)
-        rows = grid_rows(asked.solutions, evaluation, iteration)
-        added = self._add(rows, evaluation.valid & (evaluation.fitness > FITNESS_FLOOR))
+        rows = _archive_rows(asked.solutions, evaluation, iteration)
+        accepted = evaluation.valid & (evaluation.fitness > FITNESS_FLOOR)
+        added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
+        if accepted.any():
+            for name, values in self._archive.add(**{name: column[accepted] for name, column in rows.items()}).items():
+                added[name][accepted] = values
         if self._pool is not None:
             self._settle(self._pool)
         num_new = len(asked.new)
@@ -131,26 +142,48 @@ class Scheduler:
             method.tell(evaluation, rows, added, batches)
         return num_new
 
-    def _add(self, rows: Columns, accepted: NDArray[np.bool_]) -> Columns:
-        """Adds accepted terrains to the archive; status and value of each as pyribs gives them to its emitters."""
-        added = {"status": np.zeros(len(accepted), np.int32), "value": np.full(len(accepted), _INVALID_VALUE)}
-        if accepted.any():
-            for name, values in self._archive.add(**{name: column[accepted] for name, column in rows.items()}).items():
-                added[name][accepted] = values
-        return added
-
     def _settle(self, pool: Pool) -> None:
         """Makes the archive anew, of the terrains that hold the cells."""
         rows = pool.settle(self._pending_numbers())
         self._archive.clear()
         if len(rows):
             assert pool.terrains is not None
-            terrains = select_terrains(pool.terrains, rows)
-            self._archive.add(**grid_rows(pool.solutions[rows], terrains, pool.iteration[rows]))
+            terrains = pool.terrains.rows(rows)
+            self._archive.add(**_archive_rows(pool.solutions[rows], terrains, pool.iteration[rows]))
 
     def elites(self) -> Columns:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""
         data: Any = self._archive.data()
         order = np.lexsort((data["index"], -data["objective"]))
-        elites = {name: data[name][order] for name in FIELDS}
+        elites = {name: data[name][order] for name in _FIELDS}
         return elites | {"fitness": data["objective"][order], "cell": data["index"][order].astype(np.int64)}
+
+
+def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:
+    """An empty archive; ``learning`` are pyribs' ``learning_rate`` and ``threshold_min``."""
+    extra_fields: dict[str, Any] = {"genes": ((num_genes,), np.float32), "end_position": ((2,), np.float32)}
+    extra_fields |= dict.fromkeys(_STATISTICS, ((cells.num_ratios,), np.float64))
+    extra_fields |= dict.fromkeys(_RATES, ((), np.float64)) | dict.fromkeys(_COUNTS, ((), np.int64))
+    return GridArchive(
+        solution_dim=num_genes,
+        dims=[cells.num_cells],
+        ranges=[(0, cells.num_cells)],
+        seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
+        solution_dtype=np.float32,
+        objective_dtype=np.float64,
+        measures_dtype=np.float64,
+        extra_fields=extra_fields,
+        **learning,
+    )
+
+
+def _archive_rows(solutions: NDArray[np.float32], terrains: Evaluation, iteration: NDArray[np.int64] | int) -> Columns:
+    """Terrains as an archive takes them, of unclipped genes (T, num_genes), with the iteration that found each."""
+    columns = {name: getattr(terrains, name) for name in _FIELDS if name not in ("genes", "iteration")}
+    return columns | {
+        "solution": solutions,
+        "objective": terrains.fitness,
+        "measures": terrains.cell[:, None] + 0.5,
+        "genes": clipped(solutions),
+        "iteration": np.broadcast_to(iteration, len(solutions)),
+    }

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from qd.search.archive import Subject
 from qd.search.descriptors import Cells
 from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg, read_preset
@@ -18,32 +19,17 @@ _MOST_EPISODES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchCfg:
+class SearchCfg(Subject):
     """What is searched, with what, and how; runs that agree in all but ``iterations`` are the same run."""
 
-    robot: str
-    robot_sha256: str
-    """Hash of its settings, model and meshes."""
-    penalty_definition: str
-    """How the penalties are defined (:data:`sim.robots.robot.PENALTY_DEFINITION`)."""
     preset: str
     policy: str
     """Controller: ``shipped``, or as :func:`sim.controllers.loaders.load_policy` takes it."""
-    policy_sha256: str | None
-    """Hash of the controller's files, None where there are none."""
-    space: str = "super_gaussian"
-    """Terrain space, as :func:`sim.terrains.spaces.registry.load_space` takes it."""
-    space_sha256: str | None = None
-    """Hash of its code if it is a user's own."""
     seed: NonNegativeInt = 0
     iterations: PositiveInt
     """Iterations to reach; may be raised later."""
     replicas: PositiveInt
     """Episodes a terrain."""
-    intervals: PositiveInt = 10
-    """Intervals of each ratio."""
-    collision_bit: bool
-    """Whether base collision is a descriptor of its own."""
     fitness: FitnessCfg
     scheduler: SchedulerCfg
 

@@ -12,10 +12,10 @@ import torch
 
 from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
-from qd.search import settings, start
+from qd.search import loop, settings
 from qd.search.archive import read_archive
 from qd.search.methods import METHODS
-from qd.search.summary import print_summary
+from qd.search.results import print_summary
 from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
@@ -95,7 +95,7 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flags, name):
 
 @pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
 def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch, again, settling, name):
-    monkeypatch.setattr(start, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
+    monkeypatch.setattr(loop, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
     assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
     assert os.listdir() == []
 

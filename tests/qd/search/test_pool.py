@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, join_evaluations, select_terrains
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, join_evaluations
 from qd.search.pool import DEPTH, Pool, chance_to_stay, expected_score
 from tests.qd.stand_in import make_result
 
@@ -120,7 +120,7 @@ def test_a_terrain_that_was_crossed_again_several_times_at_once_has_all_episodes
     pool.tell(np.zeros((2, 2), np.float32), np.zeros(2, np.int64), told, 2)
     assert pool.terrains.episodes.tolist() == [9]
     assert pool.terrains.penalty_mean.sum() == pytest.approx((8.0 + 2.0 + 5.0) / 3)
-    assert select_terrains(told, [0]).penalty_mean.sum() == pytest.approx(2.0)  # what it was told stays as it was
+    assert told.rows([0]).penalty_mean.sum() == pytest.approx(2.0)  # what it was told stays as it was
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout, select_terrains
+from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.search.presets import SchedulerCfg
 from qd.search.surrogate import surrogate as module
 from qd.search.surrogate.networks import MEMBERS, Networks, Trainer
@@ -259,7 +259,7 @@ def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(m
     heights = (corridor_heights(torch.from_numpy(genes), SUPER_GAUSSIAN) / 0.25).flatten(1)
     for first in range(0, 420, 60):
         part = slice(first, first + 60)
-        search.learn(genes[part], select_terrains(evaluation, part))
+        search.learn(genes[part], evaluation.rows(part))
     assert [len(maps) for maps, _, _ in given] == [128, 256, 256, 300, 300, 300]
     for told, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
         places = drawn.unique()
