@@ -32,10 +32,9 @@ from sim.rollout import RolloutResult
 from sim.terrains.conditions.base import CONDITIONS, Condition
 from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
-from sim.terrains.spaces.names import join_name
-from sim.terrains.spaces.on_ground import ground_genes
 from sim.terrains.spaces.registry import load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.wider import ground_genes
 from sim.terrains.terrains import Terrains
 
 _FULL = (20, 4)  # terrains a value and episodes a terrain
@@ -116,7 +115,7 @@ def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[
         flat = np.zeros((len(genes), SUPER_GAUSSIAN.num_genes))  # bumps of no height
         return np.tile(np.concatenate([flat, genes], axis=1).astype(np.float32), (count, 1))
 
-    space = join_name(SUPER_GAUSSIAN.name, (name,))
+    space = f"{SUPER_GAUSSIAN.name}+{name}"
     return Dose(name, sweep.values, title=sweep.title, quantities={name: quantity}, make=make, space=space)
 
 

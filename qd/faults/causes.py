@@ -13,7 +13,8 @@ from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.conditions.base import CONDITIONS, condition_texts
 from sim.terrains.ground import PATCHES, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
-from sim.terrains.spaces.base import TerrainSpace, WiderSpace
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.wider import WiderSpace
 
 LEAST_HEIGHT = 0.03
 """A part that is lower and less deep everywhere under the robot lies beside its way [m]."""

@@ -3,7 +3,7 @@
 An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
 controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
 certificate is not known to be passable. A fault is robust if it is one under varied conditions too
-(:func:`sim.terrains.spaces.under_conditions.varied_genes`).
+(:func:`sim.terrains.spaces.wider.varied_genes`).
 """
 
 from collections.abc import Container, Mapping, Sequence

@@ -21,7 +21,7 @@ from qd.workers.pipeline import PipelineCfg, build_simulator
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.under_conditions import varied_genes, varied_space
+from sim.terrains.spaces.wider import varied_genes, varied_space
 from sim.terrains.terrains import Terrains
 
 

@@ -119,7 +119,7 @@ class Archive(Evaluation, Subject):
     certifier_resolved_outcomes: NDArray[np.int64]
     """With contact resolved, shape (N, C, 4)."""
 
-    # Under varied conditions (:func:`sim.terrains.spaces.under_conditions.varied_genes`); None before.
+    # Under varied conditions (:func:`sim.terrains.spaces.wider.varied_genes`); None before.
     varied_outcomes: NDArray[np.int64] | None = None
     """By the controller that was searched, shape (N, 4)."""
     certifier_varied_outcomes: NDArray[np.int64] | None = None

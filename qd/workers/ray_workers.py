@@ -29,8 +29,7 @@ from sim.files.provenance import code_fingerprint
 from sim.robots.find import get_robot
 from sim.robots.user import PackedRobot, pack_robot
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.names import join_name, split_name
-from sim.terrains.spaces.registry import is_user_space
+from sim.terrains.spaces.registry import is_user_space, split_name
 from sim.terrains.terrains import Terrains
 
 _ROOMS = ("kernels", "sim", "qd")
@@ -95,7 +94,7 @@ class RayWorker:
             robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
             if self._space is not None:
                 code = self._space.unpacked(folder / "space")
-                cfg = replace(cfg, space=join_name(code, split_name(cfg.space)[1]))
+                cfg = replace(cfg, space="+".join((code, *split_name(cfg.space)[1])))
             cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
             self._simulator = self._build(cfg, num_terrains)
 

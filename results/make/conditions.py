@@ -21,14 +21,13 @@ from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
 from results.make.spaces import search_space
 from sim.terrains.conditions.base import CONDITIONS
-from sim.terrains.spaces.names import join_name
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from sim.terrains.terrains import Terrains
 
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
-SPACE = join_name(SUPER_GAUSSIAN.name, tuple(CONDITIONS))
+SPACE = "+".join((SUPER_GAUSSIAN.name, *CONDITIONS))
 _PUBLISHED = (*ARCHIVE_FILES, "minimal.npz", "minimal.json")
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from kernels.conditions import DisturbedStep
-from sim.terrains.conditions.base import Condition, Gene, register
+from sim.terrains.conditions.base import CONDITIONS, Condition, Gene
 from sim.terrains.quantities import Sweep
 
 
@@ -27,4 +27,4 @@ class Wind(Condition):
         return rows
 
 
-register(Wind())
+CONDITIONS["wind"] = Wind()

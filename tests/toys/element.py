@@ -6,10 +6,10 @@ from typing import ClassVar
 import warp as wp
 
 from kernels.course import Element, Range
-from sim.terrains.elements.base import LENGTH, CourseElement, register_element
+from sim.terrains.elements.base import ELEMENTS, LENGTH, CourseElement
 from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.course import Course
-from sim.terrains.spaces.registry import register_space
+from sim.terrains.spaces.registry import SPACES
 
 
 @wp.func
@@ -27,7 +27,7 @@ HUMP = CourseElement(
     quantities={"height": Quantity(name="size", low=0.01, high=1.0, unit="m"), "length": LENGTH},
     doses={"hump": Sweep("height", (0.1, 0.2, 0.4), {"length": 1.0})},
 )
-register_element(HUMP)
+ELEMENTS["hump"] = HUMP
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,4 +36,4 @@ class Humps(Course):
     kinds: ClassVar[tuple[str, ...]] = ("flat", "hump")
 
 
-register_space(Humps())
+SPACES["humps"] = Humps()

@@ -41,7 +41,7 @@ class Gene(Quantity):
 
 
 class Condition:
-    """A condition under which robots cross. A class, whose instance is registered, adds one."""
+    """A condition under which robots cross. A class and its instance in :data:`CONDITIONS` add one."""
 
     name: ClassVar[str]
     """What a space is called by it: ``course+payload``."""
@@ -86,11 +86,6 @@ class Condition:
 
 CONDITIONS: dict[str, Condition] = {}
 """All conditions by name, in the order of their numbers in a row of conditions."""
-
-
-def register(condition: Condition) -> None:
-    """Adds a condition behind the others."""
-    CONDITIONS[condition.name] = condition
 
 
 def condition_genes(names: Sequence[str] | None = None) -> tuple[Gene, ...]:

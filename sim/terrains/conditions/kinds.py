@@ -12,7 +12,7 @@ from kernels.conditions import BASE, DisturbedStep, VariedRobots
 from kernels.episode import Outcome
 from kernels.observation import noise_width
 from sim.robots.training import NoiseCfg
-from sim.terrains.conditions.base import Array, Condition, Gene, register
+from sim.terrains.conditions.base import CONDITIONS, Array, Condition, Gene
 from sim.terrains.quantities import Sweep
 
 MAX_LATENCY_S = 0.06
@@ -294,5 +294,5 @@ class Grip(Condition):
         episodes.model.geom_friction[:, 0] *= values[0]
 
 
-for _condition in (Payload(), MotorStrength(), ActionDelay(), ObservationLag(), ObservationNoise(), Push(), Grip()):
-    register(_condition)
+_KINDS = (Payload, MotorStrength, ActionDelay, ObservationLag, ObservationNoise, Push, Grip)
+CONDITIONS.update((kind.name, kind()) for kind in _KINDS)

@@ -68,12 +68,10 @@ class CourseElement(ElementKind):
 
 
 ELEMENTS: dict[str, CourseElement] = {}
-"""All elements by name; flat ground is the first, and what is left where another is taken away."""
+"""All elements by name; flat ground is the first, and what is left where another is taken away.
 
-
-def register_element(element: CourseElement) -> None:
-    """Adds an element behind the others. Courses of the shipped space do not have it (spaces/course.py)."""
-    ELEMENTS[element.name] = element
+Courses of the shipped space have those that spaces/course.py names.
+"""
 
 
 def all_elements() -> tuple[CourseElement, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from kernels.course import CENTRE_ROW, DIRECTION, SPACING, Element, Range, direction_sign, fit_face, fit_top
-from sim.terrains.elements.base import LENGTH, CourseElement, cells, register_element
+from sim.terrains.elements.base import ELEMENTS, LENGTH, CourseElement, cells
 from sim.terrains.quantities import Quantity, Sweep
 
 SLOPE_ROWS = 40
@@ -305,5 +305,5 @@ RUBBLE = CourseElement(
     draw_turns=lambda count, rng: rng.uniform(-0.5, 0.5, count),
 )
 
-for _kind in (FLAT, RAMP, CROSS_SLOPE, SILL, RAIL, KERB, STEP, STAIRS, PALLET, DITCH, BRIDGE, STONES, RUBBLE):
-    register_element(_kind)
+_KINDS = (FLAT, RAMP, CROSS_SLOPE, SILL, RAIL, KERB, STEP, STAIRS, PALLET, DITCH, BRIDGE, STONES, RUBBLE)
+ELEMENTS.update((kind.name, kind) for kind in _KINDS)

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from kernels.ground import Ground
 from sim.terrains.conditions.base import nominal_row
 from sim.terrains.hand_crafted import Seed
-from sim.terrains.spaces.names import join_height, join_name
 
 MAX_HEIGHT = 0.25
 """Heights of the shipped spaces are for robots half a metre high: Table I's w [m]."""
@@ -103,43 +102,6 @@ class TerrainSpace:
         return array
 
 
-class WiderSpace(TerrainSpace):
-    """The terrains of another space, ``inner``, whose genes come first, and genes of some ``kinds`` behind them."""
-
-    def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
-        """``kinds`` are in their order; a class sets :attr:`num_genes`."""
-        self.inner, self.kinds, self.name = inner, kinds, join_name(inner.name, kinds)
-        for name in ("sha256", "sigma0", "any_spacing", "height_share"):
-            setattr(self, name, getattr(inner, name))
-
-    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
-        """Turns genes into heights on the device, by the inner space."""
-        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
-
-    def absent(self, part: int) -> tuple[slice, Any]:
-        """Columns of a part behind those of the inner space, counted from 0, and genes of it that change nothing."""
-        raise NotImplementedError
-
-    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
-        """Genes without some parts: those of the inner space come first, the others become :meth:`absent`."""
-        changed = self.validate(genes).copy()
-        first = self.inner.num_genes
-        if len(changed):
-            count = len(self.inner.parts(changed[0, :first]))
-            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
-            for part in parts:
-                if part >= count:
-                    columns, values = self.absent(part - count)
-                    changed[:, columns] = values
-        return changed
-
-    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes with heights scaled by the inner space; the others stay as they are."""
-        rows, first = clipped(self.validate(genes)), self.inner.num_genes
-        heights = self.inner.scaled(rows[:, :first], scale)
-        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShippedSpace(TerrainSpace):
     """A space with heights for robots half a metre high, which can be lowered for smaller ones."""
@@ -152,7 +114,7 @@ class ShippedSpace(TerrainSpace):
     @property
     def name(self) -> str:
         """``course``, with another height ``course@0.06``."""
-        return self.base_name if self.height == MAX_HEIGHT else join_height(self.base_name, self.height)
+        return self.base_name if self.height == MAX_HEIGHT else f"{self.base_name}@{self.height:g}"
 
     @property
     def height_share(self) -> float:

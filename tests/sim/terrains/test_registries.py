@@ -16,7 +16,7 @@ from sim.terrains.corridor import corridor_maps, num_maps
 from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.spaces.registry import SPACES, get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrains.spaces.under_conditions import varied_space
+from sim.terrains.spaces.wider import varied_space
 from sim.terrains.terrains import Terrains
 from tests.sim.terrains.spaces.spaces import write_ridges
 

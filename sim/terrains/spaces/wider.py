@@ -1,0 +1,196 @@
+"""Any terrain space with more genes: of its ground, 32 for friction and 32 for softness, and of conditions."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
+from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, condition_texts
+from sim.terrains.ground import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
+from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
+
+_ABSENT = {"friction": 1.0, "softness": -1.0}  # the gene of ground that changes nothing
+_TITLES = {
+    "friction": "friction every 2 m along the way",
+    "softness": "time constant of the ground [s] every 2 m along the way, 0 where it is firm",
+}
+_ROWS_OF_THE_WAY = slice(ROWS // 2 - 1, ROWS // 2 + 1)  # rows of patches, the right one first
+_MAX_SLIPPERY = 0.995  # rounded, what is above is 1.00
+
+
+class WiderSpace(TerrainSpace):
+    """The terrains of another space, ``inner``, on ground whose patches differ, and crossed under conditions.
+
+    The genes of the inner space come first, then those of each map, patch after patch (:mod:`kernels.ground`), then
+    those of each condition. A patch is a part, and so is a condition; one that changes nothing counts as absent.
+    """
+
+    def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
+        """``kinds`` are some of :data:`sim.terrains.ground.GROUND_KINDS`, then conditions, in their order."""
+        self.inner, self.kinds, self.name = inner, kinds, "+".join((inner.name, *kinds))
+        for name in ("sha256", "sigma0", "any_spacing", "height_share", "genes_per_part"):
+            setattr(self, name, getattr(inner, name))
+        self.maps = tuple(kind for kind in kinds if kind in GROUND_KINDS)
+        self.ground = self.maps or inner.ground
+        self.conditions = tuple(kind for kind in kinds if kind in CONDITIONS)
+        if self.maps and inner.genes_per_part and NUM_PATCHES % inner.genes_per_part:
+            self.genes_per_part = None  # maps must divide by the parts of the space, too
+        absent = [np.array([_ABSENT[kind]]) for kind in self.maps for _ in range(NUM_PATCHES)]
+        self._absent = absent + [CONDITIONS[name].to_genes({}) for name in self.conditions]
+        ends = inner.num_genes + np.cumsum([0, *map(len, self._absent)])
+        self._columns = [slice(first, last) for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
+        self.num_genes = int(ends[-1])
+
+    def _map_columns(self, kind: str) -> slice:
+        first = self.inner.num_genes + NUM_PATCHES * self.maps.index(kind)
+        return slice(first, first + NUM_PATCHES)
+
+    def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
+        """Turns genes into heights on the device, by the inner space."""
+        self.inner.rasterise(genes[:, : self.inner.num_genes].contiguous(), spacing, heights_out, *origin)
+
+    def lay_ground(self, genes: Any, ground_out: Ground) -> None:
+        """Turns genes into maps on the device (:mod:`kernels.ground`)."""
+        self.inner.lay_ground(genes[:, : self.inner.num_genes].contiguous(), ground_out)
+        if "friction" in self.maps:
+            decode_friction(genes[:, self._map_columns("friction")].contiguous(), ground_out.friction)
+        if "softness" in self.maps:
+            decode_softness(genes[:, self._map_columns("softness")].contiguous(), ground_out.time_constant)
+
+    def condition_rows(self, genes: ArrayLike) -> NDArray[np.float32]:
+        """Rows of conditions, shape (num_terrains, number of values)."""
+        kinds = condition_genes(self.conditions)
+        columns = clipped(genes)[:, self.num_genes - len(kinds) :].T
+        rows = super().condition_rows(genes)
+        for gene, values in zip(kinds, columns, strict=True):
+            rows[:, condition_column(gene.name)] = gene.to_value(values)
+        return rows
+
+    def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
+        """Hard-random terrains of the inner space, every patch as it always is or as slippery or soft as can be.
+
+        Each condition is at one of its limits; pushes come at any time.
+        """
+        rng = np.random.default_rng(seed)
+        heights = self.inner.hard_random(count, rng)
+        maps = rng.choice([-1.0, 1.0], (count, NUM_PATCHES * len(self.maps)))
+        hard = [gene.hard_at_limits for gene in condition_genes(self.conditions)]
+        limits = rng.choice([-1.0, 1.0], (count, len(hard)))
+        conditions = np.where(hard, limits, rng.uniform(-1.0, 1.0, limits.shape))
+        return np.concatenate([heights, maps.astype(np.float32), conditions.astype(np.float32)], axis=1)
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Those of the inner space, then each patch of each map, then each condition."""
+        row = clipped(genes)
+        texts = [*self.inner.parts(row[: self.inner.num_genes])]
+        for kind in self.maps:
+            texts += [_patch_text(kind, *patch) for patch in enumerate(self._patch_values(row, kind))]
+        conditions = zip(self.conditions, self._condition_texts(row), strict=True)
+        return (*texts, *(text or f"no {name}" for name, text in conditions))
+
+    def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
+        """Genes without some parts: those of the inner space come first, the others change nothing."""
+        changed = self.validate(genes).copy()
+        first = self.inner.num_genes
+        if len(changed):
+            count = len(self.inner.parts(changed[0, :first]))
+            changed[:, :first] = self.inner.without(changed[:, :first], [part for part in parts if part < count])
+            for part in parts:
+                if part >= count:
+                    changed[:, self._columns[part - count]] = self._absent[part - count]
+        return changed
+
+    def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
+        """Genes with heights scaled by the inner space; the others stay as they are."""
+        rows, first = clipped(self.validate(genes)), self.inner.num_genes
+        heights = self.inner.scaled(rows[:, :first], scale)
+        return None if heights is None else np.concatenate([heights, rows[:, first:]], axis=1)
+
+    def describe(self, genes: ArrayLike) -> str:
+        """The terrain of the inner space, of each map the patches on both sides of the way, and the conditions.
+
+        Each has a line. What lies across the way has its ground behind it: ``kerb 0.15 m up (friction 0.25)``.
+        """
+        row = clipped(genes)
+        heights = row[: self.inner.num_genes]
+        across = self.inner.spans(heights) if self.maps else ()
+        spans = [text + self._ground_text(row, begin, end) for text, begin, end in across]
+        lines = [", ".join(spans) or self.inner.describe(heights)]
+        for kind in self.maps:
+            sides = self._patch_values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY]
+            right, left = (" ".join(f"{value:.2f}" for value in side) for side in sides)
+            lines.append(f"{_TITLES[kind]}: left of the way {left}, right of it {right}")
+        return "\n".join(lines + [self.condition_text(row)] * bool(self.conditions))
+
+    def condition_text(self, genes: ArrayLike) -> str:
+        """The conditions that are not nominal; empty of a space without any."""
+        nominal = "nominal conditions" if self.conditions else ""
+        return ", ".join(filter(None, self._condition_texts(genes))) or nominal
+
+    def _condition_texts(self, genes: ArrayLike) -> list[str]:
+        return condition_texts(self.condition_rows(np.asarray(genes)[None])[0], self.conditions)
+
+    def _ground_text(self, row: NDArray[np.float32], begin: float, end: float) -> str:
+        """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
+        first, last = patch_index((begin, end), PATCH * COLS, COLS)
+        texts = []
+        for kind in self.maps:
+            values = self._patch_values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY, first : last + 1]
+            if kind == "friction" and values.min() < _MAX_SLIPPERY:
+                texts.append(f"friction {values.min():.2f}")
+            if kind == "softness" and values.max() > 0.0:
+                texts.append(f"soft, {values.max():.3f} s")
+        return f" ({', '.join(texts)})" if texts else ""
+
+    def _patch_values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
+        """Frictions, or time constants [s], of one terrain, shape (32,)."""
+        share = (row[self._map_columns(kind)].astype(np.float64) + 1.0) / 2.0
+        if kind == "friction":
+            return 1.0 - (1.0 - share) * (1.0 - MIN_FRICTION)
+        tau = MIN_TIME_CONSTANT_S * (MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) ** share
+        return np.where(share > 0.0, tau, 0.0)
+
+
+def _patch_text(kind: str, patch: int, value: float) -> str:
+    row, col = divmod(patch, COLS)
+    where = f"at x = {PATCH * col:.0f} to {PATCH * (col + 1):.0f} m, y = {PATCH * row:.0f} to {PATCH * (row + 1):.0f} m"
+    if kind == "friction":
+        return f"friction {value:.2f} {where}"
+    return f"soft ground of {value:.3f} s {where}" if value else f"firm ground {where}"
+
+
+def ground_genes(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Genes of a map of one friction, or of one time constant [s] above the least; shape (num_values, 32)."""
+    if kind == "friction":
+        genes = 1.0 - 2.0 * (1.0 - values) / (1.0 - MIN_FRICTION)
+    else:
+        genes = 2.0 * np.log(values / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
+    return np.repeat(genes[:, None], NUM_PATCHES, axis=1)
+
+
+def varied_space(space: TerrainSpace) -> TerrainSpace:
+    """The space whose terrains are those of another one under varied conditions."""
+    inner, maps = (space.inner, space.maps) if isinstance(space, WiderSpace) else (space, ())
+    varied = (name for name in CONDITIONS if name in space.conditions or CONDITIONS[name].varied)
+    return WiderSpace(inner, (*maps, *varied))
+
+
+def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Genes of a terrain, (num_genes,), under conditions drawn by each seed, for :func:`varied_space`.
+
+    The first value of a condition is drawn uniformly from its ``varied`` limits, what controllers are usually trained
+    for; others are nominal. Conditions that the space has genes of stay as they are. Shape (number of seeds, its
+    num_genes).
+    """
+    added = [condition for name, condition in CONDITIONS.items() if condition.varied and name not in space.conditions]
+    low, high = np.array([condition.varied for condition in added]).reshape(-1, 2).T
+    drawn = np.stack([np.random.default_rng(seed).uniform(low, high) for seed in seeds.tolist()], axis=1)
+    columns = {c.name: c.to_genes({c.genes[0].name: values}) for c, values in zip(added, drawn, strict=True)}
+    lengths = [len(CONDITIONS[name].genes) for name in space.conditions]
+    cuts = space.num_genes - sum(lengths) + np.cumsum([0, *lengths])[:-1]
+    terrain, *kept = np.split(np.tile(genes, (len(seeds), 1)), cuts, axis=1)
+    columns |= dict(zip(space.conditions, kept, strict=True))
+    ordered = [columns[name] for name in varied_space(space).conditions]
+    return np.concatenate([terrain, *ordered], axis=1).astype(np.float32)
