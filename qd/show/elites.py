@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.faults.causes import UNCLEAR
-from qd.faults.families import rank
-from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
+from qd.faults.families import Ranking, rank
+from qd.faults.minimise.results import MinimalTerrains, read_minimal
 from qd.faults.numbers import best_certifier
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.archive import Archive, read_archive
@@ -54,6 +54,8 @@ class OpenedRun:
     """A run directory or an archive file."""
     archive: Archive
     robot: RobotCfg
+    minima: MinimalTerrains | None = None
+    """The minimal terrains of its elites, if there are some."""
 
     @property
     def folder(self) -> Path:
@@ -65,6 +67,15 @@ class OpenedRun:
         """What the genes mean."""
         return get_space(self.archive.space, self.archive.space_sha256)
 
+    @property
+    def scales(self) -> dict[str, float]:
+        """Scale of each penalty."""
+        return dict(zip(self.archive.penalties, self.archive.scales, strict=True))
+
+    def rank(self, **options: Any) -> Ranking:
+        """Its elites by what is known best of each; ``options`` as of :func:`qd.faults.families.rank`."""
+        return rank(self.archive, self.space, self.minima, half_width=self.robot.half_width, **options)
+
     def command(self, word: str, **flags: object) -> str:
         """A command about this run as a user types it."""
         space = self.space.name if self.space.sha256 else None  # code of a user's own runs only if named
@@ -72,10 +83,9 @@ class OpenedRun:
 
     def as_searched(self) -> tuple[str, FitnessCfg]:
         """Controller and fitness of the search; defaults where the archive lies without its config."""
-        cfg = self.search()
-        if cfg is None:
-            return SHIPPED, FitnessCfg(penalties=self.archive.penalties, scales=self.archive.scales)
-        return cfg.policy, cfg.fitness
+        if (cfg := self.search()) is not None:
+            return cfg.policy, cfg.fitness
+        return SHIPPED, FitnessCfg(penalties=self.archive.penalties, scales=self.archive.scales)
 
     def search(self) -> SearchCfg | None:
         """Settings of the search; None where the archive lies without them."""
@@ -87,12 +97,13 @@ class OpenedRun:
 
     def policy(self, named: str | None = None) -> str:
         """The controller to cross with: the named one, or that of the search."""
-        cfg = self.search()
-        if named is None and cfg is not None:
+        if named is not None:
+            return resolve_policy(named, self.robot)
+        if (cfg := self.search()) is not None:
             return find_policy(self.path, cfg, self.robot)
-        policy = resolve_policy(named or SHIPPED, self.robot)
+        policy = resolve_policy(SHIPPED, self.robot)
         searched = self.archive.policy_sha256
-        if named is None and searched not in (None, digest := controller_hash(policy)):
+        if searched not in (None, digest := controller_hash(policy)):
             raise ValueError(
                 f"{self.path} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
                 f"{digest}): say with --policy which one to cross with"
@@ -114,8 +125,7 @@ class OpenedRun:
         They are of the robot's panel, of the run, or beside a published run.
         """
         names = dict(zip(self.archive.certifier_sha256, self.archive.certifiers, strict=True))
-        folders = (self.robot.panel, self.folder / CERTIFIERS_FOLDER)
-        files = [file for folder in folders for file in controllers_in(folder).values()]
+        files = [*controllers_in(self.robot.panel).values(), *controllers_in(self.folder / CERTIFIERS_FOLDER).values()]
         files.append(str(self.folder.parent / f"{self.folder.name}.pt"))
         return {names[digest]: file for file in files if (digest := str(controller_hash(file))) in names}
 
@@ -123,33 +133,27 @@ class OpenedRun:
         """Name of the certifier that crosses an elite most often, of :meth:`certifiers`; None without a certificate."""
         return best_certifier(self.archive, number, self.certifiers())
 
-    def minima(self) -> MinimalTerrains:
-        """The minimal terrains of its elites."""
-        minima = read_minimal(self.folder, self.archive)
-        if minima is None:
-            raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
-        return minima
-
     def terrains(self, elite: str = "", minimal: str | None = None) -> list[EliteTerrain]:
         """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
 
         Without a number it is the worst elite.
         """
-        archive = self.archive
-        minima = read_minimal(self.folder, archive) if minimal is None else self.minima()
-        if minimal is not None and minima is not None:
-            numbers = minima.choose(minimal, self.path)
-            rows = [(minima.genes[number], minima.entry(number)) for number in numbers]
+        genes: Any = self.archive.genes
+        if minimal is None:
+            if not elite and len(self.archive):
+                elite = str(self.rank().worst(1)[0])
+            numbers = choose_elites(elite or "0", range(len(self.archive)), f"{self.path} has no elite")
+            entries = dict.fromkeys(numbers)
+        elif self.minima is None:
+            raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
         else:
-            if not elite and len(archive):
-                ranking = rank(archive, self.space, minima, half_width=self.robot.half_width)
-                elite = str(ranking.worst(1)[0])
-            numbers = choose_elites(elite or "0", range(len(archive)), f"{self.path} has no elite")
-            rows = [(archive.genes[number], None) for number in numbers]
-        causes = rank(archive, self.space, minima, half_width=self.robot.half_width, numbers=numbers).causes
+            genes = self.minima.genes
+            numbers = self.minima.choose(minimal, self.path)
+            entries = {number: self.minima.entry(number) for number in numbers}
+        causes = self.rank(numbers=numbers).causes
         return [
-            EliteTerrain(number, genes, "" if cause == UNCLEAR else cause, entry)
-            for number, (genes, entry), cause in zip(numbers, rows, causes, strict=True)
+            EliteTerrain(number, genes[number], "" if cause == UNCLEAR else cause, entries[number])
+            for number, cause in zip(numbers, causes, strict=True)
         ]
 
 
@@ -162,4 +166,4 @@ def open_run(named: str | None, run: Path | None = None, *, space: str | None = 
     archive = read_archive(run)
     robot = resolve_robot(archive.named(), named, run)
     check_space(archive, space)
-    return OpenedRun(path=run, archive=archive, robot=robot)
+    return OpenedRun(path=run, archive=archive, robot=robot, minima=read_minimal(find_directory(run), archive))

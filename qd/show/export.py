@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.pack import PACK_FILE, find_pack, read_pack
-from qd.faults.families import VERDICTS, Ranking, rank
-from qd.faults.minimise.results import read_minimal
+from qd.faults.families import VERDICTS, Ranking
 from qd.search.archive import Archive
 from qd.search.directory import RUNS, output_folder
 from qd.search.progress import Bar
@@ -45,9 +44,7 @@ def export_elites(
             "conditions: replay or film them instead"
         )
     terrains = {terrain.stem: terrain for terrain in opened_run.terrains(elite, minimal)}
-    minima = read_minimal(opened_run.folder, archive)
-    numbers = [terrain.number for terrain in terrains.values()]
-    ranking = rank(archive, space, minima, half_width=opened_run.robot.half_width, numbers=numbers)
+    ranking = opened_run.rank(numbers=[terrain.number for terrain in terrains.values()])
 
     def build(name: str) -> ExportedTerrain:
         genes = terrains[name].genes

@@ -270,7 +270,7 @@ def _describe_elite(run: OpenedRun, terrain: EliteTerrain, now: Evaluation) -> d
         "archive": archive,
         "elite": number,
         "terrain": minimal["words"] if minimal else run.space.describe(terrain.genes).splitlines(),
-        "minimal": run.minima().describe(number) if minimal else "",
+        "minimal": run.minima.describe(number) if minimal and run.minima else "",
         "verdict": (minimal or {}).get("verdict", "not judged"),
         "same_cell": same_cell,
         "verdicts": describe_judgement(archive, number),

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.tables import read_tables
-from qd.faults.families import VERDICTS, Ranking, rank
-from qd.faults.minimise.minimise import read_minimal
+from qd.faults.families import VERDICTS, Ranking
 from qd.faults.numbers import further_rates
 from qd.search.archive import Archive
 from qd.search.directory import ROUNDS_FILE, output_folder
@@ -49,8 +48,7 @@ def write_report(
         return write_rounds(run, robot, out)
     opened_run = open_run(robot, run, space=space)
     archive = opened_run.archive
-    minima = read_minimal(opened_run.folder, archive)
-    ranking = rank(archive, opened_run.space, minima, half_width=opened_run.robot.half_width, judged=True)
+    ranking = opened_run.rank(judged=True)
     if not len(ranking):
         raise ValueError(f"{opened_run.path} must have valid elites to report on, got none: let its search go on")
     controller = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
@@ -61,7 +59,7 @@ def write_report(
     if tables is not None:
         file = without_machine(str(tables))
         compared = compare_controllers(read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256)
-    content = collect_content(opened_run, ranking, minima, controller, is_searched=not suffix)
+    content = collect_content(opened_run, ranking, controller, is_searched=not suffix)
     heads, others = _choose_elites(ranking, num_elites)
     cases: dict[int, dict[str, Any]] = {}
     missing = [_explain_no_crossings(opened_run, policy, device)]
@@ -152,11 +150,10 @@ def _make_case(
 ) -> dict[str, Any] | None:
     """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
     archive = opened_run.archive
-    scales = dict(zip(archive.penalties, archive.scales, strict=True))
-    failure = find_failure(recording, scales)
+    failure = find_failure(recording, opened_run.scales)
     if failure is None:
         return None
-    moments = [failure] if ghost is None else [failure, find_same_moment(failure, ghost[1], scales)]
+    moments = [failure] if ghost is None else [failure, find_same_moment(failure, ghost[1], opened_run.scales)]
     sources = render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if ghost is not None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
-from qd.faults.minimise.minimise import MinimalTerrains
+from qd.faults.minimise.results import MinimalTerrains
 from qd.faults.numbers import fault_numbers
 from qd.search.archive import Archive
 from qd.search.directory import METRICS_FILE, Metrics, RunDirectory
@@ -26,11 +26,10 @@ _MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # fewer have no interval of their mean
 
 
-def collect_content(
-    opened_run: OpenedRun, ranking: Ranking, minima: MinimalTerrains | None, policy: str, *, is_searched: bool
-) -> dict[str, Any]:
+def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_searched: bool) -> dict[str, Any]:
     """Values of the template, without the terrains that a controller crossed for the page."""
     archive = opened_run.archive
+    minima = opened_run.minima
     search = opened_run.search()
     run = RunDirectory(opened_run.folder)
     space = opened_run.space

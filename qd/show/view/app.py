@@ -11,12 +11,10 @@ from typing import Any
 import viser
 
 from qd.show.recordings import Recordings
-from qd.show.view.meshes import robot_parts
-from qd.show.view.player import PlayerBar
+from qd.show.view.panels import PlayerBar
 from qd.show.view.recorder import Recorder, TaskProgress
-from qd.show.view.scene import SKY, compute_first_view
-from qd.show.view.shown import Shared
-from qd.show.view.tab import Tab
+from qd.show.view.scene import SKY, compute_first_view, robot_parts
+from qd.show.view.tab import Shared, Tab
 from qd.show.view.viewed import ViewedRun
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
@@ -45,15 +43,13 @@ class App:
         self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
         recorder.robot = show.robot
         recorder.report = partial(self.post, self.show_progress)
-        first = int(show.listing.ranking.order()[0]) if show.elite is None else show.elite
+        first = int(show.ranking.order()[0]) if show.elite is None else show.elite
         request = show.request(first, next(iter(show.controllers), None), minimal=show.minimal)
         if request is not None and recordings.read(request) is None:
             recorder.request(request, key="first")  # before a page is open
         skeleton = Skeleton(show.robot)
-        self._shared = Shared(
-            show=show, skeleton=skeleton, parts=robot_parts(skeleton, show.robot), recordings=recordings,
-            recorder=recorder, post=self.post,
-        )  # fmt: skip
+        parts = robot_parts(skeleton, show.robot)
+        self._shared = Shared(show, skeleton, parts, recordings, recorder, self.post)
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
@@ -136,7 +132,7 @@ def serve(show: ViewedRun, recorder: Recorder, *, host: str, port: int, cache: P
     check_port(host, port)
     app = App(show, Recordings(show.robot, folder=cache), recorder, host=host, port=port)
     try:
-        print(f"{show.opened_run.path}: {len(show.opened_run.archive):,} elites of {show.robot.name}.")
+        print(f"{show.path}: {len(show.archive):,} elites of {show.robot.name}.")
         print(f"Open http://{host}:{port} in a browser; Ctrl-C ends.", flush=True)
         app.run()
     except KeyboardInterrupt:

@@ -1,29 +1,32 @@
-"""The panels of a tab, the archive left and the crossing right, with its selection and clock.
+"""The panels of a tab, the archive left and the crossing right, with its selection and clock, and the bar below.
 
 A panel posts what a visitor does to the viewer's loop, which calls the :class:`qd.show.view.tab.Tab`.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import viser
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
-from viser import uplot
+from viser import _messages, uplot
 
 from kernels.penalties import PENALTIES
 from qd.faults.families import ORDERS, summarise_search
 from qd.show.crossed import ENDINGS
-from qd.show.view.listing import FITNESS_TEXT, TEMPLATES, Column, Listing, render_rates
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
+from qd.show.view.viewed import FITNESS_TEXT, TEMPLATES, Column, ViewedRun, render_rates
 from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
+_SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 _WIDTH = 360  # of a panel [pixels]
 _NARROW_WIDTH = 300
 _WIDE = 1300  # a narrower window has no room for two wide panels, and the archive is folded [pixels]
@@ -40,25 +43,25 @@ _KEYS = """- **Space** play or pause
 class Selection:
     """The listed elites in their order, and the picked one: at first all, and the first."""
 
-    def __init__(self, listing: Listing) -> None:
-        self._listing = listing
+    def __init__(self, show: ViewedRun) -> None:
+        self._show = show
         self._choice: dict[str, str] = {}
-        self.matching: NDArray[np.int64] = listing.list_elites()
+        self.matching: NDArray[np.int64] = show.list_elites()
         """Numbers of the elites of the list, in their order."""
         self.picked = int(self.matching[0])
         """Number of the elite that is shown; it stays when it is not listed any more."""
 
     def choose(self, **changes: str) -> None:
-        """List the elites of another ``cause``, or in another ``order``, as :class:`Listing` has them."""
+        """List the elites of another ``cause``, or in another ``order``, as :class:`ViewedRun` has them."""
         self._choice |= changes
-        self.matching = self._listing.list_elites(**self._choice)
+        self.matching = self._show.list_elites(**self._choice)
 
     def step(self, by: int) -> int:
         """Number of the next (1) or previous (-1) elite of the list; the picked one at the end of the list.
 
         A picked elite that is not listed has the neighbours of its position among all elites.
         """
-        positions = np.argsort(self._listing.list_elites(**self._choice | {"cause": ""}))  # of each elite
+        positions = np.argsort(self._show.list_elites(**self._choice | {"cause": ""}))  # of each elite
         ahead = positions[self.matching] - positions[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
         return int(near[0]) if len(near) else self.picked
@@ -103,18 +106,18 @@ class ArchivePanel:
         """Add the panel; a visitor's choices are posted to the ``tab``."""
         gui = client.gui
         self._selection = selection
-        self._listing = listing = tab.shared.show.listing
+        self._run = show = tab.shared.show
         panel = gui.add_panel()
         panel.dock_left()
         panel.set_width(_WIDTH)
         if tab.window[0] < _WIDE:
             panel.minimize()
         with panel.add_tab("Archive"):
-            summary = escape(summarise_search(listing.ranking, listing.archive))
+            summary = escape(summarise_search(show.ranking, show.archive))
             gui.add_html(_small(f"{escape(title)}<br><b>{summary}.</b>"))
             orders = {label: name for name, label in ORDERS.items()}
             choose = partial(tab.shared.post, self._choose)
-            _add_choice(gui, "Cause", listing.causes(), partial(choose, "cause"))
+            _add_choice(gui, "Cause", show.causes(), partial(choose, "cause"))
             _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_TEXT}.")
             self.list = gui.add_html("")
             self._map = gui.add_html("")
@@ -126,8 +129,8 @@ class ArchivePanel:
     def show(self) -> None:
         """Draw list and map."""
         selection = self._selection
-        self._map.content = _small(self._listing.render_map(selection.matching, selection.picked))
-        self.list.content = _small(self._listing.render_list(selection.matching, selection.picked))
+        self._map.content = _small(self._run.render_map(selection.matching, selection.picked))
+        self.list.content = _small(self._run.render_list(selection.matching, selection.picked))
 
 
 class CrossingPanel:
@@ -149,7 +152,7 @@ class CrossingPanel:
         whole = {label: bool(k) for k, label in enumerate(_TERRAINS)}
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
-        names = tab.shared.show.opened_run.archive.penalties
+        names = tab.shared.show.archive.penalties
         series = [uplot.Series(label=PENALTIES[name].label, stroke=PENALTIES[name].color, width=2.0) for name in names]
         with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):
             look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
@@ -171,10 +174,6 @@ class CrossingPanel:
         self.terrain.visible = has_minimal
         self.terrain.value = _TERRAINS[minimal]
 
-    def show_details(self, text: str) -> None:
-        """Show facts of an elite, in Markdown."""
-        self.details.content = text
-
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""
         self.rates.content = _small(render_rates(columns)) if columns else ""
@@ -193,6 +192,51 @@ class CrossingPanel:
     def stretch_curves(self, duration_s: float) -> None:
         """Have the curves' time last as long as the bar's [s]."""
         self._curves.scales = {"x": uplot.Scale(time=False, range=(0.0, max(duration_s, 0.02)))}
+
+
+class PlayerBar:
+    """The player bar under the scene: it shows values in the browser, and sends back what a visitor does.
+
+    ``page.js`` draws the bar, since viser has no element under the scene. It also sends keys and clicks on elites.
+    """
+
+    def __init__(self, client: viser.ClientHandle, act: Callable[[str, Any], None]) -> None:
+        """Add the bar; ``act`` is called in another thread with the name and value of each action of a visitor."""
+        self._client = client
+        self._act = act
+        self.shown: dict[str, Any] = {}
+        """Values by their names in ``page.js``."""
+        panel = client.gui.add_panel()  # hidden by the script; the field of a folded panel would be gone
+        panel.float(x=0.0, y=0.0)
+        panel.expand()
+        with panel.add_tab("player bar"):
+            client.gui.add_html('<i class="faultline-channel"></i>')
+            field = client.gui.add_text("channel", "")
+        field.on_update(lambda event: self._receive(field.value) if event.client is not None else None)
+        self._run(_SCRIPT)
+
+    def _receive(self, text: str) -> None:
+        try:
+            _, actions = json.loads(text)
+            for name, value in actions.items():
+                self._act(name, value)
+        except (ValueError, TypeError, AttributeError):  # anybody may write into the field
+            return
+
+    def show(self, values: Mapping[str, Any]) -> None:
+        """Show values by their names in ``page.js``; only changed ones are sent."""
+        changed = {name: value for name, value in values.items() if self.shown.get(name, ...) != value}
+        if changed:
+            self.shown |= changed
+            self._run(f"window.faultline?.show({json.dumps(changed)});")
+
+    def show_address(self, query: str, *, is_new: bool) -> None:
+        """Change the browser's address without loading a page; a new one is an entry in its history."""
+        self._run(f"window.faultline?.address({json.dumps(query)}, {json.dumps(is_new)});")
+
+    def _run(self, script: str) -> None:
+        """Run a script in the browser; viser does so for its plots, and has no public name for it."""
+        self._client.gui._websock_interface.queue_message(_messages.RunJavascriptMessage(source=script))
 
 
 def _small(text: str) -> str:
@@ -218,12 +262,10 @@ def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: 
 
 def _render_legend() -> str:
     """What the colours of the page mean."""
-    colors = {
-        "slippery": SLIPPERY, "soft": SOFT, "touch": TOUCH, "foot": FOOT_TOUCH, "force": FORCE_COLOR,
-        "command": COMMAND_COLOR, "ghost": OTHER_CONTROLLER,
-    }  # fmt: skip
+    names = ("slippery", "soft", "touch", "foot", "force", "command", "ghost")
+    colors = (SLIPPERY, SOFT, TOUCH, FOOT_TOUCH, FORCE_COLOR, COMMAND_COLOR, OTHER_CONTROLLER)
     return TEMPLATES.get_template("legend.html").render(
         ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
         endings=[(ending.label, ending.color) for ending in ENDINGS.values()],
-        **{name: to_hex(color) for name, color in colors.items()},
+        **dict(zip(names, map(to_hex, colors), strict=True)),
     )

@@ -1,7 +1,7 @@
 """One crossing as it is shown: bodies, touches, forces, command and penalties at every frame, and what happens when."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,11 +52,11 @@ class Crossing:
 
 
 def trace_crossing(
-    recording: Recording, replica: int, skeleton: Skeleton, penalties: Sequence[str], scales: Sequence[float]
+    recording: Recording, replica: int, skeleton: Skeleton, scales: Mapping[str, float]
 ) -> Crossing | None:
     """One episode of a recording of one terrain; None if it broke before its first frame.
 
-    The ``penalties`` are those to show, by name, and are divided by ``scales``.
+    The penalties that ``scales`` names are shown, divided by them.
     """
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
@@ -71,7 +71,8 @@ def trace_crossing(
     bodies = [foot.bodyid[0] - 1 for foot in shapes]
     feet = positions[:, bodies] + rotated(quaternions[:, bodies], np.stack([foot.pos for foot in shapes]))
     command = recording.command[0, replica, :frames].astype(np.float64)
-    columns = [recording.penalty_names.index(name) for name in penalties]
+    sums = recording.penalties[0, replica, :frames].astype(np.float64)
+    columns = [recording.penalty_names.index(name) for name in scales]
     return Crossing(
         dt=recording.dt,
         duration_s=duration_s,
@@ -80,7 +81,7 @@ def trace_crossing(
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
         command=_command_arrows(qpos, command),
-        penalties=recording.penalties[0, replica, :frames][:, columns].astype(np.float64) / np.asarray(scales),
+        penalties=sums[:, columns] / np.array([*scales.values()]),
         touching=recording.touching[0, replica, :frames],
         marks=find_marks(recording, replica),
         failure_s=find_failure_time(recording, replica),

@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from html import escape
 from typing import Any
@@ -13,18 +14,16 @@ import viser
 from qd.search.directory import output_folder
 from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
-from qd.show.recordings import CrossingRequest
-from qd.show.view.address import Address, read_address
-from qd.show.view.listing import count_endings
-from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, Selection
-from qd.show.view.player import PlayerBar
-from qd.show.view.playing import group_episodes, trace_paths
-from qd.show.view.recorder import TaskProgress
-from qd.show.view.scene import Scene, View, compute_first_view, compute_overview
-from qd.show.view.shown import Shared, ShownController
-from qd.show.view.viewed import SEARCHED
+from qd.show.recordings import CrossingRequest, Recordings
+from qd.show.view.address import MINIMAL, Address, read_address
+from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
+from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
+from qd.show.view.recorder import Recorder, TaskProgress
+from qd.show.view.scene import Part, Scene, View, compute_first_view, compute_overview
+from qd.show.view.viewed import SEARCHED, ViewedRun, count_endings
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
+from sim.robots.skeleton import Skeleton
 from sim.terrains.bank import make_terrains
 
 _BAR_S = 0.1  # real time from one update of the bar's time to the next, while playing
@@ -36,6 +35,56 @@ NO_GHOST = "none"
 """Ghosts to choose beside the controllers: the certifier of the elite, if it is at hand, and none."""
 
 
+@dataclass(frozen=True)
+class Shared:
+    """What all tabs share."""
+
+    show: ViewedRun
+    skeleton: Skeleton
+    parts: list[Part]
+    recordings: Recordings
+    recorder: Recorder
+    post: Callable[..., None]
+    """Has the loop call a function with arguments."""
+
+
+class ShownController:
+    """The controller that is shown, or the ghost beside it."""
+
+    def __init__(self, shared: Shared, key: Hashable) -> None:
+        """No controller yet. The recorder works on the last request of each ``key``."""
+        self._shared = shared
+        self._key = key
+        self.name: str | None = None
+        self.request: CrossingRequest | None = None
+        self.recording: Recording | None = None
+        self.crossing: Crossing | None = None
+
+    def load(self, elite: int, name: str | None, *, minimal: bool = False) -> None:
+        """Load the recording of another elite or controller, or request it."""
+        self.name = name
+        self.recording = None
+        self.crossing = None
+        self.request = self._shared.show.request(elite, name, minimal=minimal)
+        if self.request is not None:
+            self.recording = self._shared.recordings.read(self.request)
+        self._shared.recorder.request(self.request if self.recording is None else None, key=self._key)
+
+    def take(self, progress: TaskProgress) -> bool:
+        """Take the recording, if it is done; returns whether the progress is of this controller's request."""
+        if self.request is None or progress.task != self.request or self.recording is not None:
+            return False
+        self.recording = progress.result
+        return True
+
+    def show_episode(self, replica: int) -> None:
+        """Trace an episode, counted from 0, if one is recorded."""
+        show = self._shared.show
+        self.crossing = None
+        if self.recording is not None:
+            self.crossing = trace_crossing(self.recording, replica, self._shared.skeleton, show.scales)
+
+
 class Tab:
     """What one tab shows; the loop calls all methods."""
 
@@ -43,14 +92,12 @@ class Tab:
         self, client: viser.ClientHandle, bar: PlayerBar, shared: Shared, window: tuple[int, int], query: str
     ) -> None:
         """Show what the address asks for behind its question mark, in a window of so many CSS pixels."""
-        show = shared.show
+        self.show = show = shared.show
         self.client = client
         self.bar = bar
         self.shared = shared
         self.window = window
-        self._archive = show.opened_run.archive
-        self._scales = dict(zip(self._archive.penalties, self._archive.scales, strict=True))
-        self.selection = Selection(show.listing)
+        self.selection = Selection(show)
         self.clock = Clock()
         self.controller = next(iter(show.controllers), None)
         self.ghost_choices = (CERTIFIER, NO_GHOST, *show.controllers)
@@ -66,7 +113,7 @@ class Tab:
         self.robot = ShownController(shared, client.client_id)
         self.ghost = ShownController(shared, (client.client_id, "ghost"))
         self.scene = Scene(client, shared.parts, shared.skeleton.num_bodies, len(show.robot.foot_geoms))
-        title = f"{show.robot.name} · {show.opened_run.folder} · {len(self._archive):,} elites"
+        title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
         self.list = ArchivePanel(client, self.selection, title, self)
         self.panel = CrossingPanel(client, list(show.controllers), self)
         self.go_to(query)
@@ -74,11 +121,17 @@ class Tab:
     def act(self, name: str, value: Any) -> None:
         """Do a visitor's action on the bar, by a key or on an elite; nonsense is left out."""
         actions: dict[str, tuple[Callable[[Any], Any], Callable[..., None]]] = {
-            "play": (bool, self.play), "seek": (float, self.seek), "speed": (float, self.set_speed),
-            "episode": (int, lambda number: self.choose_replica(number - 1)), "follow": (bool, self.set_follow),
-            "overview": (bool, lambda _: self.overview()), "pick": (str, self.pick), "step": (int, self.step),
-            "resize": (list, self.resize), "open": (str, self.go_to),
-        }  # fmt: skip
+            "play": (bool, self.play),
+            "seek": (float, self.seek),
+            "speed": (float, self.set_speed),
+            "episode": (int, lambda number: self.choose_replica(number - 1)),
+            "follow": (bool, self.set_follow),
+            "overview": (bool, lambda _: self.overview()),
+            "pick": (str, self.pick),
+            "step": (int, self.step),
+            "resize": (list, self.resize),
+            "open": (str, self.go_to),
+        }
         if name not in actions:
             return
         kind, method = actions[name]
@@ -93,13 +146,13 @@ class Tab:
 
     def go_to(self, query: str) -> None:
         """Show what an address asks for; one without a time opens just before the robot fails, and plays."""
-        show = self.shared.show
+        show = self.show
         address, refused = read_address(query)
         for text in refused:
             self.refuse(text)
         first = self.selection.picked if show.elite is None else show.elite
         elite = first if address.elite is None else address.elite
-        if not 0 <= elite < len(self._archive):
+        if not 0 <= elite < len(self.show.archive):
             self._refuse_elite(elite)
             elite = first
         for name, choices in ((address.controller, show.controllers), (address.ghost, self.ghost_choices)):
@@ -110,21 +163,23 @@ class Tab:
             self.panel.controller.value = address.controller
         if address.ghost in self.ghost_choices:
             self.ghost_choice = address.ghost
-        self._prefers_minimal = address.minimal or (address.elite is None and show.minimal)
-        if address.minimal and show.minimal_genes(elite) is None:
+        is_minimal = address.terrain == MINIMAL
+        self._prefers_minimal = is_minimal or (address.elite is None and show.minimal)
+        if is_minimal and show.minimal_genes(elite) is None:
             self.refuse(f"Elite {elite} has no minimal terrain here.")
         self.replica = None
         self._begin_s = address.time_s
         self.clock.playing = address.time_s is None
         if address.episode is not None:
             self.choose_replica(address.episode - 1, address.time_s, playing=self.clock.playing)
-        if address.camera is None:
+        has_camera = None not in (address.position, address.look_at)
+        if not has_camera:
             self.look(compute_first_view)
         self.selection.picked = elite
         self.list.show()
         self._show_elite()
         self._settled_at = time.perf_counter() + _SETTLE_S
-        self.set_follow(address.follow or (address.time_s is None and address.camera is None))
+        self.set_follow(address.follow or (address.time_s is None and not has_camera))
 
     @property
     def playing(self) -> bool:
@@ -150,15 +205,17 @@ class Tab:
         self._address_at = time.perf_counter()
         camera = self.client.camera
         position, look_at = (",".join(f"{x:.2f}" for x in point) for point in (camera.position, camera.look_at))
+        time_s = self.clock.time_s if self.robot.crossing is not None else self._begin_s
         address = Address(
             elite=self.selection.picked,
             controller=self.controller,
             ghost=None if self.ghost_choice == CERTIFIER else self.ghost_choice,
-            minimal=self.minimal,
+            terrain=MINIMAL if self.minimal else None,
             episode=None if self.replica is None else self.replica + 1,
-            time_s=self.clock.time_s if self.robot.crossing is not None else self._begin_s,
+            time_s=time_s if time_s is None else round(time_s, 2),
             follow=self.scene.follow,
-            camera=(position, look_at),
+            position=position,
+            look_at=look_at,
         )
         query = address.query()
         if query != self.query:
@@ -170,22 +227,18 @@ class Tab:
         """Have the recorder film the shown episode, unless it makes a film already."""
         if self.robot.recording is None or self.replica is None or self._film is not None:
             return
-        opened_run = self.shared.show.opened_run
+        show = self.show
         by = "" if self.controller in (None, SEARCHED) else str(self.controller)
         stem = f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}{f'-{by}' * bool(by)}"
-        file = output_folder(opened_run.path, opened_run.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
-        ghost = None
-        if self.ghost.name is not None and self.ghost.recording is not None:
-            ghost = (self.ghost.name, self.ghost.recording)
+        file = output_folder(show.path, show.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
+        beside = None if self.ghost.recording is None else (self.ghost.name, self.ghost.recording)
         try:
             prepare_output(file)
         except (OSError, ValueError) as error:
             self.panel.show_film(f"No film: {error}")
             return
-        self._film = partial(
-            film, self.robot.recording, opened_run.robot, self._scales, out=file, episode=self.replica, by=by,
-            beside=ghost,
-        )  # fmt: skip
+        look: Any = {"episode": self.replica, "by": by, "beside": beside}
+        self._film = partial(film, self.robot.recording, show.robot, show.scales, out=file, **look)
         self.panel.show_film("Filming: the film process starts …")
         self.shared.recorder.request(self._film, key=(self.client.client_id, "film"))
 
@@ -213,7 +266,7 @@ class Tab:
     @property
     def minimal(self) -> bool:
         """Whether a minimal terrain is shown."""
-        return self._prefers_minimal and self.shared.show.minimal_genes(self.selection.picked) is not None
+        return self._prefers_minimal and self.show.minimal_genes(self.selection.picked) is not None
 
     def choose_terrain(self, minimal: bool) -> None:
         """Show the elite's minimal terrain, or the whole one."""
@@ -232,7 +285,7 @@ class Tab:
         self.client.add_notification("Not here", text, color="red", auto_close_seconds=12.0)
 
     def _refuse_elite(self, number: object) -> None:
-        self.refuse(f"There is no elite {number} here: there are 0 to {len(self._archive) - 1}.")
+        self.refuse(f"There is no elite {number} here: there are 0 to {len(self.show.archive) - 1}.")
 
     def look(self, compute_view: Callable[[int, int], View]) -> None:
         """Move the camera to a view that depends on the window's width and height."""
@@ -250,7 +303,7 @@ class Tab:
     def pick(self, text: str | int) -> None:
         """Show the elite of a number, just before the robot fails, or refuse the number."""
         number = int(text) if str(text).strip().isdecimal() else -1
-        if not 0 <= number < len(self._archive):
+        if not 0 <= number < len(self.show.archive):
             self._refuse_elite(f"'{text}'")
         elif number != self.selection.picked:
             self.selection.picked = number
@@ -260,7 +313,7 @@ class Tab:
 
     def choose_controller(self, name: str) -> None:
         """Show the crossings of another controller."""
-        if name in self.shared.show.controllers and name != self.controller:
+        if name in self.show.controllers and name != self.controller:
             self.controller = name
             self._begin_s = None
             self.clock.playing = True
@@ -329,25 +382,25 @@ class Tab:
         self.cancel_film()
 
     def _show_elite(self) -> None:
-        show = self.shared.show
+        show = self.show
         elite = self.selection.picked
-        name = show.listing.ranking.name(elite)
+        name = show.ranking.name(elite)
         minimal_genes = show.minimal_genes(elite)
-        genes = minimal_genes if self.minimal and minimal_genes is not None else self._archive.genes[elite]
-        conditions = show.opened_run.space.condition_text(genes)
-        facts = filter(None, (f"elite {elite} of {len(self._archive):,}", show.listing.verdict(elite), conditions))
+        genes = minimal_genes if self.minimal and minimal_genes is not None else self.show.archive.genes[elite]
+        conditions = show.space.condition_text(genes)
+        facts = filter(None, (f"elite {elite} of {len(self.show.archive):,}", show.verdict(elite), conditions))
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         self.panel.show_elite(
             f"<b>{escape(name)}</b><br>{' · '.join(facts)}", has_minimal=minimal_genes is not None, minimal=self.minimal
         )
-        heights, ground = make_terrains(genes[None], show.opened_run.space)
+        heights, ground = make_terrains(genes[None], show.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()
 
     def _show_rates(self) -> None:
         """Show how episodes ended: those of the archive on the whole terrain, and recorded ones of other crossings."""
         recorded = [self.robot] if self.controller != SEARCHED else []
-        columns = [*self.shared.show.listing.columns(self.selection.picked)]
+        columns = [*self.show.columns(self.selection.picked)]
         if self.minimal:
             recorded = [self.robot, self.ghost]
             columns = []
@@ -358,7 +411,7 @@ class Tab:
 
     def _load_ghost(self) -> None:
         """Load or request the ghost's recording of the shown elite, and show it."""
-        show = self.shared.show
+        show = self.show
         name: str | None = self.ghost_choice
         self._ghost_note = ""
         if self.ghost_choice == CERTIFIER:
@@ -374,7 +427,7 @@ class Tab:
         replica = self.replica or 0
         ghost_replica = replica
         if self.ghost.recording is not None:
-            ghost_replica = find_ghost_episode(self.ghost.recording, replica, self._scales)
+            ghost_replica = find_ghost_episode(self.ghost.recording, replica, self.show.scales)
         self.ghost.show_episode(ghost_replica)
         crossing = self.robot.crossing
         ghost = self.ghost.crossing
@@ -399,11 +452,11 @@ class Tab:
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings, or have them recorded."""
-        show = self.shared.show
+        show = self.show
         policy = None if self.controller in (None, SEARCHED) else show.controllers[self.controller]
         terrain = {"minimal" if self.minimal else "elite": self.selection.picked}
-        command = show.opened_run.command("replay", policy=policy, **terrain)
-        self.panel.show_details(f"{show.listing.details(self.selection.picked)}\n\n`{command}`")
+        command = show.command("replay", policy=policy, **terrain)
+        self.panel.details.content = f"{show.details(self.selection.picked)}\n\n`{command}`"
         self.scene.hide_crossing()
         self.clock.duration_s = 0.0
         self.panel.show_curves(None)
@@ -419,7 +472,7 @@ class Tab:
 
     def _show_recording(self, recording: Recording) -> None:
         if self.replica is None:
-            self.replica = find_typical_episode(recording, self._scales)
+            self.replica = find_typical_episode(recording, self.show.scales)
         self.bar.show({"share": None, "episodes": group_episodes(recording)})
         self._show_rates()
         self.scene.set_paths(trace_paths(recording))

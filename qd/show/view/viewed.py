@@ -1,6 +1,9 @@
-"""The run that the viewer shows. What a user may have got wrong is refused before a page opens."""
+"""The run that the viewer shows: its elites as the page lists them, and the controllers that cross them.
 
-from collections.abc import Sequence
+What a user may have got wrong is refused before a page opens.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
@@ -9,42 +12,66 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.minimise.minimise import MinimalTerrains, read_minimal
+from qd.faults.families import ORDERS, VERDICTS, Ranking
+from qd.faults.numbers import best_certifier, describe_judgement
+from qd.show.crossed import ARRIVED, FAILED, count_rates
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import CrossingRequest, request_elite
-from qd.show.view.listing import Listing
 from qd.workers.compute import check_policy
 from sim.controllers.spec import ControllerSpec, parse_controllers
-from sim.robots.robot import RobotCfg
+from sim.crossing import CrossingCfg
+from sim.files.intervals import format_rate
+from sim.files.templates import open_templates
+from sim.recording.recorder import Recording
 
 SEARCHED = "searched controller"
 """Name of the search's controller on the page, if no other is given."""
+TEMPLATES = open_templates(Path(__file__).parent / "templates")
+"""HTML of the page."""
+_GREY = "#d8d8d8"
+_LISTED = "#2171b5"
+_PICKED = "#d55e00"
+_RATES = {
+    "goal_rate": "reached the goal",
+    "collision_rate": "base collision",
+    "other_rate": "out of time, off it",
+    "fallen_rate": "fallen",
+}
+FITNESS_TEXT = (
+    "what the search looks for: mean scaled penalties, less their spread over episodes, less a share of episodes "
+    "without a base collision where others have one; whether the robot fails is said by the goal rate"
+)
+"""What fitness is, and what it is not."""
+
+Column = tuple[str, int, Mapping[str, int]]
+"""A head, a number of episodes, and how many of them count for each rate of the table."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewedRun:
-    """What the viewer shows."""
+class ViewedRun(OpenedRun):
+    """What the viewer shows: a run of at least one elite."""
 
-    opened_run: OpenedRun
-    elite: int | None
+    elite: int | None = None
     """Which to show first; None for the first of the list."""
+    minimal: bool = False
+    """Whether the first terrain is the elite's minimal one."""
     controllers: dict[str, str]
     """File or code of each controller, by its name; empty if the search's controller is lost."""
     note: str = ""
     """Why there is no controller; empty if there is one."""
-    minima: MinimalTerrains | None = None
-    minimal: bool = False
-    """Whether the first terrain is the elite's minimal one."""
 
     @cached_property
-    def listing(self) -> Listing:
-        """All elites, and the orders to list them in."""
-        return Listing(opened_run=self.opened_run, minima=self.minima)
+    def ranking(self) -> Ranking:
+        """All elites, their causes and families."""
+        return self.rank()
 
-    @property
-    def robot(self) -> RobotCfg:
-        """The run's robot."""
-        return self.opened_run.robot
+    @cached_property
+    def _orders(self) -> dict[str, NDArray[np.int64]]:
+        return {name: self.ranking.order(name) for name in ORDERS}
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return [self.ranking.name(number) for number in range(len(self.archive))]
 
     def minimal_genes(self, elite: int) -> NDArray[np.float32] | None:
         """Genes of the minimal terrain of an elite; None if it has none."""
@@ -55,18 +82,98 @@ class ViewedRun:
         if controller is None:
             return None
         genes = self.minimal_genes(elite) if minimal else None
-        return request_elite(self.opened_run.archive, elite, policy=self.controllers[controller], minimal=genes)
+        return request_elite(self.archive, elite, policy=self.controllers[controller], minimal=genes)
 
     def find_certifier(self, number: int) -> tuple[str | None, str]:
         """Name of the controller that crosses a failing elite most often, or why there is none to show."""
-        archive = self.opened_run.archive
-        name = self.opened_run.certifier(number)
-        if name is not None and self.controllers.get(name) == self.opened_run.certifiers()[name]:
+        archive = self.archive
+        name = self.certifier(number)
+        if name is not None and self.controllers.get(name) == self.certifiers()[name]:
             return name, ""
         if not archive.certified[number]:
             return None, "No other controller is known to cross it." if archive.failing[number] else ""
         names = compress(archive.certifiers, archive.certificates[number].tolist())
         return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."
+
+    def list_elites(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
+        """Numbers of the elites of a cause, or of all, in one of the :data:`qd.faults.families.ORDERS`."""
+        numbers = self._orders[order]
+        return numbers[np.isin(numbers, self.ranking.by_cause()[cause])] if cause else numbers
+
+    def causes(self) -> dict[str, str]:
+        """Causes by their label with the number of elites; empty for all."""
+        rows = self.ranking.by_cause()
+        return {"all": "", **{f"{cause} ({len(members):,})": cause for cause, members in rows.items()}}
+
+    def verdict(self, number: int) -> str:
+        """One of :data:`qd.faults.families.VERDICTS`."""
+        return VERDICTS[int(self.ranking.verdict[number])]
+
+    def render_list(self, listed: NDArray[np.int64], picked: int) -> str:
+        """HTML of the elites, one below the other; a click on one shows it (``page.js``)."""
+        template = TEMPLATES.get_template("list.html")
+        return template.render(run=self, names=self._names, listed=listed.tolist(), picked=picked)
+
+    def render_map(self, listed: NDArray[np.int64], picked: int) -> str:
+        """HTML of a map of where the typical episode of each elite ends; a click on one shows it (``page.js``)."""
+        drawn = [*np.setdiff1d(np.arange(len(self.archive)), listed), *listed[::-1]]
+        colors = dict.fromkeys(drawn, _GREY) | dict.fromkeys(listed, _LISTED)
+        colors.pop(picked)
+        positions = self.ranking.end_position
+        dots = [
+            (number, positions[number].tolist(), color, 6 if color == _PICKED else 3)
+            for number, color in (colors | {picked: _PICKED}).items()
+            if np.isfinite(positions[number]).all()
+        ]
+        template = TEMPLATES.get_template("map.html")
+        return template.render(dots=dots, names=self._names, start=CrossingCfg.start, goal=CrossingCfg.goal)
+
+    def columns(self, number: int) -> Sequence[Column]:
+        """Episodes on the whole terrain: fresh, finer contact, varied conditions, and of the best certifier."""
+        ranking = self.ranking
+        archive = self.archive
+        hits = {name: ranking.hits(name, number) for name in _RATES}
+        columns: list[Column] = [
+            ("fresh" if ranking.is_fresh[number] else "as found", int(ranking.counted[number]), hits)
+        ]
+        outcomes_by_head = {"finer contact": archive.resolved_outcomes[number]}
+        if archive.varied_outcomes is not None:
+            outcomes_by_head["varied"] = archive.varied_outcomes[number]
+        if name := best_certifier(archive, number):
+            outcomes_by_head[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
+        for head, outcomes in outcomes_by_head.items():
+            if outcomes.any():
+                hits = dict(zip([*_RATES][:3], outcomes.tolist()[:3], strict=True))
+                columns.append((head, sum(hits.values()), hits))
+        return columns
+
+    def details(self, number: int) -> str:
+        """All else that is known of an elite, as Markdown."""
+        ranking = self.ranking
+        kin = int((ranking.families == ranking.families[number]).sum()) - 1
+        paragraphs = [
+            *describe_judgement(self.archive, number),
+            f"{kin or 'No'} other elite{'s' * (kin > 1)} like it (within 6 cm).",
+            f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
+            f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",
+        ]
+        if self.minima is not None and number in self.minima.genes:
+            paragraphs.insert(0, f"**Minimal terrain**: {self.minima.describe(number)}.")
+        return "\n\n".join(paragraphs)
+
+
+def count_endings(head: str, recording: Recording) -> Column:
+    """The recorded episodes of a controller."""
+    rates = count_rates(recording)
+    hits = {label: rate.hits for label, rate in rates.items()}
+    collision, *others = FAILED
+    counts = (hits[ARRIVED], hits[collision], sum(hits[label] for label in others), hits["fallen"])
+    return head, rates[ARRIVED].count, dict(zip(_RATES, counts, strict=True))
+
+
+def render_rates(columns: Sequence[Column]) -> str:
+    """HTML of how episodes ended: a row an ending and a column a controller, with 95 % intervals (Wilson)."""
+    return TEMPLATES.get_template("rates.html").render(columns=columns, rates=_RATES, format_rate=format_rate)
 
 
 def open_viewed_run(
@@ -84,20 +191,13 @@ def open_viewed_run(
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
     if elite and minimal:
         raise ValueError(f"elite and minimal both say what to open, got '{elite}' and '{minimal}': leave one out")
-    numbers: list[int | None] = [None]
+    number = None
     if elite or minimal is not None:
-        numbers = [terrain.number for terrain in opened_run.terrains(elite, minimal)]
-    if len(numbers) > 1:
-        raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite or minimal}'")
+        number, *others = (terrain.number for terrain in opened_run.terrains(elite, minimal))
+        if others:
+            raise ValueError(f"elite must be one number, since the viewer opens one, got '{elite or minimal}'")
     controllers, note = _find_controllers(policies, opened_run)
-    return ViewedRun(
-        opened_run=opened_run,
-        elite=numbers[0],
-        controllers=controllers,
-        note=note,
-        minima=read_minimal(opened_run.folder, opened_run.archive),
-        minimal=minimal is not None,
-    )
+    return ViewedRun(**vars(opened_run), elite=number, minimal=minimal is not None, controllers=controllers, note=note)
 
 
 def _find_controllers(policies: Sequence[str], opened_run: OpenedRun) -> tuple[dict[str, str], str]:
@@ -112,7 +212,7 @@ def _find_controllers(policies: Sequence[str], opened_run: OpenedRun) -> tuple[d
     try:
         if ControllerSpec.parse(searched).runs_code:
             raise ValueError(f"the search's controller {searched} is code, and what a run names is never run")
-        policy = opened_run.policy(None)
+        policy = opened_run.policy()
         check_policy(policy, opened_run.robot, "cpu")
     except ValueError as error:
         return {}, f"{error}; name a controller with --policies to see crossings"

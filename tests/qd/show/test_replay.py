@@ -193,7 +193,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     run = make_run(tmp_path)
     minimal_of(run, 2)  # of 20 elites: the elite with its last gene changed
     opened_run = open_run("anymal", run)
-    genes = opened_run.minima().genes
+    genes = opened_run.minima.genes
     number = next(iter(genes))
     wanted = []
 
@@ -213,7 +213,7 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     with pytest.raises(ValueError, match="out"):
         replay(source, out=Path("a.jpg"))
     words = " ".join(capsys.readouterr().out.split())
-    assert f"Of the minimal terrain: {opened_run.minima().describe(number)}; failing." in words
+    assert f"Of the minimal terrain: {opened_run.minima.describe(number)}; failing." in words
     assert words.count("- bump of") == 1 and "- bump of <0.24> m" in words  # those that are left alone
     ExportCommand(run=run, minimal="all", out=tmp_path / "out", formats=("npz",)).execute()
     assert {file.name for file in (tmp_path / "out").glob("*.npz")} == {f"minimal-{k}.npz" for k in genes}

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qd.show.elites import OpenedRun
-from qd.show.view.listing import Listing
+from qd.show.view.viewed import ViewedRun
 from tests.builders import small_archive
 
 
@@ -18,7 +17,7 @@ def run(published):
 
 
 @pytest.fixture
-def listing(anymal):
+def show(anymal):
     """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
     numbers = np.arange(20)
     archive = dataclasses.replace(
@@ -28,4 +27,4 @@ def listing(anymal):
         fitness=10.0 - numbers,
         episodes=np.full(20, 20),
     )
-    return Listing(opened_run=OpenedRun(path=Path(), archive=archive, robot=anymal))
+    return ViewedRun(path=Path(), archive=archive, robot=anymal, controllers={})

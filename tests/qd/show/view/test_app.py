@@ -77,7 +77,7 @@ def worst_crossed(show):
     recording = read_recording(Path(__file__).with_name("crossing.npz"))
     outcome = recording.outcome.copy()
     outcome[0, 16] = Outcome.TIME_OUT
-    wanted = request_elite(show.opened_run.archive, 0, policy=str(show.robot.policy_file), replicas=20)
+    wanted = request_elite(show.archive, 0, policy=str(show.robot.policy_file), replicas=20)
     return wanted, dataclasses.replace(recording, outcome=outcome)
 
 
@@ -107,12 +107,11 @@ def notes(client):
 
 def test_an_elite_opens_a_second_before_the_robot_fails_and_plays(shown, show, worst_crossed):
     tab, (_, recording) = shown.tab, worst_crossed
-    archive = show.opened_run.archive
-    typical = find_typical_episode(recording, dict(zip(archive.penalties, archive.scales, strict=True)))
+    typical = find_typical_episode(recording, show.scales)
     moment = find_failure_time(recording, typical)
     assert tab.replica == typical and tab.bar.shown["episode"] == typical + 1
     assert tab.clock.time_s == pytest.approx(max(0.0, moment - 1.0)) and tab.playing and tab.scene.follow
-    name = show.listing.ranking.name(0)
+    name = show.ranking.name(0)
     assert tab.bar.shown["title"] == name and name in tab.panel.head.content and "elite 0 " in tab.panel.head.content
     assert tab.scene.robot.visible and tab.bar.shown["enabled"]
     assert status(tab).startswith("base collision") and tab.bar.shown["episodes"][0][0] == "19 of 20: base collision"
@@ -203,7 +202,7 @@ def test_a_frame_has_the_robot_in_its_place_what_touches_in_colour_and_forces(sh
 
 
 def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
-    genes = show.opened_run.archive.genes[0].copy()
+    genes = show.archive.genes[0].copy()
     genes[:8] = 0.0
     entry = {"elite": 0, "bumps": [1], "of": 8, "goal_rate": 0.1, "goal_interval": [0.03, 0.25], "cause": None,
              "margin_m": None}  # fmt: skip
@@ -253,9 +252,9 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
 
 
 def test_the_ghost_is_who_certifies_it_or_words_say_why_there_is_none(show):
-    certified = int(np.flatnonzero(show.opened_run.archive.certified)[0])
+    certified = int(np.flatnonzero(show.archive.certified)[0])
     name, words = show.find_certifier(certified)
-    assert (name, words) == (show.opened_run.certifier(certified), "") and name in ("C-G", "S")
+    assert (name, words) == (show.certifier(certified), "") and name in ("C-G", "S")
     lost = dataclasses.replace(show, controllers={"base": "shipped"})
     name, words = lost.find_certifier(certified)
     assert name is None and "--policies" in words

@@ -4,19 +4,18 @@ from pathlib import Path
 
 import numpy as np
 
-from qd.show.elites import OpenedRun
-from qd.show.view.listing import Listing, count_endings, render_rates
 from qd.show.view.panels import Clock, Selection
+from qd.show.view.viewed import ViewedRun, count_endings, render_rates
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
 
 
 def list_archive(archive, robot):
-    return Listing(opened_run=OpenedRun(path=Path(), archive=archive, robot=robot))
+    return ViewedRun(path=Path(), archive=archive, robot=robot, controllers={})
 
 
-def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(listing):
-    selection, ranking = Selection(listing), listing.ranking
+def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(show):
+    selection, ranking = Selection(show), show.ranking
     assert selection.picked == ranking.worst(1)[0]
     assert selection.matching.tolist() == ranking.order("cause").tolist()
     selection.choose(order="collision_rate")
@@ -31,19 +30,19 @@ def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(listing):
     assert selection.step(1) == selection.picked == 15 and selection.step(-1) == max(rows)  # from where it was
 
 
-def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(listing):
-    members = {cause: len(rows) for cause, rows in listing.ranking.by_cause().items()}
+def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(show):
+    members = {cause: len(rows) for cause, rows in show.ranking.by_cause().items()}
     assert sum(members.values()) == 10  # those with a goal rate below .5
-    assert list(listing.causes()) == ["all", *(f"{cause} ({count})" for cause, count in members.items())]
-    rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', listing.render_list(np.array([12, 0]), 12))
-    assert rows == [("12", "crossed, 12 of 20"), ("0", listing.ranking.name(0))]
+    assert list(show.causes()) == ["all", *(f"{cause} ({count})" for cause, count in members.items())]
+    rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', show.render_list(np.array([12, 0]), 12))
+    assert rows == [("12", "crossed, 12 of 20"), ("0", show.ranking.name(0))]
 
 
 def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
-    listing = list_archive(judged_archive(), anymal)
-    assert "It is a fault" in listing.details(0)
-    fresh, resolved, certifier = listing.columns(0)
-    assert all(len(listing.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
+    show = list_archive(judged_archive(), anymal)
+    assert "It is a fault" in show.details(0)
+    fresh, resolved, certifier = show.columns(0)
+    assert all(len(show.columns(number)) == 2 for number in (1, 3))  # nobody has a certificate
     assert fresh[:2] == ("fresh", 40) and fresh[2]["goal_rate"] == 0
     # 9 at the goal, 6 base collisions and 5 others with contact resolved; S crosses it 10 times, C-G 9
     assert resolved == ("finer contact", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
@@ -60,8 +59,8 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
 def test_an_elite_whose_fresh_episodes_are_invalid_is_listed_as_found(anymal):
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 0, 39]))
-    listing = list_archive(dataclasses.replace(archive, fresh=fresh), anymal)
-    ((head, count, hits),) = listing.columns(2)
+    show = list_archive(dataclasses.replace(archive, fresh=fresh), anymal)
+    ((head, count, hits),) = show.columns(2)
     assert (head, count, hits["collision_rate"]) == ("as found", 4, 4)
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from qd.show.view.meshes import arrow_mesh, arrow_pose, robot_parts
 from qd.show.view.playing import rotated
+from qd.show.view.scene import arrow_mesh, arrow_pose, robot_parts
 from sim.robots.skeleton import Skeleton
 
 

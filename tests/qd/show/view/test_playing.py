@@ -35,7 +35,7 @@ def recording():
 
 def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     names = recording.penalty_names[::-1]
-    crossing = trace_crossing(recording, 0, skeleton, names, [2.0] * len(names))
+    crossing = trace_crossing(recording, 0, skeleton, dict.fromkeys(names, 2.0))
     assert (crossing.num_frames, crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
     np.testing.assert_allclose(crossing.positions[3, 0], [2.3, 4.0, 0.0], atol=1e-6)
     # penalty j sums j + 1 a frame; shown in the order asked for, divided by 2
@@ -44,11 +44,11 @@ def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     assert (first[:, 0] == first[:, 1]).all()  # none at the start
     np.testing.assert_allclose(last[0, 1] - last[0, 0], [0.0, 0.0, 0.5])  # 500 N
     assert (last[1:, 0] == last[1:, 1]).all()
-    assert trace_crossing(recording, 2, skeleton, (), ()) is None  # it broke at once
+    assert trace_crossing(recording, 2, skeleton, {}) is None  # it broke at once
 
 
 def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
-    crossing = trace_crossing(recording, 0, skeleton, (), ())
+    crossing = trace_crossing(recording, 0, skeleton, {})
     begin, end = crossing.command[0]
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
