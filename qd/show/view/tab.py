@@ -105,7 +105,8 @@ class Tab:
         self._prefers_minimal = False  # show the minimal terrain of elites that have one
         self.replica: int | None = None  # None: the typical one
         self._begin_s: float | None = None  # where the next crossing begins; None: just before the robot fails
-        self.query = ""
+        self.address = Address()
+        """What the browser's address says."""
         self._film: partial[None] | None = None
         self._bar_at = 0.0  # when they were updated last
         self._address_at = time.perf_counter()
@@ -167,9 +168,7 @@ class Tab:
         self._prefers_minimal = is_minimal or (address.elite is None and show.minimal)
         if is_minimal and show.minimal_genes(elite) is None:
             self.refuse(f"Elite {elite} has no minimal terrain here.")
-        self.replica = None
-        self._begin_s = address.time_s
-        self.clock.playing = address.time_s is None
+        self._begin(None, address.time_s, playing=address.time_s is None)
         if address.episode is not None:
             self.choose_replica(address.episode - 1, address.time_s, playing=self.clock.playing)
         has_camera = None not in (address.position, address.look_at)
@@ -217,28 +216,25 @@ class Tab:
             position=position,
             look_at=look_at,
         )
-        query = address.query()
-        if query != self.query:
-            before, _ = read_address(self.query)
-            self.query = query
-            self.bar.show_address(query, is_new=before.elite not in (None, address.elite))
+        if address != self.address:
+            self.bar.show_address(address.query(), is_new=self.address.elite not in (None, address.elite))
+            self.address = address
 
     def film(self) -> None:
         """Have the recorder film the shown episode, unless it makes a film already."""
         if self.robot.recording is None or self.replica is None or self._film is not None:
             return
-        show = self.show
         by = "" if self.controller in (None, SEARCHED) else str(self.controller)
         stem = f"{'minimal' if self.minimal else 'elite'}-{self.selection.picked}{f'-{by}' * bool(by)}"
-        file = output_folder(show.path, show.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
-        beside = None if self.ghost.recording is None else (self.ghost.name, self.ghost.recording)
+        file = output_folder(self.show.path, self.show.robot.name) / f"{stem}-episode-{self.replica + 1}.mp4"
         try:
             prepare_output(file)
         except (OSError, ValueError) as error:
             self.panel.show_film(f"No film: {error}")
             return
+        beside = None if self.ghost.recording is None else (self.ghost.name, self.ghost.recording)
         look: Any = {"episode": self.replica, "by": by, "beside": beside}
-        self._film = partial(film, self.robot.recording, show.robot, show.scales, out=file, **look)
+        self._film = partial(film, self.robot.recording, self.show.robot, self.show.scales, out=file, **look)
         self.panel.show_film("Filming: the film process starts …")
         self.shared.recorder.request(self._film, key=(self.client.client_id, "film"))
 
@@ -272,13 +268,14 @@ class Tab:
         """Show the elite's minimal terrain, or the whole one."""
         if minimal != self._prefers_minimal:
             self._prefers_minimal = minimal
-            self._restart()
+            self._begin(None)
             self._show_elite()
 
-    def _restart(self) -> None:
-        self.replica = None
-        self._begin_s = None
-        self.clock.playing = True
+    def _begin(self, replica: int | None, begin_s: float | None = None, *, playing: bool = True) -> None:
+        """Note which episode to show from when on, as soon as it is recorded."""
+        self.replica = replica
+        self._begin_s = begin_s
+        self.clock.playing = playing
 
     def refuse(self, text: str) -> None:
         """Say at the top of the page what does not exist."""
@@ -307,7 +304,7 @@ class Tab:
             self._refuse_elite(f"'{text}'")
         elif number != self.selection.picked:
             self.selection.picked = number
-            self._restart()
+            self._begin(None)
             self.list.show()
             self._show_elite()
 
@@ -315,8 +312,7 @@ class Tab:
         """Show the crossings of another controller."""
         if name in self.show.controllers and name != self.controller:
             self.controller = name
-            self._begin_s = None
-            self.clock.playing = True
+            self._begin(self.replica)
             self._show_crossings()
 
     def choose_ghost(self, name: str) -> None:
@@ -330,9 +326,7 @@ class Tab:
         if not 0 <= replica < CrossingRequest.replicas:
             self.refuse(f"There is no episode {replica + 1} here: there are 1 to {CrossingRequest.replicas}.")
             return
-        self.replica = replica
-        self._begin_s = begin_s
-        self.clock.playing = playing
+        self._begin(replica, begin_s, playing=playing)
         if self.robot.recording is not None:
             self._show_episode()
 

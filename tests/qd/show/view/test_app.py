@@ -162,14 +162,14 @@ def test_a_link_opens_what_it_was_copied_from(shown):
     tab = shown.tab
     shown.do((tab.choose_replica, 16), (tab.choose_controller, "other"), (tab.seek, 1.25), (tab.set_follow, True))
     tab.show_address()
-    query = tab.query
+    query = tab.address.query()
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
     second = shown.come(f"?{query}")
     assert (second.controller, second.replica, second.clock.time_s) == ("other", 16, 1.25)
     assert second.panel.controller.value == "other" and status(second).startswith("out of time")
     assert second.scene.follow and second.bar.shown["follow"] and not second.playing
     second.show_address()
-    assert second.query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1")
+    assert second.address.query().startswith("elite=0&controller=other&episode=17&t=1.25&follow=1")
 
 
 def test_what_is_not_there_is_refused_in_words(shown):
@@ -218,7 +218,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
         assert shown.asked[-1].label == "minimal terrain of elite 0 of anymal" and not tab.scene.robot.visible
         np.testing.assert_array_equal(shown.asked[-1].terrain.genes[0], genes)
         tab.show_address()
-        assert "terrain=minimal" in tab.query and shown.come(f"?{tab.query}").minimal
+        assert "terrain=minimal" in tab.address.query() and shown.come(f"?{tab.address.query()}").minimal
         assert tab.panel.rates.content == ""  # what is known is of the whole terrain
         shown.do((tab.pick, 7))
         assert not tab.minimal and not tab.panel.terrain.visible
@@ -241,8 +241,8 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
         shown.do((tab.choose_replica, episode))
         assert f"Ghost, {words}: reached the goal" in status(tab)
     tab.show_address()
-    assert "&ghost=other" in tab.query
-    assert shown.come(f"?{tab.query}").scene.ghost.visible
+    assert "&ghost=other" in tab.address.query()
+    assert shown.come(f"?{tab.address.query()}").scene.ghost.visible
     shown.do((tab.choose_controller, "other"))  # none is its own ghost
     assert not tab.scene.ghost.visible and "Ghost" not in status(tab)
     assert re.search("`faultline replay .*anymal.pt --elite 0`$", tab.panel.details.content)
