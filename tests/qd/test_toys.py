@@ -3,7 +3,6 @@
 import json
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 from faultline import main
