@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kernels.episode import Invalidity, Outcome, make_episodes
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES, penalty_columns
-from kernels.queue import make_queue, make_ready, restart_episodes, turn_over
+from kernels.queue import restart_episodes
 from kernels.rewards import Rewards
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
@@ -46,10 +46,9 @@ _WARNINGS = [
 
 
 @lru_cache(maxsize=8)
-def _base_com(robot: RobotCfg) -> tuple[float, float, float]:
+def _base_com(robot: RobotCfg) -> Array:
     """Mass centre of the base in its frame [m]."""
-    x, y, z = robot_spec(robot).compile().body_ipos[1]
-    return float(x), float(y), float(z)
+    return robot_spec(robot).compile().body_ipos[1].copy()
 
 
 def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str) -> Starts:
@@ -59,24 +58,19 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     """
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
+    base_com = wp.vec3(*_base_com(robot))
     with wp.ScopedDevice(device):
-        joint_q = wp.zeros((count, 7 + robot.num_joints), dtype=float)
-        joint_qd = wp.zeros((count, 6 + robot.num_joints), dtype=float)
-        episodes = make_episodes(count)
-        terrain_of_env = wp.zeros(count, dtype=int)
         sensors = Sensors()
-        sensors.base_com = base_com = wp.vec3(*_base_com(robot))
+        sensors.base_com = base_com
         sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
-        queue = make_queue(count, 1, count, 0, rewarded=False, device=device)
-        queue.seed.fill_(int(seed))
-        make_ready(count, queue)
-        turn_over(episodes.outcome, Rewards(), episodes, wp.zeros((count, 0), dtype=float), terrain_of_env, queue)
-        restart_episodes(
-            queue.begins, terrain_of_env, bank.terrain, make_start_ranges(CrossingCfg(), robot), sensors,
-            joint_q, joint_qd, wp.zeros((count, robot.num_joints), dtype=float), episodes, Rewards(),
-        )  # fmt: skip
-    order = np.argsort(queue.episode_of_env.numpy())  # on a GPU robots take them in any order
-    return to_mujoco(joint_q.numpy()[order], joint_qd.numpy()[order], np.array(base_com))
+        joint_q, joint_qd, action = (wp.zeros((count, width + robot.num_joints), dtype=float) for width in (7, 6, 0))
+        everyone, terrain_of_env = wp.ones(count, dtype=int), wp.zeros(count, dtype=int)
+        episodes = make_episodes(count)
+        signed = int(np.uint32(seed).astype(np.int32))  # as a kernel takes it
+        episodes.rng.assign(np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32))
+        start = (terrain_of_env, bank.terrain, make_start_ranges(CrossingCfg(), robot), sensors)
+        restart_episodes(everyone, *start, joint_q, joint_qd, action, episodes, Rewards())
+    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.array(base_com))
 
 
 class EpisodeStates:

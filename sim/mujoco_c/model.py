@@ -20,7 +20,7 @@ from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.terrains.ground import PATCHES, GroundMaps
-from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.hfield import QUARTER_TURN, Margins, as_hfield
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
@@ -86,9 +86,9 @@ def crossing_model(
     option.cone = mj.mjtCone.mjCONE_ELLIPTIC
     option.disableflags = mj.mjtDisableBit.mjDSBL_AUTORESET  # or a state that blows up would begin anew unseen
     plain = ground is None or ((ground.friction == 1.0).all() and (ground.time_constant_s == FIRM).all())
-    patches = [] if ground is None or plain else _read_patches(ground)
-    if patches:
-        _add_patches(spec, heights, patches)
+    patches = None
+    if ground is not None and not plain:
+        patches = _add_patches(spec, heights, ground)
     elif np.ptp(heights) == 0.0:  # small feet on soft contacts sink into a heightfield, whose facets push them aside
         _add_geom(spec, GROUND, (0.0, 0.0, float(heights[0, 0])), type=mj.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1))
     else:
@@ -99,11 +99,10 @@ def crossing_model(
             intprm=[1 << mj.mjtConDataField.mjCONDATA_FORCE.value, 3, 1],
         )  # fmt: skip
     model = spec.compile()
-    of_ground = np.flatnonzero([model.geom(k).name.startswith(GROUND) for k in range(model.ngeom)])
     if time_constant_s is not None:
         model.geom_solref[:] = time_constant_s, 1.0
-    if patches:
-        _lay_ground(model, robot, of_ground, patches)
+    if patches is not None:
+        _lay_ground(model, robot, *patches)
     return model
 
 
@@ -138,61 +137,41 @@ def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **look
     )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Patch:
-    rows: slice
-    cols: slice
-    margin: Margins  # nodes that continue the edge, before and behind along y, and along x
-    friction: float
-    time_constant_s: float
+def _add_patches(spec: Any, heights: NDArray[np.floating], ground: GroundMaps) -> tuple[Array, Array]:
+    """Adds a geom a patch, a box where it is level and else a heightfield; columns in which nothing changes are one.
 
-
-def _read_patches(ground: GroundMaps) -> list[_Patch]:
-    """The patches of one terrain; columns of the map in which nothing changes are one."""
-    (num_rows, num_cols) = PATCHES
-    maps = np.stack([ground.friction[0], ground.time_constant_s[0]])
-    changes = 1 + np.flatnonzero((maps[..., 1:] != maps[..., :-1]).any(axis=(0, 1)))
-    return [
-        _Patch(
-            rows=_nodes(row, num_rows, NUM_ROWS),
-            cols=_nodes(col, num_cols, NUM_COLS),
-            margin=(_margin(row, num_rows), _margin(col, num_cols)),
-            friction=float(ground.friction[0, row[0], col[0]]),
-            time_constant_s=float(ground.time_constant_s[0, row[0], col[0]]),
-        )
-        for row, col in product(pairwise(range(num_rows + 1)), pairwise([0, *changes.tolist(), num_cols]))
-    ]
-
-
-def _nodes(span: tuple[int, int], count: int, nodes: int) -> slice:
-    first, end = (place * (nodes - 1) // count for place in span)
-    return slice(first, end + 1)
-
-
-def _margin(span: tuple[int, int], count: int) -> tuple[int, int]:
-    return _MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)
-
-
-def _add_patches(spec: Any, heights: NDArray[np.floating], patches: list[_Patch]) -> None:
-    """Adds a geom a patch, a box where it is level and else a heightfield."""
-    for number, patch in enumerate(patches):
-        part = heights[patch.rows, patch.cols]
+    Returns friction and time constant of each.
+    """
+    maps = np.stack([ground.friction[0], ground.time_constant_s[0]], axis=-1).astype(np.float64)
+    changes = 1 + np.flatnonzero((maps[:, 1:] != maps[:, :-1]).any(axis=(0, 2)))
+    rows, cols = pairwise(range(PATCHES[0] + 1)), pairwise([0, *changes.tolist(), PATCHES[1]])
+    values = []
+    for number, (row, col) in enumerate(product(rows, cols)):
         name = f"{GROUND}-{number}" if number else GROUND
-        if np.ptp(part) > 0.0:
-            if patch.time_constant_s:
+        # Nodes of the patch along y and x, and those that continue the edge, before and behind.
+        axes = tuple(zip((row, col), PATCHES, heights.shape, strict=True))
+        (y0, y1), (x0, x1) = ([end * (nodes - 1) // count for end in span] for span, count, nodes in axes)
+        margin_y, margin_x = (
+            (_MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)) for span, count, _ in axes
+        )
+        patch = heights[y0 : y1 + 1, x0 : x1 + 1]
+        values.append(maps[row[0], col[0]])
+        if np.ptp(patch) > 0.0:
+            if values[-1][1]:
                 raise ValueError(NO_SOFTNESS)
-            low = SPACING * patch.cols.start, SPACING * patch.rows.start
-            _add_field(spec, part, name, low, patch.margin)
+            _add_field(spec, patch, name, (SPACING * x0, SPACING * y0), (margin_y, margin_x))
             continue
-        axes = zip((patch.rows, patch.cols), patch.margin, strict=True)
-        ends = [(nodes.start - before, nodes.stop - 1 + behind) for nodes, (before, behind) in axes]
-        (y, half_y), (x, half_x) = ((SPACING * (low + high) / 2, SPACING * (high - low) / 2) for low, high in ends)
-        size = half_x, half_y, _DEPTH / 2
-        _add_geom(spec, name, (x, y, float(part[0, 0]) - _DEPTH / 2), type=mj.mjtGeom.mjGEOM_BOX, size=size)
+        sides = ((x0 - margin_x[0], x1 + margin_x[1]), (y0 - margin_y[0], y1 + margin_y[1]))
+        (x, half_x), (y, half_y) = ((SPACING * (low + high) / 2, SPACING * (high - low) / 2) for low, high in sides)
+        middle = (x, y, float(patch[0, 0]) - _DEPTH / 2)
+        _add_geom(spec, name, middle, type=mj.mjtGeom.mjGEOM_BOX, size=(half_x, half_y, _DEPTH / 2))
+    friction, time_constant = np.transpose(values)
+    return friction, time_constant
 
 
-def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: list[_Patch]) -> None:
+def _lay_ground(model: Any, robot: RobotCfg, friction: Array, time_constant: Array) -> None:
     """Gives the geoms of the patches their contacts' friction and softness."""
+    geoms = np.flatnonzero([model.geom(k).name.startswith(GROUND) for k in range(model.ngeom)])
     of_robot = (model.geom_contype != 0) & (model.geom_bodyid > 0)
     for name in ("friction", "solref", "solimp"):
         if np.ptp(getattr(model, f"geom_{name}")[of_robot], axis=0).any():
@@ -203,10 +182,9 @@ def _lay_ground(model: Any, robot: RobotCfg, geoms: NDArray[np.intp], patches: l
     first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]
     sliding = max(model.geom_friction[first, 0], GROUND_FRICTION)
-    model.geom_friction[geoms, 0] = [sliding * patch.friction for patch in patches]
+    model.geom_friction[geoms, 0] = sliding * friction
     model.geom_solref[geoms] = model.geom_solref[first]
     model.geom_solimp[geoms] = model.geom_solimp[first]
-    time_constant = np.array([patch.time_constant_s for patch in patches])
     soft = time_constant > max(model.geom_solref[first, 0], 0.0)
     impedance = model.geom_solimp[first, 1]
     model.geom_solref[geoms[soft]] = np.stack([time_constant[soft], np.ones(soft.sum())], axis=1)
