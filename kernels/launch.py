@@ -41,12 +41,22 @@ def kernel_over(array: str, **options: Any) -> Callable[[Callable[..., None]], C
     return make_launcher
 
 
+def make_struct(struct: Any, *sources: Any, **values: Any) -> Any:
+    """A kernel argument with these values, and with what ``sources`` have under the names of other fields."""
+    made = struct()
+    for name in struct.vars:
+        for source in sources:
+            if name not in values and hasattr(source, name):
+                setattr(made, name, getattr(source, name))
+    for name, value in values.items():
+        setattr(made, name, value)
+    return made
+
+
 def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...]) -> Any:
     """A kernel argument whose arrays have these shapes, with zeros of the types that its struct names."""
-    made = struct()
-    for name, shape in shapes.items():
-        setattr(made, name, wp.zeros(shape, dtype=struct.vars[name].type.dtype, device=device))
-    return made
+    types = {name: struct.vars[name].type.dtype for name in shapes}
+    return make_struct(struct, **{name: wp.zeros(shapes[name], dtype=types[name], device=device) for name in shapes})
 
 
 def fits_block(num_floats: int, lanes: int) -> bool:

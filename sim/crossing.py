@@ -3,9 +3,8 @@
 import math
 from dataclasses import dataclass, replace
 
-import warp as wp
-
 from kernels.episode import Task
+from kernels.launch import make_struct
 from kernels.queue import StartRanges
 from sim.robots.robot import RobotCfg
 
@@ -50,30 +49,31 @@ class CrossingCfg:
 
 def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Task:
     """The goal, command and ends of a crossing as a kernel argument; without ``to_goal`` the goal ends none."""
-    task = Task()
-    for name in ("goal", "yaw_gain", "max_yaw_rate", "lower", "upper", "base_force"):
-        setattr(task, name, getattr(cfg, name))
-    task.speed = robot.speed
-    task.goal_radius = cfg.goal_radius if to_goal else 0.0  # no distance is smaller
-    task.max_steps = round(robot.max_duration_s / robot.physics_dt)
-    task.first_counted_step = round(cfg.penalties_from_s / robot.physics_dt) + 1
-    task.max_speed = robot.max_speed
-    task.max_gravity_z = 2.0  # no tilt ends a crossing
-    task.overflow_mask = CAPACITY_OVERFLOWS
-    return task
+    return make_struct(
+        Task,
+        cfg,
+        speed=robot.speed,
+        goal_radius=cfg.goal_radius if to_goal else 0.0,  # no distance is smaller
+        max_steps=round(robot.max_duration_s / robot.physics_dt),
+        first_counted_step=round(cfg.penalties_from_s / robot.physics_dt) + 1,
+        max_speed=robot.max_speed,
+        max_gravity_z=2.0,  # no tilt ends a crossing
+        overflow_mask=CAPACITY_OVERFLOWS,
+    )
 
 
 def make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> StartRanges:
     """The randomised start of a crossing as a kernel argument."""
-    ranges = StartRanges()
-    ranges.position = wp.vec2(*cfg.start)
-    ranges.position_range = cfg.start_position_range
-    ranges.yaw_range = cfg.start_yaw_range
-    ranges.joint_scale_range = cfg.start_joint_range
-    ranges.velocity_range = cfg.start_velocity_range
-    ranges.base_height = robot.default_base_height
-    ranges.footprint = wp.vec2(*robot.footprint)
-    return ranges
+    return make_struct(
+        StartRanges,
+        position=cfg.start,
+        position_range=cfg.start_position_range,
+        yaw_range=cfg.start_yaw_range,
+        joint_scale_range=cfg.start_joint_range,
+        velocity_range=cfg.start_velocity_range,
+        base_height=robot.default_base_height,
+        footprint=robot.footprint,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

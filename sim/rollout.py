@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -161,8 +161,9 @@ class Rollout:
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
             self._build(loaded, solver, device)
-        except (MemoryError, RuntimeError) as error:
-            if not _is_out_of_memory(error):
+        except (MemoryError, RuntimeError) as error:  # those of Warp have no type of their own
+            failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
+            if not failed and not str(error).startswith("Failed to allocate"):
                 raise
             raise ValueError(
                 f"num_envs and num_terrains must fit the memory that {device} has free, got {self.num_envs:,} robots "
@@ -170,86 +171,77 @@ class Rollout:
             ) from error
 
     def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
-        from sim.simulation import Simulation  # Newton takes seconds to load: only what simulates loads it
+        from sim.simulation import Reward, Simulation  # Newton takes seconds to load: only what simulates loads it
 
+        robot = self.robot
+        num_envs = self.num_envs
         bank = TerrainBank(
             self.num_terrains, device=device, with_ground=self._with_ground, with_conditions=self._with_conditions
         )
-        self.sim = Simulation(self.robot, bank, np.zeros(self.num_envs, dtype=int), cfg=solver)
+        self.sim = sim = Simulation(robot, bank, np.zeros(num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes
         self._num_unreleased = 0  # episodes that were put in and no robot may take yet
-        self._max_episode_steps = round(self.robot.max_duration_s / self.robot.control_dt)
+        self._max_episode_steps = round(robot.max_duration_s / robot.control_dt)
         self._step = 0  # control steps made so far
         self._began_at = 0  # the step at which all robots last began together
         self._taken_at = 0  # step and time of the last result
         self._taken_s = time.perf_counter()
         with wp.ScopedDevice(device):
-            self._allocate()
+            self.command = wp.zeros((num_envs, 3), dtype=float)
+            self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
+            self._last_action = wp.zeros_like(self._action)
+            self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
+            self._counter = wp.zeros(1, dtype=int)
+            self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
+            self._queue = make_queue(
+                num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=device
+            )
+            self.episode = self._queue.episode_of_env
+            self._ranges = make_start_ranges(self.cfg, robot)
+            self._robot_step = sim.make_step(self.command, self._last_action)
+            self._task = make_task(self.cfg, robot)
+            self._episode = self._stepped = make_episodes(num_envs)
+            self.outcome = self._episode.outcome
+            self._latches = [(self._task, self._episode)]
+            self._reward = None
+            if self.cfg.reward:
+                # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them
+                # runs, its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
+                self._reward = Reward(sim, robot.training, self._robot_step, falls=(Outcome.BASE_COLLISION,))
+                self._stepped = make_episodes(num_envs)
+                self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
+            self._rewards = Rewards() if self._reward is None else self._reward.state
             self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
-            self._step_graph = self.sim.capture(self._launch_control_step)
-            self._turn_graph = self.sim.capture(self._launch_turn_over)
-
-    def _allocate(self) -> None:
-        num_envs = self.num_envs
-        robot = self.robot
-        sim = self.sim
-        self._ranges = make_start_ranges(self.cfg, robot)
-        self.command = wp.zeros((num_envs, 3), dtype=float)
-        self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
-        self._last_action = wp.zeros_like(self._action)
-        self._observation = wp.zeros((num_envs, robot.observation_size), dtype=float)
-        self._counter = wp.zeros(1, dtype=int)
-        self._robot_step = sim.make_step(self.command, self._last_action)
-        self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
-        self._queue = make_queue(
-            num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=sim.device
-        )
-        self._task = make_task(self.cfg, robot)
-        self._episode = self._stepped = make_episodes(num_envs)
-        self.episode = self._queue.episode_of_env
-        self.outcome = self._episode.outcome
-        self._latches = [(self._task, self._episode)]
-        self._reward = None
-        if self.cfg.reward:
-            from sim.simulation import Reward
-
-            # A second set of episodes runs beside the crossing's, the same but without a goal. While one of them runs,
-            # its robot is stepped and paid. A base collision is a fall; an invalid state costs nothing.
-            self._reward = Reward(sim, robot.training, self._robot_step, falls=(Outcome.BASE_COLLISION,))
-            self._stepped = make_episodes(num_envs)
-            self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
-        self._rewards = Rewards() if self._reward is None else self._reward.state
+            self._step_graph = sim.capture(self._launch_control_step)
+            self._turn_graph = sim.capture(self._launch_turn_over)
 
     def _launch_control_step(self) -> None:
         sim = self.sim
-        robot = self.robot
-        apply_action(self._action, sim.sensors, robot.action_scale, self._last_action, sim.targets)
-        park_ended(
-            self._stepped.outcome, sim.sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked
-        )
-        for _ in range(robot.decimation):
+        sensors = sim.sensors
+        stepped = self._stepped.outcome
+        apply_action(self._action, sensors, self.robot.action_scale, self._last_action, sim.targets)
+        park_ended(stepped, sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked)
+        for _ in range(self.robot.decimation):
             sim.physics_step()
             sim.read_geom_forces()
             for task, episode in self._latches:
                 latch_outcomes(self._robot_step, task, episode)
-            add_penalties(self._robot_step, robot.physics_dt, self._episode.counted, self.penalty_sums)
+            add_penalties(self._robot_step, self.robot.physics_dt, self._episode.counted, self.penalty_sums)
         if self._reward is not None:
-            self._reward.pay(self._stepped.outcome)
+            self._reward.pay(stepped)
 
     def _launch_turn_over(self) -> None:
         sim = self.sim
-        begins = self._queue.begins
-        turn_over(
-            self._stepped.outcome, self._rewards, self._episode, self.penalty_sums, sim.terrain_of_env, self._queue
-        )
-        sim.restart(begins, self._robot_step, self._ranges, self._episode, self._rewards)
+        queue = self._queue
+        episode = self._episode
+        turn_over(self._stepped.outcome, self._rewards, episode, self.penalty_sums, sim.terrain_of_env, queue)
+        sim.restart(queue.begins, self._robot_step, self._ranges, episode, self._rewards)
         if self._reward is not None:
-            begin_episodes(begins, self._stepped)
+            begin_episodes(queue.begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
-        command_goal(sim.joint_q, self._episode.outcome, self._task, self.command)
-        dt = self.robot.physics_dt
-        sim.observe(self._robot_step, self._episode, dt, Noise(), self._counter, self._observation)
+        command_goal(sim.joint_q, episode.outcome, self._task, self.command)
+        sim.observe(self._robot_step, episode, self.robot.physics_dt, Noise(), self._counter, self._observation)
 
     @property
     def num_free(self) -> int:
@@ -294,32 +286,27 @@ class Rollout:
         spaces = [space_key(space.name, space.sha256) for space in (terrains.space, self.space)]
         if terrains.genes is not None and spaces[0] != spaces[1]:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
-        first = 0 if idle else self._next_slot
-        slots = ring_slices(first, count, self.num_terrains)
-        self._write_terrains(terrains, slots)
+        slots = ring_slices(0 if idle else self._next_slot, count, self.num_terrains)
+        written = 0
+        with wp.ScopedDevice(self.sim.device):
+            for run in slots:
+                lot = terrains[written : written + run.stop - run.start]
+                self.sim.bank.set(lot, run)
+                self._queue.seed[run].assign(lot.seeds.astype(np.uint32))
+                self._queue.num_ended[run].zero_()
+                written += len(lot)
         num_episodes = count * self.replicas
         max_steps = self._max_episode_steps * -(-num_episodes // self.num_envs)
         self._lots.append(_Lot(slots=slots, num_episodes=num_episodes, max_steps=max_steps, start_step=self._step))
-        self._next_slot = (first + count) % self.num_terrains
+        self._next_slot = slots[-1].stop % self.num_terrains
         self._num_unreleased += num_episodes
         if idle:
-            self._queue.taken.zero_()
-            self._queue.ready.zero_()
-            self._queue.busy.zero_()
+            for counts in (self._queue.taken, self._queue.ready, self._queue.busy):
+                counts.zero_()
             self._began_at = self._taken_at = self._step
             self._taken_s = time.perf_counter()
         if idle or self._policy.memory is not Memory.SHARED:
             self._release(begin=idle)
-
-    def _write_terrains(self, terrains: Terrains, slots: Sequence[slice]) -> None:
-        first = 0
-        with wp.ScopedDevice(self.sim.device):
-            for run in slots:
-                lot = terrains[first : first + run.stop - run.start]
-                self.sim.bank.set(lot, run)
-                self._queue.seed[run].assign(lot.seeds.astype(np.uint32))
-                self._queue.num_ended[run].zero_()
-                first += len(lot)
 
     def _release(self, *, begin: bool) -> None:
         """Let robots take what was put in, now (``begin``, where all wait) or when their episodes have ended."""
@@ -395,11 +382,10 @@ class Rollout:
         outcome = read(queue.outcome).astype(np.uint8)
         pose = read(queue.final_pose)
         penalties = read(queue.penalty_sums).astype(np.float64)[..., penalty_columns(robot.penalties)]
-        penalties[outcome == Outcome.INVALID] = np.nan
-        reward = None
-        if self._reward is not None:
-            reward = read(queue.reward).astype(np.float64)
-            reward[outcome == Outcome.INVALID] = np.nan
+        reward = None if self._reward is None else read(queue.reward).astype(np.float64)
+        for values in (penalties, reward):
+            if values is not None:
+                values[outcome == Outcome.INVALID] = np.nan
         with np.errstate(invalid="ignore"):
             upright = 1.0 - 2.0 * (pose[..., 3] ** 2 + pose[..., 4] ** 2)
         physics_steps = (self._step - self._taken_at) * robot.decimation
@@ -422,8 +408,3 @@ class Rollout:
             wall_s=wall_s,
             reward=reward,
         )
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Whether an allocation failed: on the host, by torch, or by Warp, whose errors have no type of their own."""
-    return isinstance(error, MemoryError | torch.OutOfMemoryError) or str(error).startswith("Failed to allocate")

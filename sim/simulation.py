@@ -15,7 +15,7 @@ from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
-from kernels.launch import make_zeros
+from kernels.launch import make_struct, make_zeros
 from kernels.observation import Noise, Sensors, write_observation
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.queue import StartRanges, clear_rows, restart_episodes
@@ -166,53 +166,62 @@ class Simulation:
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
         self.parked = wp.zeros(self.num_envs, dtype=int)
         # A mesh of several parts is several shapes of one name.
-        robot, names = self.robot, self.robot.geom_names
+        robot = self.robot
+        names = robot.geom_names
         columns = [names.index(name) if name in names else -1 for name in builder.shape_label]
         self.column_of_shape = wp.array(columns, dtype=int)
         roles = [BASE] * len(robot.base_geoms) + [LIMB] * len(robot.limb_geoms) + [FOOT] * len(robot.foot_geoms)
         self.geom_role = wp.array(roles, dtype=int)
-        model, data = self.solver.mjw_model, self.solver.mjw_data
-        self.dynamics = make_dynamics(model, data, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
+        mjw = (self.solver.mjw_model, self.solver.mjw_data)
+        self.dynamics = make_dynamics(*mjw, self.contacts, self.parked, self.geom_of_shape, int(geoms[0]))
 
     def _build_views(self) -> None:
-        model, data, num_joints = self.model, self.solver.mjw_data, self.robot.num_joints
-        self._state = model.state()
-        self.body_q = self._state.body_q.reshape((self.num_envs, -1))
-        self.joint_q = self._state.joint_q.reshape((self.num_envs, 7 + num_joints))
-        self.joint_qd = self._state.joint_qd.reshape((self.num_envs, 6 + num_joints))
-        self.targets = wp.zeros((self.num_envs, 7 + num_joints), dtype=float)
-        self.geom_force = wp.zeros((self.num_envs, len(self.robot.geom_names)), dtype=wp.vec3)
-        self.joint_torque = data.qfrc_actuator
-        self.overflow = data.overflow
-        self.sensors = Sensors()
-        self.sensors.default_joint_pos = wp.array(self.robot.default_joint_pos, dtype=float)
-        scan_x, scan_y = self.robot.scan_points()
-        self.sensors.scan_x = wp.array(scan_x, dtype=float)
-        self.sensors.scan_y = wp.array(scan_y, dtype=float)
-        self.base_com = self.sensors.base_com = wp.vec3(*model.body_com.numpy()[0])
-        self._coordinates = self._build_coordinates()
-        self._build_drives()
-
-    def _build_drives(self) -> None:
-        """Speed-dependent torque limits and a delay of targets, which ideal drives lack."""
         robot = self.robot
-        delay = Delay()
+        num_envs = self.num_envs
+        self._state = self.model.state()
+        self.body_q = self._state.body_q.reshape((num_envs, -1))
+        self.joint_q = self._state.joint_q.reshape((num_envs, -1))
+        self.joint_qd = self._state.joint_qd.reshape((num_envs, -1))
+        self.targets = wp.zeros(self.joint_q.shape, dtype=float)
+        self.geom_force = wp.zeros((num_envs, len(robot.geom_names)), dtype=wp.vec3)
+        self.joint_torque = self.solver.mjw_data.qfrc_actuator
+        self.overflow = self.solver.mjw_data.overflow
+        self.base_com = wp.vec3(*self.model.body_com.numpy()[0])
+        scan = dict(zip(("scan_x", "scan_y"), robot.scan_points(), strict=True))
+        arrays = {
+            name: wp.array(row, dtype=float)
+            for name, row in {**scan, "default_joint_pos": robot.default_joint_pos}.items()
+        }
+        self.sensors = make_struct(Sensors, self, **arrays)
+        # Columns of joints, bodies and targets in mujoco_warp's data, the same for all robots.
+        solver: Any = self.solver
+        columns = solver.mj_q_start.numpy()[1 : 1 + robot.num_joints]  # the first is the base's
+        moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
+        joints = [int(np.flatnonzero(columns == column)[0]) for column in moved]
+        bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
+        self._coordinates = make_struct(
+            SolverState,
+            solver.mjw_data,
+            column_of_joint=wp.array(columns, dtype=int),
+            target_of_actuator=wp.array(7 + np.array(joints, dtype=int), dtype=int),
+            column_of_body=wp.array(bodies[-self.body_q.shape[1] :], dtype=int),
+            base_com=self.base_com,
+        )
+        # Speed-dependent torque limits and a delay of targets, which ideal drives lack.
         self.motors = None
         if robot.saturation_effort is not None:
-            effort = self.solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
-            joints = self._coordinates.target_of_actuator.numpy() - 7
+            effort = solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
             motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
         max_steps = robot.drive_delay_steps
         if self.bank.conditions is not None:
             max_steps += math.ceil(MAX_LATENCY_S / robot.physics_dt)
+        self._delay = Delay()
         if max_steps:
-            actuators = len(self._coordinates.target_of_actuator)
-            delay.steps = wp.full(self.num_envs, robot.drive_delay_steps, dtype=int)
-            delay.age = wp.zeros((self.num_envs, actuators), dtype=int)
-            delay.former = wp.zeros((self.num_envs, 1 + max_steps, actuators), dtype=float)
-            delay.at_first = self.sensors.default_joint_pos
-        self._delay = delay
+            shapes = {"age": (num_envs, len(joints)), "former": (num_envs, 1 + max_steps, len(joints))}
+            self._delay = make_zeros(Delay, self.device, steps=num_envs, **shapes)
+            self._delay.steps.fill_(robot.drive_delay_steps)
+            self._delay.at_first = self.sensors.default_joint_pos
 
     def _build_conditions(self) -> None:
         self.disturbed = None
@@ -224,42 +233,22 @@ class Simulation:
                 "(sim/solver.py says why): leave conditions out"
             )
         assert self.bank.ground is not None
-        self._varied = self.dynamics.vary_bases()
-        self._varied.delay_steps, self._varied.friction = self._delay.steps, self.bank.ground.factor
-        self._varied.drive_delay, self._varied.physics_dt = self.robot.drive_delay_steps, self.robot.physics_dt
-        max_lag, size = math.ceil(MAX_LATENCY_S / self.robot.control_dt), self.robot.observation_size
-        disturbed = make_zeros(
-            Disturbed, str(self.device), row=(self.num_envs, self.bank.conditions.shape[1]),
-            age=(self.num_envs, size), former=(self.num_envs, 1 + max_lag, size),
-        )  # fmt: skip
-        for name, width in asdict(NoiseCfg()).items():
-            setattr(disturbed.noise, name, width)
-        self.disturbed = disturbed
-
-    def _build_coordinates(self) -> SolverState:
-        """Columns of joints, bodies and targets in mujoco_warp's data, the same for all robots."""
-        solver: Any = self.solver
-        data = solver.mjw_data
-        columns = solver.mj_q_start.numpy()[1 : 1 + self.robot.num_joints]  # the first is the base's
-        moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
-        followed = [7 + int(np.flatnonzero(columns == column)[0]) for column in moved]
-        coordinates = SolverState()
-        for name in ("qpos", "qvel", "ctrl", "xpos", "xquat"):
-            setattr(coordinates, name, getattr(data, name))
-        coordinates.column_of_joint = wp.array(columns, dtype=int)
-        coordinates.target_of_actuator = wp.array(followed, dtype=int)
-        bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
-        coordinates.column_of_body = wp.array(bodies[-self.body_q.shape[1] :], dtype=int)
-        coordinates.base_com = self.base_com
-        return coordinates
+        robot = self.robot
+        self._varied = self.dynamics.vary_bases(
+            delay_steps=self._delay.steps,
+            friction=self.bank.ground.factor,
+            drive_delay=robot.drive_delay_steps,
+            physics_dt=robot.physics_dt,
+        )
+        observed = (self.num_envs, robot.observation_size)
+        rows = (self.num_envs, self.bank.conditions.shape[1])
+        former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
+        self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former)
+        self.disturbed.noise = make_struct(Noise, NoiseCfg())
 
     def make_step(self, command: Any, action: Any) -> RobotStep:
         """A view of the robots at the end of a step that obeys the command (num_envs, 3) by the clipped action."""
-        step = RobotStep()
-        step.command, step.action, step.force_limit = command, action, self.robot.contact_force_limit
-        for name in ("joint_q", "joint_qd", "base_com", "geom_force", "geom_role", "overflow"):
-            setattr(step, name, getattr(self, name))
-        return step
+        return make_struct(RobotStep, self, command=command, action=action, force_limit=self.robot.contact_force_limit)
 
     def restart(self, mask: Any, step: RobotStep, ranges: StartRanges, episodes: Episodes, rewards: Rewards) -> None:
         """Begin episodes anew where the int ``mask`` (num_envs,) is not 0, under the conditions of their terrains.
@@ -292,11 +281,9 @@ class Simulation:
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
         """Push robots and disturb observations as the conditions of their terrains say (:meth:`observe`)."""
         if self.disturbed is not None:
-            step = DisturbedStep()
-            step.memory, step.episodes, step.num_joints = self.disturbed, episodes, self.robot.num_joints
-            step.dt, step.every = dt, round(self.robot.control_dt / dt)
-            step.joint_qd, step.observation = self.joint_qd, observation
-            make_disturb(disturb_effects())(step)
+            values = {"dt": dt, "every": round(self.robot.control_dt / dt), "num_joints": self.robot.num_joints}
+            values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
+            make_disturb(disturb_effects())(make_struct(DisturbedStep, self, **values))
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""
@@ -387,15 +374,17 @@ class Reward:
         middle = 0.5 * (lower + upper)
         half = 0.5 * cfg.soft_joint_limit * (upper - lower)
         steady = [int(name in cfg.steady_joints) for name in robot.joint_names]
-        self.motion = motion = Motion()
-        motion.step = step
-        motion.joint_torque = sim.joint_torque
-        motion.default_joint_pos = sim.sensors.default_joint_pos
-        motion.dt = robot.control_dt
-        motion.min_air_time_s = cfg.min_air_time_s
-        motion.joint_lower = wp.array(middle - half, dtype=float, device=sim.device)
-        motion.joint_upper = wp.array(middle + half, dtype=float, device=sim.device)
-        motion.joint_is_steady = wp.array(steady, dtype=int, device=sim.device)
+        self.motion = make_struct(
+            Motion,
+            cfg,
+            step=step,
+            joint_torque=sim.joint_torque,
+            default_joint_pos=sim.sensors.default_joint_pos,
+            dt=robot.control_dt,
+            joint_lower=wp.array(middle - half, dtype=float, device=sim.device),
+            joint_upper=wp.array(middle + half, dtype=float, device=sim.device),
+            joint_is_steady=wp.array(steady, dtype=int, device=sim.device),
+        )
         self._weights = make_weights(asdict(cfg.rewards), only_positive=cfg.only_positive, falls=falls)
         self.state = make_rewards(sim.num_envs, robot.num_joints, len(robot.geom_names), sim.device)
 

@@ -3,7 +3,7 @@
 tests/sim/test_solver.py compares the two.
 """
 
-from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco_warp
@@ -17,7 +17,7 @@ from kernels.conditions import BASE, VariedRobots
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, contacts_to_solver, forces_from_solver
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
-from kernels.launch import fits_block
+from kernels.launch import fits_block, make_struct
 from kernels.solver import Problem, Sizes, step_robots
 
 _JOINT_CODES = {name.lower(): types.JointType[name].value for name in ("FREE", "SLIDE", "HINGE")}
@@ -63,15 +63,16 @@ def mix_surfaces(m: Any, geoms: NDArray[Any], ground: int) -> Surfaces:
     friction = prefer(friction, friction_0, np.maximum(friction, friction_0))
     timed = (solref[..., :1] > 0.0) & (solref_0[..., :1] > 0.0)
     solref = np.where(timed, share * solref + (1.0 - share) * solref_0, np.minimum(solref, solref_0))
-    surfaces = Surfaces()
     with wp.ScopedDevice(m.geom_condim.device):
-        surfaces.geom = wp.array(geoms, dtype=int)
-        surfaces.body = wp.array(m.geom_bodyid.numpy()[geoms], dtype=int)
-        surfaces.condim = wp.array(condim[:, 0], dtype=int)
-        surfaces.friction = wp.array(np.maximum(friction[..., [0, 0, 1, 2, 2]], types.MJ_MINMU), dtype=types.vec5)
-        surfaces.solref = wp.array(solref, dtype=wp.vec2)
-        surfaces.solimp = wp.array(share * solimp + (1.0 - share) * solimp_0, dtype=types.vec5)
-    return surfaces
+        return make_struct(
+            Surfaces,
+            geom=wp.array(geoms, dtype=int),
+            body=wp.array(m.geom_bodyid.numpy()[geoms], dtype=int),
+            condim=wp.array(condim[:, 0], dtype=int),
+            friction=wp.array(np.maximum(friction[..., [0, 0, 1, 2, 2]], types.MJ_MINMU), dtype=types.vec5),
+            solref=wp.array(solref, dtype=wp.vec2),
+            solimp=wp.array(share * solimp + (1.0 - share) * solimp_0, dtype=types.vec5),
+        )
 
 
 def _share_row(array: Any) -> Any:
@@ -82,13 +83,15 @@ def _share_row(array: Any) -> Any:
     return array[:1] if (values == values[:1]).all() else array
 
 
-def _read_model(struct: Any, names: Iterable[str], m: Any) -> None:
-    """Set the struct's fields that mujoco_warp's model has under the same names."""
-    for name in names:
-        if hasattr(m, name):
-            array = getattr(m, name)
-            shared = _share_row(array) if array.ndim > 1 and name not in _NOT_SHARED else array
-            setattr(struct, name, _as_floats(shared) if name in ("actuator_gainprm", "actuator_biasprm") else shared)
+def _read_model(m: Any) -> SimpleNamespace:
+    """Arrays of mujoco_warp's model as our kernels take them: one row where all worlds are equal, numbers alone."""
+    arrays = {name: getattr(m, name) for name in (*Tree.vars, *Problem.vars) if hasattr(m, name)}
+    for name, array in arrays.items():
+        if array.ndim > 1 and name not in _NOT_SHARED:
+            arrays[name] = array = _share_row(array)
+        if name in ("actuator_gainprm", "actuator_biasprm"):  # the same memory, which the model keeps
+            arrays[name] = wp.array(ptr=array.ptr, dtype=float, shape=(*array.shape, 10), device=array.device)
+    return SimpleNamespace(**arrays)
 
 
 def _tree_sizes(m: Any) -> TreeSizes:
@@ -144,11 +147,6 @@ def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
     return order, np.searchsorted(depth[order], np.arange(1, depth.max() + 2)).astype(np.int32)
 
 
-def _as_floats(array: Any) -> Any:
-    """The same memory as numbers, shape (..., 10); the caller keeps the array."""
-    return wp.array(ptr=array.ptr, dtype=float, shape=(*array.shape, 10), device=array.device)
-
-
 class Dynamics:
     """The dynamics of a physics step in two kernels, one before and one after contacts are found.
 
@@ -168,46 +166,38 @@ class Dynamics:
         self.surfaces = surfaces
         self._tree_sizes = _tree_sizes(m)
         self._sizes = _solver_sizes(m, contacts)
-        self.tree = tree = Tree()
-        self._problem = problem = Problem()
-        self._robots = robots = Robots()
         self._num_worlds = d.nworld
-        _read_model(tree, Tree.vars, m)
-        _read_model(problem, Problem.vars, m)
-        for name in ("iterations", "ls_iterations", "tolerance", "ls_tolerance", "impratio_invsqrt", "timestep"):
-            setattr(problem, name, getattr(m.opt, name))
-        for name in ("qacc_warmstart", "solver_niter", "overflow"):
-            setattr(problem, name, getattr(d, name))
-        for name in (name for name in Robots.vars if hasattr(d, name)):
-            setattr(robots, name, getattr(d, name))
-        problem.contacts = contacts
-        problem.surfaces = surfaces
-        robots.parked = parked
-        tree.gravity = m.opt.gravity
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
         actuator[m.jnt_dofadr.numpy()[m.actuator_trnid.numpy()[:, 0]]] = np.arange(m.nactuator)
+        model = _read_model(m)
         with wp.ScopedDevice(d.qpos.device):
-            tree.level_start = wp.array(levels, dtype=int)
-            tree.body_order = wp.array(order, dtype=int)
-            tree.dof_actuator = wp.array(actuator, dtype=int)
-            tree.roots = wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int)
-            robots.slope = wp.zeros((d.nworld, m.nv), dtype=float)
-            problem.spilled_contacts = wp.zeros((d.nworld, max(1, self._sizes.global_floats)), dtype=float)
+            self.tree = make_struct(
+                Tree,
+                model,
+                m.opt,
+                level_start=wp.array(levels, dtype=int),
+                body_order=wp.array(order, dtype=int),
+                dof_actuator=wp.array(actuator, dtype=int),
+                roots=wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int),
+            )
+            spilled = wp.zeros((d.nworld, max(1, self._sizes.global_floats)), dtype=float)
+            slope = wp.zeros((d.nworld, m.nv), dtype=float)
+        self._problem = make_struct(
+            Problem, model, m.opt, d, contacts=contacts, surfaces=surfaces, spilled_contacts=spilled
+        )
+        self._robots = make_struct(Robots, d, parked=parked, slope=slope)
 
-    def vary_bases(self) -> VariedRobots:
-        """Give each world its own base and motors, for :func:`kernels.conditions.begin_conditions`."""
-        tree, robots, varied = self.tree, self._robots, VariedRobots()
-        with wp.ScopedDevice(robots.qpos.device):
+    def vary_bases(self, **values: Any) -> VariedRobots:
+        """Give each world its own base and motors; ``values`` are further ones of :class:`VariedRobots`."""
+        with wp.ScopedDevice(self._robots.qpos.device):
+            self._robots.strength = wp.ones(self._num_worlds, dtype=float)
             for name, base_name in _BASE_ARRAYS.items():
-                array = getattr(tree, name)
-                values = array.numpy()
-                rows = np.broadcast_to(values, (self._num_worlds, *values.shape[1:]))
-                setattr(tree, name, wp.array(rows, dtype=array.dtype))
-                setattr(varied, name, getattr(tree, name))
-                setattr(varied, base_name, wp.array(rows[:, BASE], dtype=array.dtype))
-            robots.strength = varied.strength = wp.ones(self._num_worlds, dtype=float)
-        return varied
+                array = getattr(self.tree, name)
+                rows = np.broadcast_to(array.numpy(), (self._num_worlds, *array.numpy().shape[1:]))
+                setattr(self.tree, name, wp.array(rows, dtype=array.dtype))
+                values[base_name] = wp.array(rows[:, BASE], dtype=array.dtype)
+        return make_struct(VariedRobots, self.tree, self._robots, **values)
 
     def find(self) -> None:
         """Compute poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""
@@ -236,13 +226,17 @@ class StockDynamics:
         self._model = m
         self._data = d
         self._contacts = contacts
-        self._solver_contacts = stock = SolverContacts()
-        stock.count, stock.efc_force, stock.overflow = d.nacon, d.efc.force, d.overflow
-        stock.too_many, stock.ground = types.OverflowType.NARROWPHASE.value, ground
-        for name in ("worldid", "geom", "dist", "pos", "frame", "dim", "friction", "solref", "solimp", "efc_address"):
-            setattr(stock, name, getattr(d.contact, name))
         d.contact.type.fill_(int(types.ContactType.CONSTRAINT))
-        stock.slot = wp.zeros(contacts.shape.shape, dtype=int, device=d.qpos.device)
+        self._solver_contacts = make_struct(
+            SolverContacts,
+            d.contact,
+            count=d.nacon,
+            efc_force=d.efc.force,
+            overflow=d.overflow,
+            too_many=types.OverflowType.NARROWPHASE.value,
+            ground=ground,
+            slot=wp.zeros(contacts.shape.shape, dtype=int, device=d.qpos.device),
+        )
 
     def find(self) -> None:
         """Compute poses alone."""

@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import Invalidity, Outcome, make_episodes
+from kernels.launch import make_struct
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES, penalty_columns
 from kernels.queue import restart_episodes
@@ -58,19 +59,18 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     """
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
-    base_com = wp.vec3(*_base_com(robot))
+    base_com = _base_com(robot)
     with wp.ScopedDevice(device):
-        sensors = Sensors()
-        sensors.base_com = base_com
-        sensors.default_joint_pos = wp.array(robot.default_joint_pos, dtype=float)
+        default = wp.array(robot.default_joint_pos, dtype=float)
+        sensors = make_struct(Sensors, base_com=base_com, default_joint_pos=default)
         joint_q, joint_qd, action = (wp.zeros((count, width + robot.num_joints), dtype=float) for width in (7, 6, 0))
-        everyone, terrain_of_env = wp.ones(count, dtype=int), wp.zeros(count, dtype=int)
         episodes = make_episodes(count)
         signed = int(np.uint32(seed).astype(np.int32))  # as a kernel takes it
         episodes.rng.assign(np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32))
-        start = (terrain_of_env, bank.terrain, make_start_ranges(CrossingCfg(), robot), sensors)
-        restart_episodes(everyone, *start, joint_q, joint_qd, action, episodes, Rewards())
-    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.array(base_com))
+        where = (wp.ones(count, dtype=int), wp.zeros(count, dtype=int), bank.terrain)  # all robots, on the one terrain
+        how = (make_start_ranges(CrossingCfg(), robot), sensors)
+        restart_episodes(*where, *how, joint_q, joint_qd, action, episodes, Rewards())
+    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.float32(base_com))
 
 
 class EpisodeStates:
