@@ -29,7 +29,7 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.templates import open_templates
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
-from sim.robots.stand import Standing, describe_model, describe_standing, stand, standing_mistakes
+from sim.robots.stand import Standing, describe_model, stand
 from sim.robots.user import describe_inferred
 from sim.rollout import RolloutResult
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
@@ -60,12 +60,13 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
     if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
         check_policy(policy, robot, compute.device)
     print("\n\n".join(filter(None, (describe_inferred(robot), describe_model(robot)))), flush=True)
-    robot, standing = _with_room(robot, compute.device, 3.0)
-    print(describe_standing(robot, standing), flush=True)
+    standing = _stand_with_room(robot, compute.device, 3.0)
+    robot = standing.robot
+    print(standing.describe(), flush=True)
     if not has_controller:
         expected = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
         print(f"Without a controller, expected at {expected} or named by --policy, this is all.")
-        return not [*standing_mistakes(robot, standing)]
+        return not standing.mistakes
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
         if not _report_walk(robot, walk(crosser, policy)):
             return False
@@ -77,7 +78,7 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
     stairs, kerb = (_half_label(dose, name) for name in ("stairs_up", "step_up"))
     print(f"Half get over a kerb {kerb}, stairs {stairs}", end="; ")
     print(f"{share:.0%} cross hard-random terrains at --height {height:g}.")
-    return not [*standing_mistakes(robot, standing)]
+    return not standing.mistakes
 
 
 def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
@@ -94,23 +95,23 @@ def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> Robot
         policy = policy or str(robot.policy_file)
         check_policy(policy, robot, compute.device)
         print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
-        robot, _ = _with_room(robot, compute.device, 1.0)
+        robot = _stand_with_room(robot, compute.device, 1.0).robot
         terrains = 1_000 if compute.device.startswith("cuda") else 100
         calibrate(robot, policy, compute=compute, terrains=terrains, replicas=4)
     return robot
 
 
-def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, Standing]:
-    """The robot with room for the contacts of the dropped ones, written into its settings where these are data."""
-    larger = robot
-    while (standing := stand(larger, device=device, seconds=seconds)).overflowed:
-        if larger.nconmax >= _MAX_CONTACTS:
+def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
+    """Stands the robot with room for the dropped ones' contacts, which is written into settings that are data."""
+    tried = robot
+    while (standing := stand(tried, device=device, seconds=seconds)).overflowed:
+        if tried.nconmax >= _MAX_CONTACTS:
             raise ValueError(
-                f"robot '{robot.name}' has more than {larger.nconmax} contacts: let fewer geoms touch anything"
+                f"robot '{robot.name}' has more than {tried.nconmax} contacts: let fewer geoms touch anything"
             )
-        larger = replace(larger, nconmax=2 * larger.nconmax)
-    if larger is robot:
-        return robot, standing
+        tried = replace(tried, nconmax=2 * tried.nconmax)
+    if tried is robot:
+        return standing
     larger = replace(robot, nconmax=max(robot.nconmax, int(np.ceil(1.5 * standing.contacts))))
     file = robot.settings_file
     if file is None or file.suffix != ".toml":
@@ -119,7 +120,7 @@ def _with_room(robot: RobotCfg, device: str, seconds: float) -> tuple[RobotCfg, 
         text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
         write_atomically(file, f"nconmax = {larger.nconmax}\n{text}".encode())
         print(f"It had too little room for contacts: {file} now has nconmax = {larger.nconmax}.", flush=True)
-    return larger, standing
+    return replace(standing, robot=larger)
 
 
 def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
@@ -147,10 +148,8 @@ def _report_walk(robot: RobotCfg, walks: dict[str, dict[str, float]]) -> bool:
     slow, fast = sorted(walk["speed"] for walk in walks.values())
     reaches_goal = min(walk["goal"] for walk in walks.values()) >= FAILING_GOAL_RATE
     agree = fast - slow <= _APART * fast
-    text = _TEMPLATES.get_template("walking.txt").render(
-        robot=robot, walks=walks, reaches_goal=reaches_goal, agree=agree, tolerance=_APART
-    )
-    print(text.rstrip(), flush=True)
+    content = {"robot": robot, "walks": walks, "reaches_goal": reaches_goal, "agree": agree, "tolerance": _APART}
+    print(_TEMPLATES.get_template("walking.txt").render(content).rstrip(), flush=True)
     return reaches_goal and agree
 
 

@@ -17,7 +17,6 @@ from sim.files.command import with_traceback
 from sim.robots.drives import Drives, drive_problems, read_drives, set_drives
 from sim.robots.elements import joint_names, mj, touching_geoms
 from sim.robots.model_files import ModelFiles, read_model_files
-from sim.robots.refused import refused_elements, structure_problems
 from sim.robots.robot import RobotCfg
 from sim.robots.urdf import read_urdf
 
@@ -32,6 +31,17 @@ PER_JOINT = (
 )
 """Settings with a value for each joint."""
 _SLACK = 1e-3  # files round [rad]
+_LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
+_CONSTRAINT_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "refsafe")
+_FORCE_FLAGS = ("spring", "damper", "gravity", "clampctrl", "actuation")
+_ZERO_OPTIONS = ("density", "viscosity", "wind", "disableactuator")
+_ZERO_ATTRIBUTES = {
+    "body": ("gravcomp", "mocap"),
+    "joint": ("ref",),
+    "geom": ("margin", "gap", "adhesion", "surfacevel"),
+    "actuator": ("armature", "damping", "delay"),
+}
+"""Attributes of elements that must be 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +64,7 @@ def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     what it shows.
     """
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
-    if problems := [*file_problems(robot, robot_file)]:
+    if problems := file_problems(robot, robot_file):
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
     set_drives(robot_file.spec, robot_file.drives, robot)
     for geom in touching_geoms(*robot_file.spec.bodies):
@@ -112,43 +122,112 @@ def _strip(spec: Any) -> None:
     """Takes out what simulations leave out of a file; whatever names a body would keep it from being fused."""
     for element in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.tuples):
         spec.delete(element)
-    kept = {name: getattr(spec.option, name) for name in ("gravity", "impratio")}
-    kept["gravity"] = kept["gravity"].copy()
-    spec.option = mj.MjSpec().option
-    for name, value in kept.items():
-        setattr(spec.option, name, value)
+    usual = mj.MjSpec()
+    for name in ("gravity", "impratio"):
+        setattr(usual.option, name, getattr(spec.option, name))
+    spec.option = usual.option
 
 
-def file_problems(robot: RobotCfg, file: RobotFile) -> Iterator[str]:
+def refused_elements(spec: Any) -> Iterator[str]:
+    """Elements and attributes of a specification, with their line in the file."""
+    option = spec.option
+    for flag in (*_CONSTRAINT_FLAGS, *_FORCE_FLAGS):
+        if option.disableflags & getattr(mj.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+            yield f'<flag {flag}="disable"> in <option>'
+    if option.enableflags & mj.mjtEnableBit.mjENBL_OVERRIDE:
+        yield '<flag override="enable">'
+    yield from (f"<option {name}>" for name in _ZERO_OPTIONS if np.any(getattr(option, name)))
+    if option.gravity[0] or option.gravity[1] or not option.gravity[2] < 0.0:
+        yield f"<option gravity> that does not point down, {option.gravity}"
+    yield from _refused_equalities(spec)
+    bodies, joints, geoms = spec.bodies, spec.joints, touching_geoms(*spec.bodies)
+    elements = {"body": bodies, "joint": joints, "geom": geoms, "actuator": spec.actuators}
+    for kind, names in _ZERO_ATTRIBUTES.items():
+        for element in elements[kind]:
+            for name in names:
+                if np.any(getattr(element, name)):
+                    yield f"<{kind} {name}> of {element.name} ({element.info})"
+    for joint in joints:
+        is_free = joint.type == mj.mjtJoint.mjJNT_FREE
+        if joint.type == mj.mjtJoint.mjJNT_BALL:
+            yield f"a ball joint ({joint.info})"
+        if not (is_free or joint.name):
+            yield f"a joint without a name ({joint.info})"
+        if np.any(joint.damping[1:]):
+            yield f"<joint damping> of {joint.name} ({joint.info})"
+        if np.any(joint.stiffness[0 if is_free else 1 :]):
+            yield f"<joint stiffness> of {joint.name} ({joint.info})"
+    for geom in geoms:
+        if geom.type in (mj.mjtGeom.mjGEOM_HFIELD, mj.mjtGeom.mjGEOM_SDF):
+            yield f"a height field or distance field as geom {geom.name} ({geom.info})"
+    if spec.compiler.inertiafromgeom == mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        for body in bodies:
+            if body.explicitinertial and not (body.joints or body.geoms):
+                yield f'<inertial> of {body.name} ({body.info}) beside inertiafromgeom="true"'
+    yield from (f"a tendon ({tendon.info})" for tendon in spec.tendons)
+    yield from (f"a flexible body ({flex.info})" for flex in spec.flexes)
+
+
+def _refused_equalities(spec: Any) -> Iterator[str]:
+    """Equalities but those by which a joint follows one leader linearly, with MuJoCo's usual stiffness."""
+    followers = [equality.name1 for equality in spec.equalities]
+    usual = mj.MjSpec().add_equality()
+    for equality in spec.equalities:
+        is_linear = equality.type == mj.mjtEq.mjEQ_JOINT and not np.any(equality.data[2:5])
+        has_leader = equality.name2 and equality.name2 not in followers and followers.count(equality.name1) == 1
+        is_usual = all(np.array_equal(getattr(equality, name), getattr(usual, name)) for name in ("solref", "solimp"))
+        if not (is_linear and has_leader and is_usual and equality.active):
+            kind = mj.mjtEq(equality.type).name.removeprefix("mjEQ_").lower()
+            yield f"<equality> {kind} of {equality.name1} ({equality.info})"
+
+
+def structure_problems(model: Any) -> Iterator[str]:
+    """Complaints about a compiled model that is no robot of single joints on a free base."""
+    if not model.njnt or model.jnt_type[0] != mj.mjtJoint.mjJNT_FREE or model.jnt_bodyid[0] != 1:
+        yield "the first body must move freely: give it a <freejoint/>"
+        return
+    if not model.geom_contype[model.geom_bodyid > 0].any():
+        yield "no geom touches anything: give some contype 1, in a URDF a <collision>"
+    for k in range(1, model.njnt):
+        if model.jnt_type[k] == mj.mjtJoint.mjJNT_FREE or model.body_jntnum[model.jnt_bodyid[k]] != 1:
+            yield f"joint {model.joint(k).name} must be a hinge or slide, the only joint of its body"
+    for k in np.flatnonzero((model.geom_bodyid == 0) & (model.geom_contype != 0)):
+        yield f"geom {model.geom(k).name} belongs to the world, not to the robot: take it out"
+    poses = np.hstack([model.body_pos, model.body_quat, model.body_ipos])
+    for k in range(1, model.nbody):
+        if not np.isfinite(poses[k]).all():
+            yield f"position and rotation of body {model.body(k).name} must be numbers"
+        if model.body_inertia[k].min() < _LEAST_GYRATION**2 * model.body_mass[k]:
+            yield f"inertia of body {model.body(k).name} is that of a point: give it that of a body [kg m^2]"
+
+
+def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     """Complaints about settings that do not fit the robot's file."""
-    yield from _joint_problems(robot, file)
-    names = [geom.name for geom in touching_geoms(*file.spec.bodies)]
-    yield from _missing("geom that touches the ground is", robot.geom_names, names, robot)
+    geoms = [geom.name for geom in touching_geoms(*file.spec.bodies)]
+    missing = _missing("geom that touches the ground is", robot.geom_names, geoms, robot)
+    return [*_joint_problems(robot, file), *missing]
 
 
-def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: RobotCfg) -> Iterator[str]:
-    if missing := ", ".join(name for name in names if name not in present):
-        yield f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"
+def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: RobotCfg) -> list[str]:
+    missing = ", ".join(name for name in names if name not in present)
+    return [f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"] if missing else []
 
 
-def _joint_problems(robot: RobotCfg, file: RobotFile) -> Iterator[str]:
+def _joint_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     """Complaints about the joints' names, and about settings with a value for each joint."""
     model, drives, names = file.model, file.drives, robot.joint_names
     if names != joint_names(model):
-        missing = [*_missing("joint is", names, joint_names(model), robot)]
-        yield from missing or [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
-        return
-    fine = True
+        missing = _missing("joint is", names, joint_names(model), robot)
+        return missing or [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]
+    problems = []
     for field in PER_JOINT:
         values = getattr(robot, field)
         if values is not None and len(values) != len(names):
-            yield f"{field} needs {len(names)} values, one a joint, got {len(values)}"
-            fine = False
+            problems.append(f"{field} needs {len(names)} values, one a joint, got {len(values)}")
     for field in ("armature", "damping", "frictionloss"):
         values = getattr(model, f"dof_{field}")[6:]
         if negative := [f"{names[k]} ({values[k]:g})" for k in np.flatnonzero(~(values >= 0.0))]:
-            yield f"{field} must be a number, 0 or more, got {', '.join(negative)}"
-            fine = False
+            problems.append(f"{field} must be a number, 0 or more, got {', '.join(negative)}")
     pose = robot.default_joint_pos
     if len(pose) == len(names):
         low, high = np.where(model.jnt_limited[1:, None] == 1, model.jnt_range[1:], (-np.inf, np.inf)).T
@@ -156,14 +235,13 @@ def _joint_problems(robot: RobotCfg, file: RobotFile) -> Iterator[str]:
         if len(beyond):
             listed = ", ".join(f"{names[k]} ({low[k]:g} to {high[k]:g}, got {pose[k]:g})" for k in beyond)
             degrees = ": angles are in radians" if np.abs(pose).max() > 2.0 * np.pi else ""
-            yield f"default_joint_pos is outside of the file's range for {listed}{degrees}"
-            fine = False
-    limitless = [name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort)]
+            problems.append(f"default_joint_pos is outside of the file's range for {listed}{degrees}")
+    limitless = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
-        yield f"no torque limit above 0 for {', '.join(limitless)}: give it in the file or by effort_limit"
-        fine = False
-    if fine:
-        gains = drives.stiffness if robot.stiffness is None else np.array(robot.stiffness)
-        limp = [name for k, name in enumerate(names) if not gains[k] > 0.0 and k not in drives.followers]
-        if limp:
-            yield f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"
+        problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
+    gains = drives.stiffness if robot.stiffness is None else robot.stiffness
+    limp = [k for k in range(len(names)) if not problems and not gains[k] > 0.0 and k not in drives.followers]
+    if limp:
+        listed = ", ".join(names[k] for k in limp)
+        problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
+    return problems

@@ -116,20 +116,19 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
     """Gives each joint a position actuator, in the joints' order, by the settings' gains if they have some."""
     for actuator in spec.actuators:
         spec.delete(actuator)
+    stiffness = drives.stiffness if robot.stiffness is None else robot.stiffness
+    damping = drives.damping if robot.damping is None else robot.damping
+    effort = np.minimum(drives.effort, np.inf if robot.effort_limit is None else robot.effort_limit)
     for k, name in enumerate(robot.joint_names):
         if robot.armature is not None:
             spec.joint(name).armature = robot.armature[k]
         if k in drives.followers:
             continue
-        effort = min(drives.effort[k], np.inf if robot.effort_limit is None else robot.effort_limit[k])
-        is_limited = np.isfinite(effort)
-        stiffness = drives.stiffness[k] if robot.stiffness is None else robot.stiffness[k]
-        damping = drives.damping[k] if robot.damping is None else robot.damping[k]
         actuator = spec.add_actuator(name=name, target=name, trntype=_JOINT)
-        actuator.set_to_position(kp=stiffness, kv=damping)
+        actuator.set_to_position(kp=stiffness[k], kv=damping[k])
         actuator.gear = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
         actuator.dyntype = mj.mjtDyn.mjDYN_NONE
-        actuator.forcelimited = is_limited
-        actuator.forcerange = (-effort, effort) if is_limited else (0.0, 0.0)
+        actuator.forcelimited = np.isfinite(effort[k])
+        actuator.forcerange = (-effort[k], effort[k]) if np.isfinite(effort[k]) else (0.0, 0.0)
         actuator.ctrllimited = not np.isnan(drives.targets[k, 0])
         actuator.ctrlrange = np.nan_to_num(drives.targets[k])

@@ -31,35 +31,41 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
 
     With ``visuals`` a URDF keeps the visuals of its links that are primitives or existing meshes of a known format.
     """
-    root = _parse(model_file, visuals=visuals)
+    try:
+        root = ET.parse(model_file).getroot()
+    except FileNotFoundError:
+        raise ValueError(f"model file expected at {model_file}, no such file") from None
+    except (ET.ParseError, OSError, ValueError) as error:
+        raise ValueError(f"{model_file} cannot be read as XML: {error}") from None
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
-    _refuse_xacro(root, model_file)
-    files = [model_file]
-    if root.tag == "robot":
-        if problems := [f"{model_file}: {problem}" for problem in _urdf_problems(root)]:
-            raise ValueError("; ".join(problems))
-        for mesh in root.iter("mesh"):
-            if mesh.get("filename"):
-                files.append(_mesh_path(mesh, model_file))
-                mesh.set("filename", str(files[-1]))
-    else:
-        files = _mjcf_files(model_file)
-    missing = sorted({str(file) for file in files if not file.is_file()})
-    if missing:
+    visual_elements = [(parent, visual) for parent in root.iter() for visual in parent.findall("visual")]
+    for parent, visual in visual_elements if root.tag == "robot" else ():
+        if not (visuals and _can_be_shown(visual, model_file)):  # meshes are often in formats that need more packages
+            parent.remove(visual)
+    for element in root.iter():
+        marks = [value for value in element.attrib.values() if "${" in value or "$(" in value]
+        if marks := marks + [element.tag] * ("xacro" in element.tag):
+            remedy = f"make one of it, `xacro {model_file.name} > {model_file.stem}.expanded.urdf`"
+            raise ValueError(f"{model_file} is a xacro file ({marks[0]}), expected a URDF: {remedy}")
+    files = _mjcf_files(model_file) if root.tag == "mujoco" else _urdf_files(root, model_file)
+    if missing := sorted({str(file) for file in files if not file.is_file()}):
         raise ValueError(f"{model_file} names files that are not there: {', '.join(missing)}")
-    foreign = sorted({str(file) for file in files if file.suffix.lower() not in _SUFFIXES and file != model_file})
-    if foreign:
+    if foreign := sorted({str(file) for file in files[1:] if file.suffix.lower() not in _SUFFIXES}):
         raise ValueError(f"{model_file}: meshes must be STL or OBJ files, got {', '.join(foreign)}: convert them")
     return ModelFiles(root=root, files=tuple(dict.fromkeys(Path(os.path.abspath(file)) for file in files)))
 
 
-def _refuse_xacro(root: ET.Element, file: Path) -> None:
-    for element in root.iter():
-        marks = [value for value in element.attrib.values() if "${" in value or "$(" in value]
-        if marks := marks + [element.tag] * ("xacro" in element.tag):
-            remedy = f"make one of it, `xacro {file.name} > {file.stem}.expanded.urdf`"
-            raise ValueError(f"{file} is a xacro file ({marks[0]}), expected a URDF: {remedy}")
+def _urdf_files(root: ET.Element, model_file: Path) -> list[Path]:
+    """A URDF and its meshes, whose names become absolute."""
+    if problems := [f"{model_file}: {problem}" for problem in _urdf_problems(root)]:
+        raise ValueError("; ".join(problems))
+    files = [model_file]
+    for mesh in root.iter("mesh"):
+        if mesh.get("filename"):
+            files.append(_mesh_path(mesh, model_file))
+            mesh.set("filename", str(files[-1]))
+    return files
 
 
 def _urdf_problems(root: ET.Element) -> Iterator[str]:
@@ -80,20 +86,6 @@ def _urdf_problems(root: ET.Element) -> Iterator[str]:
             yield f'{name} has no {missing}: give it <limit lower="-1.5" upper="1.5" effort="30" velocity="20"/>'
         if limit is not None and limit.get("effort", "").strip().startswith("-"):
             yield f"{name} must have an effort above 0, got {limit.get('effort')}"
-
-
-def _parse(file: Path, *, visuals: bool = False) -> ET.Element:
-    try:
-        root = ET.parse(file).getroot()
-    except FileNotFoundError:
-        raise ValueError(f"model file expected at {file}, no such file") from None
-    except (ET.ParseError, OSError, ValueError) as error:
-        raise ValueError(f"{file} cannot be read as XML: {error}") from None
-    for parent in list(root.iter()):
-        for visual in parent.findall("visual") if root.tag == "robot" else ():
-            if not (visuals and _can_be_shown(visual, file)):  # meshes are often in formats that need more packages
-                parent.remove(visual)
-    return root
 
 
 def _can_be_shown(visual: ET.Element, model_file: Path) -> bool:

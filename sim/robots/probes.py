@@ -50,34 +50,9 @@ _GROWTH = 1.25
 _Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Hull:
-    """A convex hull as the half spaces ``normal . x <= offset``."""
-
-    triangles: _Array  # corners, shape (num_triangles, 3, 3) [m]
-    normal: _Array  # outward, of length 1, shape (num_planes, 3)
-    offset: _Array  # shape (num_planes,) [m]
-
-    def inradius(self) -> float:
-        """Radius of the largest ball about the middle of the hull's volume [m]."""
-        corners = self.triangles - self.triangles.mean(axis=(0, 1))
-        volume = np.abs(np.linalg.det(corners))
-        middle = np.average(corners.sum(axis=1) / 4.0, axis=0, weights=volume) + self.triangles.mean(axis=(0, 1))
-        return float((self.offset - self.normal @ middle).min())
-
-
-def _make_hull(vertices: _Array) -> _Hull:
-    try:
-        hull = ConvexHull(vertices)
-    except QhullError:
-        raise ValueError("its mesh must have a volume: replace it in the robot's file by a solid or a box") from None
-    planes = np.unique(np.round(hull.equations, 9), axis=0)  # facets of one face share their plane
-    return _Hull(triangles=hull.points[hull.simplices], normal=planes[:, :3], offset=-planes[:, 3])
-
-
 def _surface_samples(triangles: _Array, spacing: float) -> _Array:
     """Points on the triangles, corners included: none of a triangle is farther than spacing / sqrt(3) from the next."""
-    samples: list[_Array] = []
+    samples = []
     for a, b, c in triangles:
         longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
         count = max(1, int(np.ceil(longest / spacing)))
@@ -88,13 +63,13 @@ def _surface_samples(triangles: _Array, spacing: float) -> _Array:
     return np.unique(np.round(np.concatenate(samples), 7), axis=0).astype(np.float64)
 
 
-def _inscribe_ball(point: _Array, hull: _Hull, radii: _Array, max_depth: float) -> tuple[_Array, float]:
+def _inscribe_ball(point: _Array, planes: _Array, radii: _Array, max_depth: float) -> tuple[_Array, float]:
     """Centre and radius of the first of the falling ``radii`` whose inscribed ball is so near to a surface point."""
-    clearance = hull.offset - hull.normal @ point
-    touching = clearance < 0.25 * max_depth
-    inward = -hull.normal[touching].sum(axis=0)
+    normal = planes[:, :3]
+    clearance = -planes[:, 3] - normal @ point
+    inward = -normal[clearance < 0.25 * max_depth].sum(axis=0)
     inward /= np.linalg.norm(inward)
-    rate = -hull.normal @ inward  # clearance that a plane gains a metre inward
+    rate = -normal @ inward  # clearance that a plane gains a metre inward
     leaves, nears = rate > 1e-9, rate < -1e-9
     largest = float(clearance[~leaves & ~nears].min(initial=np.inf))
     for radius in radii[radii <= largest + 1e-9]:
@@ -105,25 +80,24 @@ def _inscribe_ball(point: _Array, hull: _Hull, radii: _Array, max_depth: float) 
     return point, 0.0  # a tip sharper than any of the balls
 
 
-def _cover(hull: _Hull, tolerance: float) -> tuple[_Array, _Array] | None:
+def _cover(triangles: _Array, planes: _Array, inradius: float, tolerance: float) -> tuple[_Array, _Array] | None:
     """Balls, (n, 3) and (n,), with every sample of the surface near enough to one; None if it takes too many."""
     spacing = tolerance / _SAMPLES_PER_TOLERANCE
-    samples = _surface_samples(hull.triangles, spacing)
+    samples = _surface_samples(triangles, spacing)
     goal = tolerance - spacing / np.sqrt(3.0)
-    largest = min(hull.inradius(), _MAX_PROBE_RADIUS)
+    largest = min(inradius, _MAX_PROBE_RADIUS)
     radii = largest * 0.5 ** np.arange(max(1.0, np.ceil(np.log2(8.0 * largest / tolerance))))
     squares = (samples * samples).sum(axis=1)
     gap = np.full(len(samples), np.inf)
-    centres: list[_Array] = []
-    chosen_radii: list[float] = []
+    balls: list[tuple[_Array, float]] = []
     while gap.max() > goal:
-        if len(chosen_radii) == MAX_MESH_PROBES:
+        if len(balls) == MAX_MESH_PROBES:
             return None
-        centre, radius = _inscribe_ball(samples[gap.argmax()], hull, radii, 0.9 * goal)
-        centres.append(centre)
-        chosen_radii.append(radius)
+        centre, radius = _inscribe_ball(samples[gap.argmax()], planes, radii, 0.9 * goal)
+        balls.append((centre, radius))
         distance = np.sqrt(np.maximum(squares - 2.0 * samples @ centre + centre @ centre, 0.0))
         gap = np.minimum(gap, distance - radius)
+    centres, chosen_radii = zip(*balls, strict=True)
     return np.array(centres), np.array(chosen_radii)
 
 
@@ -135,31 +109,16 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
     side = np.sign(across) if np.ptp((corners - middle) @ axes[1]) > _WIDE else np.zeros(len(centres))
     side[side == 0.0] = 1.0
     strips = []
-    for radius in np.unique(radii)[::-1]:
-        for lane in np.unique(side):
-            chosen = np.flatnonzero((radii == radius) & (side == lane))
+    for radius, lane in itertools.product(np.unique(radii)[::-1], np.unique(side)):
+        chosen = np.flatnonzero((radii == radius) & (side == lane))
+        if len(chosen):
             row = centres[chosen[np.argsort(along[chosen], kind="stable")]]
-            if len(row):
-                strips.append(Strip(centres=row, radius=float(radius), spread=_spread(row)))
+            line = row[-1] - row[0]
+            length = float(line @ line)
+            share = np.clip((row - row[0]) @ line / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(row))
+            spread = float(np.linalg.norm(row - row[0] - share[:, None] * line, axis=1).max())
+            strips.append(Strip(centres=row, radius=float(radius), spread=spread))
     return strips
-
-
-def _spread(row: _Array) -> float:
-    """How far points lie from the straight line between the first and the last of them [m]."""
-    line = row[-1] - row[0]
-    length = float(line @ line)
-    share = np.clip((row - row[0]) @ line / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(row))
-    return float(np.linalg.norm(row - row[0] - share[:, None] * line, axis=1).max())
-
-
-@lru_cache(maxsize=64)
-def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
-    hull = _make_hull(np.frombuffer(vertices).reshape(-1, 3))
-    corners = np.unique(hull.triangles.reshape(-1, 3), axis=0)
-    tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
-    while (balls := _cover(hull, tolerance)) is None:
-        tolerance *= _GROWTH
-    return _rows(*balls, corners), tolerance
 
 
 def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
@@ -169,6 +128,25 @@ def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
     of the hull's surface lies at most the tolerance outside of the nearest one.
     """
     return _hull_probes(np.asarray(vertices, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
+    try:
+        hull = ConvexHull(np.frombuffer(vertices).reshape(-1, 3))
+    except QhullError:
+        raise ValueError("its mesh must have a volume: replace it in the robot's file by a solid or a box") from None
+    planes = np.unique(np.round(hull.equations, 9), axis=0)  # outward normal . x <= -offset; facets of a face share one
+    triangles = hull.points[hull.simplices]
+    centred = triangles - triangles.mean(axis=(0, 1))
+    volume = np.abs(np.linalg.det(centred))
+    middle = np.average(centred.sum(axis=1) / 4.0, axis=0, weights=volume) + triangles.mean(axis=(0, 1))
+    inradius = float((-planes[:, 3] - planes[:, :3] @ middle).min())  # of the largest ball about the hull's middle
+    corners = np.unique(triangles.reshape(-1, 3), axis=0)
+    tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
+    while (balls := _cover(triangles, planes, inradius, tolerance)) is None:
+        tolerance *= _GROWTH
+    return _rows(*balls, corners), tolerance
 
 
 MAX_SAG = 0.005
@@ -271,17 +249,20 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
     shape: list[int] = []
     strips: list[Strip] = []
+    centres: list[list[Any]] = []
     problems: list[str] = []
     for k in range(builder.shape_count):
+        pose: Any = builder.shape_transform[k]
         try:
             scale = np.asarray(builder.shape_scale[k])
-            strips += shape_strips(newton.GeoType(builder.shape_type[k]), scale, builder.shape_source[k])
+            added = shape_strips(newton.GeoType(builder.shape_type[k]), scale, builder.shape_source[k])
+            shape += [k] * len(added)
+            strips += added
+            centres += [[wp.transform_point(pose, _vec3(*centre)) for centre in strip.centres] for strip in added]
         except ValueError as error:
             problems.append(f"geom {builder.shape_label[k]}: {error}")
-        shape += [k] * (len(strips) - len(shape))
     if problems:
         raise ValueError("; ".join(problems))
-    centres = [_transform_points(builder.shape_transform[k], strip) for k, strip in zip(shape, strips, strict=True)]
     radius = [strip.radius for strip in strips]
     body = [builder.shape_body[k] for k in shape]
     bundles = _bundle_strips(body)
@@ -296,10 +277,6 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     probes.bundle_body = wp.array([body[first] for first in bundles[:-1]], dtype=int)
     probes.bundle_ball = wp.array(balls, dtype=wp.vec4)
     return probes
-
-
-def _transform_points(pose: Any, strip: Strip) -> list[Any]:
-    return [wp.transform_point(pose, _vec3(*centre)) for centre in strip.centres]
 
 
 def _bundle_strips(body: Sequence[int]) -> list[int]:

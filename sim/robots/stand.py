@@ -12,9 +12,11 @@ import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.files.templates import open_templates
+from sim.robots.drives import read_drives
 from sim.robots.model import build_robot
 from sim.robots.probes import measure_extents, start_height
 from sim.robots.robot import RobotCfg
@@ -25,7 +27,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 _GRAVITY = 9.81
 _TERRAINS = 4
-_CLEARANCE = 1.5  # a dropped robot starts above the highest ground this far round it [m]
+_CLEARANCE = 61  # nodes: a dropped robot starts above the highest ground 1.5 m round it
 _UPRIGHT_DEG = 15.0
 _STRAY = 0.1  # share of the weight that geoms without a role may carry
 _SUNK = 0.005  # deeper than this in the ground at the start is a mistake [m]
@@ -46,6 +48,7 @@ _MASSES = (0.1, 1000.0)  # [kg]
 class Standing:
     """How a robot stood in its default pose, and how the dropped ones lay."""
 
+    robot: RobotCfg
     height: tuple[float, float]
     """Height of the base at the start and at the end [m]."""
     right_height: float
@@ -83,9 +86,32 @@ class Standing:
         """Name of the geom that is lowest at the start."""
         return min(self.bottoms, key=self.bottoms.__getitem__)
 
-    def foot_gap(self, robot: RobotCfg) -> float:
+    @property
+    def foot_gap(self) -> float:
         """Height of the lowest foot over the ground at the start [m]; negative in the ground."""
-        return min(self.bottoms[name] for name in robot.foot_geoms)
+        return min(self.bottoms[name] for name in self.robot.foot_geoms)
+
+    @property
+    def mistakes(self) -> list[str]:
+        """Names of what has to be mended, as ``templates/standing.txt`` explains them."""
+        height, end_height = self.height
+        checks = {
+            "sunk": self.foot_gap < -_SUNK,
+            "falls": height > self.right_height + _FALL,
+            "feet are not lowest": self.lowest_geom not in self.robot.foot_geoms,
+            "weight without a role": self.finite and end_height > 0.5 * height and self.stray > _STRAY,
+            "not finite": not self.finite,
+            "bounces": self.stands and self.restless > _RESTLESS,
+            "contacts": self.overflowed,
+        }
+        return [name for name, is_wrong in checks.items() if is_wrong]
+
+    def describe(self) -> str:
+        """How the robot stood, and what has to be mended."""
+        on_ground = min(self.bottoms.values()) + _NEAR_LOWEST
+        low = [name for name, bottom in self.bottoms.items() if bottom < on_ground]
+        roleless = [name for name in low if name not in self.robot.geom_names]
+        return _TEMPLATES.get_template("standing.txt").render(standing=self, roleless=roleless).rstrip()
 
 
 def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32) -> Standing:
@@ -107,8 +133,9 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     start[1:, 3:7] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
     builder = build_robot(robot)
     ((bottoms, reach),) = measure_extents(builder, [robot.default_joint_pos])
-    for terrain, row in zip(terrains[1:], start[1:], strict=True):
-        row[2] = reach + _highest_ground(heights[terrain], *row[:2])
+    highest = maximum_filter(heights, size=(1, _CLEARANCE, _CLEARANCE))
+    column, row = np.rint(start[1:, :2].T / SPACING).astype(int)
+    start[1:, 2] = reach + highest[terrains[1:], row, column].astype(np.float64)
     sim.joint_q.assign(start)
     contacts, overflowed, forces = _let_fall(sim, seconds)
     end = sim.joint_q.numpy()[0].astype(np.float64)
@@ -117,6 +144,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     on_feet = forces[:, [name in robot.foot_geoms for name in robot.geom_names]] / weight
     shares = zip(robot.geom_names, forces.mean(axis=0) / weight, strict=True)
     return Standing(
+        robot=robot,
         height=(robot.default_base_height, float(end[2])),
         right_height=start_height(robot, builder),
         bottoms={name: robot.default_base_height + bottom for name, bottom in bottoms.items()},
@@ -128,13 +156,6 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
         overflowed=overflowed,
         finite=bool(np.isfinite(sim.joint_q.numpy()).all() and np.isfinite(sim.joint_qd.numpy()).all()),
     )
-
-
-def _highest_ground(heights: NDArray[np.float32], x: float, y: float) -> float:
-    """Highest ground round a point [m]."""
-    row, column, reach = (round(length / SPACING) for length in (y, x, _CLEARANCE))
-    rows, columns = (slice(max(index - reach, 0), index + reach + 1) for index in (row, column))
-    return float(heights[rows, columns].max())
 
 
 def _let_fall(sim: Simulation, seconds: float) -> tuple[int, bool, NDArray[np.float64]]:
@@ -163,41 +184,18 @@ def _let_fall(sim: Simulation, seconds: float) -> tuple[int, bool, NDArray[np.fl
     return contacts, overflowed, np.array(forces, dtype=np.float64)
 
 
-def standing_mistakes(robot: RobotCfg, standing: Standing) -> Iterator[str]:
-    """Names of what has to be mended, as ``templates/standing.txt`` explains them."""
-    height, end_height = standing.height
-    if standing.foot_gap(robot) < -_SUNK:
-        yield "sunk"
-    if height > standing.right_height + _FALL:
-        yield "falls"
-    if standing.lowest_geom not in robot.foot_geoms:
-        yield "feet are not lowest"
-    if standing.finite and end_height > 0.5 * height and standing.stray > _STRAY:
-        yield "weight without a role"
-    if not standing.finite:
-        yield "not finite"
-    if standing.stands and standing.restless > _RESTLESS:
-        yield "bounces"
-    if standing.overflowed:
-        yield "contacts"
-
-
 def describe_model(robot: RobotCfg) -> str:
     """Joints and geoms of a robot as the solver holds them, and numbers that look like other units."""
     builder = build_robot(robot)
     sim = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
-    return (
-        _TEMPLATES.get_template("model.txt")
-        .render(
-            robot=robot,
-            mass=float(sim.solver.mj_model.body_subtreemass[0]),
-            num_bodies=builder.body_count,
-            joints=_align([*_joint_rows(robot, sim)]),
-            geoms=_align([*_geom_rows(robot, sim, builder)]),
-            warnings=dict(_unit_warnings(robot, builder)),
-        )
-        .rstrip()
-    )
+    content = {
+        "mass": float(sim.solver.mj_model.body_subtreemass[0]),
+        "num_bodies": builder.body_count,
+        "joints": _align([*_joint_rows(robot, sim)]),
+        "geoms": _align([*_geom_rows(robot, sim, builder)]),
+        "warnings": dict(_unit_warnings(robot, builder)),
+    }
+    return _TEMPLATES.get_template("model.txt").render(robot=robot, **content).rstrip()
 
 
 def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
@@ -206,25 +204,18 @@ def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
     motors = np.zeros((model.nu, 0)) if sim.motors is None else sim.motors.numpy()[:, 1:]
     heads = "joint", "default", "range [rad]", "kp", "kd", "effort", "armature", "damping", "friction"
     yield *heads, *("saturation", "speed limit [rad/s]")[: motors.shape[1]]
-    drives = {int(joint): k for k, joint in enumerate(model.actuator_trnid[:, 0])}
-    for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True), start=1):
-        low, high = model.jnt_range[k]
-        effort = float(model.jnt_actfrcrange[k, 1])
-        kp = kd = 0.0
-        text = "follows"
-        limits = ["-"] * motors.shape[1]
-        if (drive := drives.get(k)) is not None:
-            kp = model.actuator_gainprm[drive, 0]
-            kd = 0.0 - model.actuator_biasprm[drive, 2]
-            if model.actuator_forcelimited[drive]:
-                effort = min(effort, model.actuator_forcerange[drive, 1])
-            text = f"{effort:g}" if effort < _NO_EFFORT_LIMIT else "free"
-            limits = [f"{limit:g}" for limit in motors[drive]]
-        span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[k] else "free"
-        dof = int(model.jnt_dofadr[k])
-        armature, damping, friction = model.dof_armature[dof], model.dof_damping[dof], model.dof_frictionloss[dof]
-        gains = f"{kp:g}", f"{kd:g}", text, f"{armature:.3g}", f"{damping:g}", f"{friction:g}"
-        yield name, f"{angle:.3f}", span, *gains, *limits
+    drives = read_drives(model)
+    driven = model.actuator_trnid[:, 0].tolist()
+    armature, damping, friction = (
+        getattr(model, f"dof_{name}")[6:] for name in ("armature", "damping", "frictionloss")
+    )
+    for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True)):
+        low, high = model.jnt_range[1 + k]
+        span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[1 + k] else "free"
+        effort = f"{drives.effort[k]:g}" if drives.effort[k] < _NO_EFFORT_LIMIT else "free"
+        limits = [f"{limit:g}" for limit in motors[driven.index(1 + k)]] if 1 + k in driven else ["-"] * len(motors.T)
+        gains = f"{drives.stiffness[k]:g}", f"{0.0 + drives.damping[k]:g}", effort if 1 + k in driven else "follows"
+        yield name, f"{angle:.3f}", span, *gains, f"{armature[k]:.3g}", f"{damping[k]:g}", f"{friction[k]:g}", *limits
 
 
 def _geom_rows(robot: RobotCfg, sim: Simulation, builder: newton.ModelBuilder) -> Iterator[Sequence[str]]:
@@ -265,14 +256,3 @@ def _unit_warnings(robot: RobotCfg, builder: Any) -> Iterator[tuple[str, Any]]:
     is_wide = (span > 2.0 * _TURN) & (span < _FREE) & (np.maximum(abs(low), abs(high)) > 2.0 * _TURN)
     if is_wide.any():
         yield "ranges", [f"{robot.joint_names[k]} ({low[k]:g} to {high[k]:g})" for k in np.flatnonzero(is_wide)]
-
-
-def describe_standing(robot: RobotCfg, standing: Standing) -> str:
-    """How the robot stood, and what has to be mended."""
-    on_ground = min(standing.bottoms.values()) + _NEAR_LOWEST
-    geoms = [name for name, bottom in standing.bottoms.items() if bottom < on_ground and name not in robot.geom_names]
-    return (
-        _TEMPLATES.get_template("standing.txt")
-        .render(robot=robot, standing=standing, mistakes=[*standing_mistakes(robot, standing)], roleless=geoms)
-        .rstrip()
-    )

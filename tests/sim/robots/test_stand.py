@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from sim.robots.find import get_robot
-from sim.robots.stand import describe_model, describe_standing, stand, standing_mistakes
+from sim.robots.stand import describe_model, stand
 from tests.sim.dogs import KINDS, LEGS, write_dog
 
 
@@ -19,8 +19,8 @@ def test_a_dog_stands_on_its_feet(tmp_path, device, kind):
     assert standing.height[0] == 0.29 and 0.24 < standing.height[1] < 0.29
     assert standing.tilt_deg < 2.0 and standing.joint_error < 0.1
     assert 4 <= standing.contacts < dog.nconmax
-    assert not [*standing_mistakes(dog, standing)]
-    assert describe_standing(dog, standing).endswith("It stands.")
+    assert not standing.mistakes
+    assert standing.describe().endswith("It stands.")
     for change in ({"carried": {}}, {"height": (0.29, 0.1)}, {"tilt_deg": 16.0}, {"finite": False}):
         assert not dataclasses.replace(standing, **change).stands
 
@@ -40,18 +40,18 @@ def test_a_dog_stands_on_its_feet(tmp_path, device, kind):
 def test_what_has_to_be_mended_is_named(tmp_path, device, change, mistake, parts):
     robot = dataclasses.replace(get_robot(str(write_dog(tmp_path, **KINDS["urdf"]))), **change)
     standing = stand(robot, device=device, seconds=1.5, drops=2)
-    assert mistake in standing_mistakes(robot, standing)
-    text = describe_standing(robot, standing)
+    assert mistake in standing.mistakes
+    text = standing.describe()
     mended = "\n".join(line for line in text.splitlines() if line.startswith("To mend"))
     assert all(part in mended for part in parts) and "biped" not in text
     dead = dataclasses.replace(standing, finite=False)
-    assert "not finite" in standing_mistakes(robot, dead) and "physics_dt" in describe_standing(robot, dead)
+    assert "not finite" in dead.mistakes and "physics_dt" in dead.describe()
 
 
 def test_a_biped_falls_and_nothing_is_wrong_with_it(cassie, device):
     standing = stand(cassie, device=device, drops=1)
-    assert not standing.stands and "pelvis" in standing.carried and not [*standing_mistakes(cassie, standing)]
-    assert "biped" in describe_standing(cassie, standing)
+    assert not standing.stands and "pelvis" in standing.carried and not standing.mistakes
+    assert "biped" in standing.describe()
 
 
 def test_motors_and_delay_are_listed(tmp_path):
