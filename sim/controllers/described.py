@@ -228,15 +228,14 @@ class Described(torch.nn.Module):
             self._refuse("a scan must have x and y where the robot has no scan_x and scan_y")
         if not set(points) <= index_by_point.keys():
             x, y = ([*dict.fromkeys(values)] for values in zip(*points, strict=True))
-            self._refuse(
-                f"the scan's points are not those of the robot: write into robot.toml scan_x = {x} and scan_y = {y}"
-            )
+            remedy = f"write into robot.toml scan_x = {x} and scan_y = {y}"
+            self._refuse(f"the scan's points are not those of the robot: {remedy}")
         return [index_by_point[point] for point in points]
 
     @property
     def observation_size(self) -> int:
         """Columns that the network sees."""
-        return sum(width * length for width, length in zip(self.widths, self.lengths, strict=True))
+        return int(np.dot(self.widths, self.lengths))
 
     @property
     def columns(self) -> str:
@@ -251,12 +250,9 @@ class Described(torch.nn.Module):
 
     def _get_memory(self, count: int) -> _Memory:
         if count not in self._memories:
-            self._memories[count] = _Memory(
-                steps=torch.zeros((count, 1), device=self._device),
-                action=torch.zeros((count, self.num_actions), device=self._device),
-                sent=torch.zeros((count, self.cfg.action_delay_steps, self.num_actions), device=self._device),
-                past=torch.zeros((count, max(self.lengths), sum(self.widths)), device=self._device),
-            )
+            sent = (self.cfg.action_delay_steps, self.num_actions)
+            shapes = (1,), (self.num_actions,), sent, (max(self.lengths), sum(self.widths))
+            self._memories[count] = _Memory(*(torch.zeros((count, *shape), device=self._device) for shape in shapes))
         return self._memories[count]
 
     @torch.inference_mode()
@@ -283,7 +279,17 @@ class Described(torch.nn.Module):
             for term, sensor, index in zip(self.cfg.observation, self._sensors, self._index, strict=True)
         ]
         now = (torch.cat(columns, dim=1) - self._zeros).clamp(*self._limits) * self._scale
-        return self._with_history(now if clip is None else now.clamp(-clip, clip), memory)
+        now = now if clip is None else now.clamp(-clip, clip)
+        history = self.cfg.history
+        if history is None:
+            return now
+        past = torch.cat([now[:, None], memory.past[:, :-1]], dim=1)
+        if history.fill == "first":
+            past = torch.where(memory.steps[:, :, None] == 0.0, now[:, None], past)
+        memory.past.copy_(past)
+        terms = [past] if history.by == "row" else past.split(self.widths, dim=2)
+        steps = [term[:, :length] for term, length in zip(terms, self.lengths, strict=False)]
+        return torch.cat([(term.flip(1) if history.newest == "last" else term).flatten(1) for term in steps], dim=1)
 
     @torch.inference_mode()
     def act(self, output: torch.Tensor) -> torch.Tensor:
@@ -308,19 +314,6 @@ class Described(torch.nn.Module):
             angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
             return torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
         return getattr(sensed, term.term).flatten(1)
-
-    def _with_history(self, now: torch.Tensor, memory: _Memory) -> torch.Tensor:
-        history = self.cfg.history
-        if history is None:
-            return now
-        past = torch.cat([now[:, None], memory.past[:, :-1]], dim=1)
-        if history.fill == "first":
-            past = torch.where(memory.steps[:, :, None] == 0.0, now[:, None], past)
-        memory.past.copy_(past)
-        terms = [past] if history.by == "row" else past.split(self.widths, dim=2)
-        lengths = self.lengths if history.by == "term" else self.lengths[:1]
-        steps = [term[:, :length] for term, length in zip(terms, lengths, strict=True)]
-        return torch.cat([(term.flip(1) if history.newest == "last" else term).flatten(1) for term in steps], dim=1)
 
 
 def _limits(clip: Any) -> Any:

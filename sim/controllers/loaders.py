@@ -66,9 +66,8 @@ def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Loads a controller, as :class:`ControllerSpec` names it, and tries it on rows of the robot, on a Warp device.
 
-    Files are loaded as data only (``weights_only``; TorchScript and ONNX hold no Python) after a look at their
-    checksums; code runs only from a module or Python file that is named. TorchScript and ONNX are read by C++, which a
-    file made to harm can crash. A warning says if the training record beside a file names another robot.
+    Files are loaded as data only, though C++ reads TorchScript and ONNX, which a file made to harm can crash; code runs
+    only from a module or Python file that is named. A warning says if the record of a training names another robot.
     """
     device = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
     if device != "cpu" and not torch.cuda.is_available():
@@ -77,10 +76,9 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     policy = _load_file(Path(spec), robot, device) if named.module is None else _load_code(named, robot, device)
     _try_rows(policy, (robot.observation_size, robot.num_joints), device, str(spec), f"robot '{robot.name}'")
     if named.module is None and not _separates_rows(policy, robot.observation_size, device):
-        raise ValueError(
-            f"policy '{spec}' fails, or acts differently in an episode's first step, beside other rows or after other "
-            "steps: it mixes rows, draws at random, or remembers across a reset: export it without that"
-        )
+        what = "fails, or acts differently in an episode's first step, beside other rows or after other steps"
+        why = "it mixes rows, draws at random, or remembers across a reset"
+        raise ValueError(f"policy '{spec}' {what}: {why}: export it without that")
     if named.file is not None:
         _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
@@ -89,18 +87,17 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
 def _warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
     record = policy.with_suffix(".train.json")
     try:
-        settings = read_json(record).get("settings")
-    except (OSError, ValueError):  # no record, or a damaged one
+        trained = read_json(record)["settings"]["robot_sha256"]
+    except (OSError, ValueError, LookupError, TypeError):  # no record, or a damaged one
         return
-    trained = settings.get("robot_sha256") if isinstance(settings, dict) else None
-    if trained is None or trained == robot_digest(robot):
+    if (
+        trained in (None, robot_digest(robot)) or multiprocessing.parent_process() is not None
+    ):  # a worker's parent warns
         return
     now = robot_digest(get_robot(robot.spec))  # a command may have changed its time step or capacities by itself
-    if trained != now and multiprocessing.parent_process() is None:  # a worker's parent warns
-        _print_once(
-            f"warning: {policy} was trained with a robot of other settings, model or meshes (SHA-256 {trained[:12]} in "
-            f"{record.name}) than {robot.spec} has now ({now[:12]})"
-        )
+    if trained != now:
+        what = f"a robot of other settings, model or meshes (SHA-256 {trained[:12]} in {record.name})"
+        _print_once(f"warning: {policy} was trained with {what} than {robot.spec} has now ({now[:12]})")
 
 
 @functools.cache
@@ -162,21 +159,20 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
     return policy
 
 
+@torch.inference_mode()
 def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label: str) -> None:
     """Tries a controller of these observation and action sizes on four robots that begin an episode."""
     shape = (4, sizes[0])
     try:
-        with torch.inference_mode():
-            reset_all(policy, 4, device)
-            action = policy(torch.zeros(shape, device=device))
+        reset_all(policy, 4, device)
+        action = policy(torch.zeros(shape, device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
-        width, _ = find_widths(policy) if isinstance(policy, torch.nn.Module) else (None, None)
+        width = find_widths(policy)[0] if isinstance(policy, torch.nn.Module) else None
         if width not in (None, sizes[0]):
             what = f"takes {width} columns, {label} gives {sizes[0]}"
             raise ValueError(f"policy '{spec}' {what}: describe those that it takes (docs/controllers.md)") from error
         raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {label}: {in_one_line(error)}") from error
-    problem = action_problem(action, (4, sizes[1]))
-    if problem is not None:
+    if problem := action_problem(action, (4, sizes[1])):
         raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")

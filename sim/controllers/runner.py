@@ -1,7 +1,7 @@
 """A controller in the loop: from the observation buffer to that of the actions, every control step."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
@@ -24,10 +24,8 @@ def with_rows_of_zeros(rows: torch.Tensor) -> torch.Tensor:
 
 def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
     """What is wrong with an action, which must be floats of that shape; None if it fits. Waits for no device."""
-    if not isinstance(action, torch.Tensor):
-        return f"got {type(action).__name__}"
-    if tuple(action.shape) != shape:
-        return f"got {tuple(action.shape)}"
+    if not isinstance(action, torch.Tensor) or tuple(action.shape) != shape:
+        return f"got {tuple(action.shape) if isinstance(action, torch.Tensor) else type(action).__name__}"
     if not action.is_floating_point() or action.is_meta or action.layout != torch.strided:
         return f"as plain floats, got {action.dtype}, {action.layout}, on {action.device}"
     return None
@@ -111,33 +109,26 @@ class Recurrent(torch.nn.Module):
 
 
 def is_graph_safe(policy: Any) -> bool:
-    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory."""
+    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory.
+
+    It has fixed shapes then, and its ``reset(rows)`` writes in place.
+    """
     return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and find_memory(policy) is Memory.NONE)
 
 
 class PolicyRunner:
-    """Runs a policy between two Warp buffers.
+    """Runs a policy between two Warp buffers; one that :func:`is_graph_safe` is captured as a CUDA graph."""
 
-    A torch module without memory is captured as a CUDA graph. So is a policy that says that it is ``graph_safe``: it
-    has fixed shapes, and its ``reset(rows)`` writes in place.
-    """
-
-    def __init__(
-        self, policy: Callable[[torch.Tensor], torch.Tensor], observation: Any, action: Any, begins: Any
-    ) -> None:
+    def __init__(self, policy: Any, observation: Any, action: Any, begins: Any) -> None:
         """Binds the policy to Warp arrays (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
 
         ``begins`` is not 0 where an episode begins with the coming step.
         """
-        self._policy: Any = policy
+        self._policy = policy
         self.memory = find_memory(policy)
-        self._begins = wp.to_torch(begins)
-        self._observation = wp.to_torch(observation)
-        self._action = wp.to_torch(action)
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._observation, self._action, self._begins = map(wp.to_torch, (observation, action, begins))
         self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
-        if self._observation.is_cuda and is_graph_safe(policy):
-            self._graph = self._capture()
+        self._graph = self._capture() if self._observation.is_cuda and is_graph_safe(policy) else None
 
     def reset(self) -> None:
         """Begins an episode of all robots, of a policy whose memory is :attr:`Memory.SHARED`."""
@@ -148,19 +139,16 @@ class PolicyRunner:
         observation = self._observation.clone()
         if self._plain:  # a function, or a module that remembers, gets one row a robot
             observation = with_rows_of_zeros(observation)
-        sizes = tuple(observation.shape)
+        shape = (len(observation), self._action.shape[1])
         try:
             if self.memory is Memory.PER_ROBOT:
                 self._policy.reset(self._begins != 0)
             action = self._policy(observation)
         except (Exception, SystemExit) as error:  # a controller can fail with anything
-            raise ValueError(
-                f"controller {getattr(self._policy, '__qualname__', type(self._policy).__qualname__)} failed in the "
-                f"middle of a crossing, on observations of shape {sizes}: {in_one_line(error)}"
-            ) from error
-        shape = (sizes[0], self._action.shape[1])
-        problem = action_problem(action, shape)
-        if problem is not None:
+            name = getattr(self._policy, "__qualname__", type(self._policy).__qualname__)
+            what = f"failed in the middle of a crossing, on observations of shape {tuple(observation.shape)}"
+            raise ValueError(f"controller {name} {what}: {in_one_line(error)}") from error
+        if problem := action_problem(action, shape):
             raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")
         self._action.copy_(action[: len(self._action)])
 
@@ -170,12 +158,9 @@ class PolicyRunner:
             self._call()
         torch.cuda.synchronize()
         graph = torch.cuda.CUDAGraph()
-        # Other threads may use the device meanwhile.
-        with (
-            recording(),
-            torch.cuda.graph(graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"),
-        ):
-            self._call()
+        stream = torch.cuda.current_stream()
+        with recording(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            self._call()  # while other threads may use the device
         return graph
 
     @torch.inference_mode()

@@ -9,11 +9,13 @@ import sysconfig
 import tomllib
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sim.files.provenance import ROOMS, ROOT
 from sim.robots.robot import RobotCfg, robot_identity
 
 SHIPPED = "shipped"
@@ -34,10 +36,8 @@ class ControllerSpec:
     @classmethod
     def parse(cls, spec: str | Path) -> "ControllerSpec":
         """Splits a name into its parts; the name of an existing file is that file."""
-        match = _NAMED.fullmatch(str(spec))
-        if match is None or Path(spec).exists():
-            return cls(file=str(spec))
-        return cls(**match.groupdict())
+        match = None if Path(spec).exists() else _NAMED.fullmatch(str(spec))
+        return cls(file=str(spec)) if match is None else cls(**match.groupdict())
 
     def __str__(self) -> str:
         if self.module is None:
@@ -60,8 +60,8 @@ class ControllerSpec:
         files = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
         if self.file is not None:
             files.append(Path(self.file))
-            if files[-1].suffix == ".toml" and (weights := weights_file(files[-1])) is not None:
-                files.append(weights)
+            if files[-1].suffix == ".toml":
+                files += filter(None, [weights_file(files[-1])])
             files += filter(None, [agent_file(files[-1])])
         return tuple(files)
 
@@ -70,15 +70,15 @@ class ControllerSpec:
         module = self.module
         if module is not None and module.endswith(".py"):
             module = str(folder / Path(module).name)
-        return ControllerSpec(module=module, name=self.name, file=self.file and str(folder / Path(self.file).name))
+        return replace(self, module=module, file=self.file and str(folder / Path(self.file).name))
 
 
 def weights_file(path: Path) -> Path | None:
     """File of the weights that a description names, or of that name beside it; None if it cannot be read."""
     try:
-        policy = tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
-        neighbour = path.parent / Path(policy).name
-        return neighbour if neighbour.is_file() and not (path.parent / policy).is_file() else path.parent / policy
+        policy = path.parent / tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
+        neighbour = path.parent / policy.name
+        return neighbour if neighbour.is_file() and not policy.is_file() else policy
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
@@ -95,18 +95,17 @@ def resolve_policy(policy: str, robot: RobotCfg) -> str:
 
 
 def controller_hash(policy: str | Path) -> str | None:
-    """SHA-256 of a controller: of its file, or of all its files and the callable's name.
+    """SHA-256 of a controller's file, or of all its files and the callable's name; None if a file is missing.
 
-    None if a file is missing, or a module has none. Files that code reads or imports are not part of it.
+    Files that code reads or imports are not part of it.
     """
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
     if spec.module is not None and not spec.module.endswith(".py"):
-        try:
-            found_module = importlib.util.find_spec(spec.module)
-        except (ImportError, ValueError):  # no package of that name
-            found_module = None
-        files.insert(0, Path((found_module and found_module.origin) or ""))
+        module = None
+        with suppress(ImportError, ValueError):  # no package of that name
+            module = importlib.util.find_spec(spec.module)
+        files.insert(0, Path((module and module.origin) or ""))
     if not all(file.is_file() for file in files):
         return None
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
@@ -116,21 +115,13 @@ def controller_hash(policy: str | Path) -> str | None:
 
 
 def controller_identity(robot: RobotCfg, policy: str | Path) -> dict[str, str | None]:
-    """What a record of a robot under a controller names: ``robot``, ``policy`` (a name without folders), their hashes.
-
-    ``policy_sha256`` is None for a controller without a file.
-    """
-    controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(str(policy))}
+    """What a record of a robot under a controller names: both, without folders, and their hashes, or None."""
+    controller = {"policy": ControllerSpec.parse(policy).label, "policy_sha256": controller_hash(policy)}
     return {"robot": robot.name, **robot_identity(robot), **controller}
 
 
-_ROOT = Path(__file__).resolve().parents[2]
-_FOLDERS_NOT_OF_USERS = (
-    *(_ROOT / room for room in ("kernels", "sim", "qd", "train")),
-    *(Path(sysconfig.get_path(kind)) for kind in ("stdlib", "platstdlib", "purelib", "platlib")),
-)
-
-
+_LIBRARIES = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")]
+_FOLDERS_NOT_OF_USERS = [*map(Path, _LIBRARIES), *(ROOT / room for room in ROOMS)]
 _ADVICE = re.compile(
     r"(?s)Weights only load failed.*(trusted source\.|WeightsUnpickler error: )|\. (Please use `torch|This is an int).*"
 )
@@ -142,13 +133,11 @@ def in_one_line(error: BaseException) -> str:
     lines = _ADVICE.sub("", str(error)).strip().splitlines()
     first = -1 if lines and lines[0].startswith("The following operation failed") else 0  # TorchScript's trace
     text = ": ".join([type(error).__name__, *lines[first:][:1]]).rstrip(".")
-    frames = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith("<")
-        and not any(Path(frame.filename).is_relative_to(folder) for folder in _FOLDERS_NOT_OF_USERS)
-    ]
-    return f"{text} ({frames[-1].filename}, line {frames[-1].lineno})" if frames else text
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename)
+        if not file.name.startswith("<") and not any(map(file.is_relative_to, _FOLDERS_NOT_OF_USERS)):
+            return f"{text} ({file}, line {frame.lineno})"
+    return text
 
 
 def run_file(path: Path) -> ModuleType:
@@ -195,18 +184,15 @@ def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dic
 def parse_controllers(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
     """Policy of each controller by its name, in the order given; the robot's own as ``base`` if there is none.
 
-    Each is ``NAME=FILE``, ``NAME=module:callable`` or ``NAME=shipped``; a text may hold several, with spaces. Errors
-    name the ``flag``.
+    Each is ``NAME=POLICY``; a text may hold several, with spaces. Errors name the ``flag``.
     """
     text = " ".join(policies).strip() or f"base={SHIPPED}"
     controllers: dict[str, str] = {}
     for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is
         name, _, policy = item.partition("=")
         if not re.fullmatch(r"[\w.+@-]+", name) or not policy:
-            raise ValueError(
-                f"{flag} must be NAME=FILE each, the name of letters, digits and . _ + @ -, got '{item}': "
-                "write for example C-G=runs/tuned/policy.pt"
-            )
+            must = "NAME=FILE each, the name of letters, digits and . _ + @ -"
+            raise ValueError(f"{flag} must be {must}, got '{item}': write for example C-G=runs/tuned/policy.pt")
         if name in controllers:
             raise ValueError(f"{flag} must have different names, got '{name}' twice: rename one of them")
         controllers[name] = resolve_policy(policy, robot)

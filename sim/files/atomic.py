@@ -21,10 +21,8 @@ def explain_failed_write(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OSError(
-            f"{path} cannot be written: {error.strerror or error}: make room there or give another place; the file "
-            "of before is whole"
-        ) from error
+        remedy = "make room there or give another place; the file of before is whole"
+        raise OSError(f"{path} cannot be written: {error.strerror or error}: {remedy}") from error
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -37,11 +35,8 @@ def write_atomically(path: Path, data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
+            with _opened(path.parent) as folder:
                 os.fsync(folder)  # or the renaming may be lost
-            finally:
-                os.close(folder)
         except OSError:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -108,14 +103,19 @@ def check_zip(path: Path) -> None:
 @contextlib.contextmanager
 def locked(folder: Path, busy: str = "") -> Iterator[None]:
     """Locks a folder; if another process has it, raises a ValueError with the text ``busy``, or waits without one."""
+    with _opened(folder) as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))
+        except OSError as error:
+            cannot = f"{folder} cannot be locked: {error.strerror}: give a folder on another disk"
+            raise ValueError(busy if isinstance(error, BlockingIOError) else cannot) from None
+        yield
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[int]:
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))
-    except OSError as error:
-        os.close(handle)
-        cannot = f"{folder} cannot be locked: {error.strerror}: give a folder on another disk"
-        raise ValueError(busy if isinstance(error, BlockingIOError) else cannot) from None
-    try:
-        yield
+        yield handle
     finally:
         os.close(handle)

@@ -14,10 +14,10 @@ import sys
 import textwrap
 import threading
 import traceback
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from shutil import get_terminal_size
 from types import FrameType
@@ -120,15 +120,13 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     A command whose defaults follow from some of its flags has a class method ``defaults(argv)``.
 
     Returns:
-        Exit status: what ``execute`` returns if that is a number, else 0; 2 after wrong flags, and after one line on
-        stderr for what a user can mend (ValueError, OSError, FloatingPointError); that of a UserError; 130 for Ctrl-C
-        and SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``. FAULTLINE_DEBUG=1
-        shows the traceback in place of the line.
+        Exit status: what ``execute`` returns if that is a number, else 0; 2 for wrong flags and what a user can mend,
+        with one line on stderr, or the traceback where FAULTLINE_DEBUG=1; that of a UserError; 130 for Ctrl-C and
+        SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        defaults = {"default": cls.defaults(argv)} if hasattr(cls, "defaults") else {}
-        command = _parse(cls, argv, name, defaults)
+        command = _parse(cls, argv, name)
         check_settings(command)
         status = command.execute()
         sys.stdout.flush()
@@ -152,10 +150,10 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
 def _is_output_closed() -> bool:
     """Whether standard output or errors have lost their reader; what is left to print there is dropped."""
     poll = select.poll()
-    for stream in (1, 2):
-        poll.register(stream, 0)
-    closed = [stream for stream, _ in poll.poll(0)]
-    for stream in closed:
+    poll.register(1, 0)
+    poll.register(2, 0)
+    closed = poll.poll(0)
+    for stream, _ in closed:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     return bool(closed)
 
@@ -182,23 +180,18 @@ def say(*parts: str | tuple[str, str], error: bool = False) -> None:
     console.print(Text.assemble(*parts), soft_wrap=not console.is_terminal)
 
 
-def _parse(cls: Any, argv: Sequence[str], name: str, defaults: dict[str, Any]) -> Any:
+def _parse(cls: Any, argv: Sequence[str], name: str) -> Any:
     """The command with its flags; SystemExit after help, or after a message about wrong flags."""
     if get_terminal_size().columns < _MIN_COLUMNS:
         os.environ["COLUMNS"] = str(_MIN_COLUMNS)  # tyro never ends in a narrower terminal
     if {"-h", "--help"} & {*argv}:
         for paragraph in (inspect.getdoc(cls) or "").split("\n\n"):
             print(textwrap.fill(paragraph, get_terminal_size().columns), end="\n\n")
+    options: dict[str, Any] = {"description": "", "registry": _plain_help(cls), "config": (tyro.conf.DisallowNone,)}
+    if hasattr(cls, "defaults"):
+        options["default"] = cls.defaults(argv)
     try:
-        return tyro.cli(
-            cls,
-            prog=f"faultline {name}",
-            args=list(argv),
-            description="",
-            registry=_plain_help(cls),
-            config=(tyro.conf.DisallowNone,),
-            **defaults,
-        )
+        return tyro.cli(cls, prog=f"faultline {name}", args=list(argv), **options)
     finally:
         sys.stdout.flush()
 
@@ -212,6 +205,10 @@ def _plain_help(cls: Any) -> ConstructorRegistry:
     hint = tyro.conf.arg(help_behavior_hint=lambda text: "" if text in ("", "None") else f"(default: {text})")
     busy = False
 
+    def join_lines(helptext: Any) -> str | None:
+        text: Any = (helptext() if callable(helptext) else helptext) or ""
+        return " ".join((text.format_map(cls.help_values()) if "{" in text else text).split()) or None
+
     @registry.struct_rule
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         nonlocal busy
@@ -223,7 +220,7 @@ def _plain_help(cls: Any) -> ConstructorRegistry:
         if not isinstance(spec, StructConstructorSpec):
             return None
         fields = [
-            replace(field, type=Annotated[field.type, hint], helptext=partial(_plain_text, cls, field.helptext))
+            replace(field, type=Annotated[field.type, hint], helptext=partial(join_lines, field.helptext))
             for field in spec.fields
         ]
         return replace(spec, fields=tuple(fields))
@@ -231,34 +228,21 @@ def _plain_help(cls: Any) -> ConstructorRegistry:
     return registry
 
 
-def _plain_text(cls: Any, helptext: Any) -> str | None:
-    text: Any = helptext() if callable(helptext) else helptext
-    if "{" in (text or ""):
-        text = text.format_map(cls.help_values())
-    return " ".join((text or "").split()) or None
-
-
 def peek(argv: Sequence[str], flag: str) -> str | None:
     """The last value that a command line gives a flag, as ``--flag value`` or ``--flag=value``; None if it has none."""
-    value = None
-    for word, following in pairwise([*argv, ""]):
-        if word == flag:
-            value = following
-        elif word.startswith(f"{flag}="):
-            value = word.partition("=")[2]
-    return value
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument(flag, nargs="?", dest="value")
+    return parser.parse_known_args(argv)[0].value
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
-    while frame is not None:
-        if f"{os.sep}llvmlite{os.sep}" in frame.f_code.co_filename:
-            # Its C code calls Python back and drops what is raised there: the signal comes again until it is over.
-            later = threading.Timer(0.1, os.kill, (os.getpid(), signum))
-            later.daemon = True
-            later.start()
-            return
-        frame = frame.f_back
-    raise KeyboardInterrupt
+    if any(f"{os.sep}llvmlite{os.sep}" in caller.f_code.co_filename for caller, _ in traceback.walk_stack(frame)):
+        # Its C code calls Python back and drops what is raised there: the signal comes again until it is over.
+        later = threading.Timer(0.1, os.kill, (os.getpid(), signum))
+        later.daemon = True
+        later.start()
+    else:
+        raise KeyboardInterrupt
 
 
 def command_line(name: str, **flags: object) -> str:
@@ -306,9 +290,9 @@ def publish(
 ) -> dict[str, Any]:
     """Measures a report, shows it, writes it to the JSON file ``out`` if given, and returns it.
 
-    ``draw`` makes a PNG of it, which is written beside the JSON. Both files are tried before the work.
+    ``draw`` makes the PNG beside the JSON. Both files are tried before the work.
     """
-    writers: dict[Path, Callable[[dict[str, Any]], bytes]] = {} if out is None else {out: to_json}
+    writers: dict[Path, Callable[..., bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:
         if out.suffix != ".json":
             raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")

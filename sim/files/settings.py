@@ -6,6 +6,7 @@ A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Fl
 import json
 import math
 import re
+import reprlib
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -40,7 +41,7 @@ def problems(settings: Any, prefix: str = "") -> list[str]:
         if is_dataclass(value):
             lines += problems(value, f"{name}.")
         elif problem := _mismatch(setting.type, value):
-            lines.append(f"{name} = {_brief(value)}: {problem}")
+            lines.append(f"{name} = {reprlib.repr(value)}: {problem}")
     return lines
 
 
@@ -95,11 +96,6 @@ def _mismatch(annotation: Any, value: Any) -> str | None:
     return "Expected a tuple" if isinstance(value, list) and isinstance(converted, tuple) else None
 
 
-def _brief(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."
-
-
 def read_toml(path: Path, text: str | None = None) -> dict[str, Any]:
     """Content of a TOML file, or of its text; an error names the file."""
     try:
@@ -138,13 +134,10 @@ def read_yaml(file: Path) -> dict[str, Any]:
 def to_toml(value: Any) -> str:
     """A value as TOML writes it, tables in braces."""
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{_key(key)} = {to_toml(item)}' for key, item in value.items())}}}"
+        keys = [key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in value]
+        return f"{{{', '.join(f'{key} = {to_toml(item)}' for key, item in zip(keys, value.values(), strict=True))}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(to_toml, value))}]"
     if isinstance(value, float):
         return repr(float(value))
     return json.dumps(str(value) if isinstance(value, PurePath) else value, ensure_ascii=False)
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)

@@ -61,9 +61,9 @@ class IsaacLab:
         agent = read_yaml(agent_file) if agent_file.is_file() else {}
         if agent.get("clip_actions") is not None:
             source.set(action_clip=agent["clip_actions"])
-        exported = [file for name in ("policy.pt", "policy.onnx") if (file := path / "exported" / name).is_file()]
-        if exported:
-            return exported[0]
+        for name in ("policy.pt", "policy.onnx"):
+            if (exported := path / "exported" / name).is_file():
+                return exported
         checkpoints = sorted(path.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
         if not checkpoints:
             raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
@@ -113,8 +113,7 @@ def _read_speed(env: dict[str, Any], source: Source) -> None:
     ranges = [command.get("ranges") or {} for command in commands]
     speeds = [limits["lin_vel_x"][1] for limits in ranges if "lin_vel_x" in limits]
     if speeds and 0.0 < speeds[0] < RobotCfg.speed:
-        reason = f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here"
-        source.set(speed=speeds[0], reason=reason)
+        source.set(speed=speeds[0], reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
         source.set(max_duration_s=round(15.0 / speeds[0], 1), reason="in proportion")
 
 
@@ -127,16 +126,17 @@ def _match_joints(patterns: Any, joints: Sequence[str], keep_pattern_order: Any 
 
 def _read_action(actions: dict[str, Any], path: Path, source: Source) -> list[str]:
     """Scale, offset and joints of the action; returns the order of all joints, which env.yaml does not say."""
-    joint_order = _breadth_first(source.model)
-    reason = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
-    for descriptors in sorted(path.rglob("*IO_descriptors.yaml"))[:1]:
-        joint_order = read_yaml(descriptors)["articulations"]["robot"]["joint_names"]
+    if descriptors := sorted(path.rglob("*IO_descriptors.yaml")):
+        joint_order = read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"]
         reason = ""
-    actions = {name: term for name, term in actions.items() if term is not None}
-    kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items()}
+    else:
+        joint_order = _breadth_first(source.model)
+        reason = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
+    kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items() if term is not None}
     if list(kinds.values()) != ["JointPositionAction"]:
         raise ValueError(f"{source.file}: actions must be one JointPositionAction, got {kinds}")
-    ((name, term),) = actions.items()
+    (name,) = kinds
+    term = actions[name]
     label = f"{source.file}: actions.{name}"
     if term.get("clip") is not None:
         raise ValueError(f"{label}.clip limits targets, which is not supported: give joints that range")
@@ -165,9 +165,8 @@ def _read_term(
     function = re.split(r"[:.]", str(term["func"]))[-1]
     params = term.get("params") or {}
     if function not in _TERMS or term.get("modifiers"):
-        what = f"{term['func']}{' with modifiers' if term.get('modifiers') else ''}"
-        known = ", ".join(_TERMS)
-        raise ValueError(f"{source.file} says what is not understood: observation {name}, {what}; only {known}")
+        what = f"observation {name}, {term['func']}{' with modifiers' * bool(term.get('modifiers'))}"
+        raise ValueError(f"{source.file} says what is not understood: {what}; only {', '.join(_TERMS)}")
     centre = source.model.body_ipos[1].round(5).tolist() if function == "base_lin_vel" else None
     row = make_term(_TERMS[function], term.get("scale"), clip=term.get("clip"), at=centre)
     if function in ("joint_pos_rel", "joint_vel_rel"):

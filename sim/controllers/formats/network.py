@@ -24,9 +24,9 @@ def load_network(
 ) -> Policy:
     """The network of a checkpoint, TorchScript or ONNX file, with a ``reset(rows)`` if it remembers.
 
-    ``sizes`` are the columns that it must take and the actions that it must return, which errors call those of
-    ``label``; None takes those of the file, and a TorchScript module as it is. ``activation`` is the function between
-    the layers of a checkpoint; None takes that of its file or training.
+    ``sizes`` are the columns and actions that it must have, which errors call those of ``label``; None takes those of
+    the file, and a TorchScript module as it is. ``activation`` stands between the layers of a checkpoint; None takes
+    that of its file or training.
     """
     if path.suffix.lower() == ".onnx":
         from sim.controllers.formats.onnx import load_onnx  # onnxruntime takes long to load, and few files need it
@@ -40,9 +40,10 @@ def load_network(
         return _load_script(path, device, sizes, error)
     policy = make_actor(content, path, activation)
     if sizes is not None and policy.sizes != sizes:
+        what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
+        must = f"{label} has {sizes[0]} observations and {sizes[1]} joints"
         raise ValueError(
-            f"policy '{path}' maps {policy.sizes[0]} observations to {policy.sizes[1]} actions, but {label} has "
-            f"{sizes[0]} observations and {sizes[1]} joints: give one that fits, or describe it (docs/controllers.md)"
+            f"policy '{path}' {what}, but {must}: give one that fits, or describe it (docs/controllers.md)"
         )
     return policy.to(device).eval()
 
@@ -62,10 +63,10 @@ def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason:
     try:
         module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
     except Exception as error:
-        raise ValueError(
-            f"policy '{path}' is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module (truncated, "
-            f"foreign, or holding code): {in_one_line(reason)}: give one of these, or an ONNX file that ends in .onnx"
-        ) from error
+        what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
+        why = f"(truncated, foreign, or holding code): {in_one_line(reason)}"
+        remedy = "give one of these, or an ONNX file that ends in .onnx"
+        raise ValueError(f"policy '{path}' {what} {why}: {remedy}") from error
     return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
 
 
@@ -116,10 +117,10 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
         is_same = reset is None or not isinstance(first, torch.Tensor) or torch.equal(first, second)
         return _Script(module) if is_same else module  # it has another memory
     separate = []
-    for robot in range(rows.shape[1]):
+    for robot in rows.split(1, dim=1):
         for name, value in probe.named_buffers():
             value.copy_(before[name])
-        separate.append(torch.cat([probe(step[robot : robot + 1]) for step in rows]))
+        separate.append(torch.cat([probe(row) for row in robot]))
     for axis in (1, 0):  # the axis of robots is the one along which they act as they do alone
         if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
             recurrent = _RecurrentScript(probe, initial, axis)
@@ -127,5 +128,7 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
                 together = torch.stack([recurrent(step) for step in rows], dim=1)
                 if torch.allclose(together, torch.stack(separate), rtol=1e-4, atol=1e-4):
                     return _RecurrentScript(module, initial, axis).to(device)
-    remedy = "give the checkpoint of which it was made"
-    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: {remedy}")
+    buffers = ", ".join(initial)
+    raise ValueError(
+        f"policy '{path}' remembers one robot alone, in {buffers}: give the checkpoint that it was made of"
+    )

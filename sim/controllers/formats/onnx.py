@@ -18,17 +18,8 @@ from sim.files.atomic import prepare_output, write_atomically
 
 _OPSET = 17  # of 2022, since robots rarely run a new onnxruntime
 _IR_VERSION = 8
-_OPERATORS = {
-    "elu": "Elu",
-    "selu": "Selu",
-    "relu": "Relu",
-    "lrelu": "LeakyRelu",
-    "tanh": "Tanh",
-    "sigmoid": "Sigmoid",
-    "softplus": "Softplus",
-    "identity": "Identity",
-}
-_ATTRIBUTES = {"elu": {"alpha": 1.0}, "lrelu": {"alpha": 0.01}}
+_OPERATORS = {name: name.capitalize() for name in ("elu", "selu", "relu", "tanh", "sigmoid", "softplus", "identity")}
+_OPERATORS["lrelu"] = "LeakyRelu"
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"
 
@@ -49,7 +40,8 @@ class OnnxPolicy:
             # TF32 would round every product to 10 bits.
             providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
         self.session = onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
-        self.sizes, self.states, self.is_single = _check_sizes(self.session, sizes)
+        self.ports = self.session.get_inputs(), self.session.get_outputs()
+        self.sizes, self.states, self.is_single = _check_sizes(*self.ports, sizes)
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size)."""
@@ -58,7 +50,7 @@ class OnnxPolicy:
     def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """Outputs for the graph's inputs, in its order, on their device; a graph for one robot runs once a robot."""
         values = [value.detach().cpu().float() for value in inputs]
-        names = [port.name for port in self.session.get_inputs()]
+        names = [port.name for port in self.ports[0]]
         calls = zip(*(value.split(1, dim=-2) for value in values), strict=True) if self.is_single else [values]
         results = [self.session.run(None, dict(zip(names, map(np.asarray, call), strict=True))) for call in calls]
         outputs = [np.concatenate(rows, axis=-2) for rows in zip(*results, strict=True)]
@@ -87,8 +79,7 @@ class OnnxLayers(torch.nn.Module):
         """From a graph and onnxruntime's policy of it; a KeyError if it has another operator."""
         super().__init__()
         self.sizes = policy.sizes
-        self._input = policy.session.get_inputs()[0].name
-        self._output = policy.session.get_outputs()[0].name
+        self._input, self._output = (ports[0].name for ports in policy.ports)
         constants = {tensor.name: tensor for tensor in model.graph.initializer}
         self._nodes: list[tuple[Callable[..., Any], list[str], list[str], dict[str, Any]]] = []
         for node in model.graph.node:
@@ -117,28 +108,26 @@ class OnnxLayers(torch.nn.Module):
 
 
 _LAYERS: dict[str, Callable[..., Any]] = {
-    "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Div": torch.div, "MatMul": torch.matmul,
-    "Elu": functional.elu, "Selu": functional.selu, "Relu": functional.relu, "Tanh": torch.tanh,
-    "Sigmoid": torch.sigmoid, "Softplus": functional.softplus, "Identity": torch.clone,
+    **{name: getattr(torch, name.lower()) for name in ("Add", "Sub", "Mul", "Div", "MatMul", "Tanh", "Sigmoid")},
+    **{name: getattr(functional, name.lower()) for name in ("Elu", "Selu", "Relu", "Softplus")},
+    "LeakyRelu": lambda value, alpha=0.01: functional.leaky_relu(value, alpha),
+    "Identity": torch.clone,
+    "Split": lambda value, *, chunks, axis=0: value.chunk(chunks, axis),
     "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **attributes: torch.addmm(
         bias, rows, weight.T if attributes.get("transB") else weight, alpha=alpha, beta=beta
     ),
-    "LeakyRelu": lambda value, alpha=0.01: functional.leaky_relu(value, alpha),
-    "Split": lambda value, *, chunks, axis=0: value.chunk(chunks, axis),
-}  # fmt: skip
+}
 """Operators of a graph of plain layers. Other attributes are found when the outputs are compared."""
 
 
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its graph takes observations (batch, observation_size) and returns actions (batch, num_joints), both float32. A
-    graph that remembers has states ``X_in`` and ``X_out``, (layers, batch, size), after them.
+    Its graph maps observations (batch, observation_size) to actions (batch, num_joints), both float32; states ``X_in``
+    and ``X_out``, (layers, batch, size), follow if it remembers. Only that file is read, and no code in it runs.
 
-    Only that file is read, and no code in it runs: weights in other files are refused, and onnxruntime knows only its
-    own operators. A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another
-    graph for one robot is changed into one for any number, if that acts on each robot as before; else it runs once a
-    robot.
+    A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another graph for one
+    robot is changed into one for any number, if that acts on each robot as before; else it runs once a robot.
     """
     target = torch.device(device)
     try:
@@ -157,11 +146,9 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
     if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
-        warnings.warn(
-            f"policy '{path}' has more than plain layers and runs on the CPU, since this onnxruntime has no CUDA that "
-            "works: install onnxruntime-gpu, or give the rsl_rl checkpoint",
-            stacklevel=2,
-        )
+        what = "runs on the CPU, since this onnxruntime has no CUDA that works"
+        remedy = "install onnxruntime-gpu, or give the rsl_rl checkpoint"
+        warnings.warn(f"policy '{path}' has more than plain layers and {what}: {remedy}", stacklevel=2)
     if policy.is_single:
         warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
     return _OnnxRecurrent(policy).to(target) if policy.states else policy
@@ -204,17 +191,17 @@ def _tensors(message: Any) -> Iterator[Any]:
                 yield from _tensors(inner)
 
 
-def _check_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int, int], list[list[int]], bool]:
+def _check_sizes(
+    inputs: Any, outputs: Any, sizes: tuple[int, int] | None
+) -> tuple[tuple[int, int], list[list[int]], bool]:
     """Widths of observation and action, shapes of the states, and whether the graph is for one robot."""
-    inputs = session.get_inputs()
-    outputs = session.get_outputs()
     if [port.name for port in inputs[1:]] != [f"{port.name.removesuffix('_out')}_in" for port in outputs[1:]]:
-        raise ValueError(
-            "it must have one input and one output, and after them the states X_in and X_out if it remembers, got "
-            f"{', '.join(port.name for port in inputs)} and {', '.join(port.name for port in outputs)}"
-        )
-    shapes = [list(port.shape or [None, None]) for port in (inputs[0], outputs[0])]  # an output's may be unknown
-    for kind, port, shape in zip(("input", "output"), (inputs[0], outputs[0]), shapes, strict=True):
+        got = " and ".join(", ".join(port.name for port in ports) for ports in (inputs, outputs))
+        must = "one input and one output, and after them the states X_in and X_out if it remembers"
+        raise ValueError(f"it must have {must}, got {got}")
+    ends = {"input": inputs[0], "output": outputs[0]}
+    shapes = [list(port.shape or [None, None]) for port in ends.values()]  # an output's may be unknown
+    for (kind, port), shape in zip(ends.items(), shapes, strict=True):
         if port.type != "tensor(float)" or len(shape) != 2:
             raise ValueError(f"its {kind} must be float32 of shape (batch, size), got {port.type} of shape {shape}")
     states = [list(port.shape) for port in inputs[1:]]
@@ -223,13 +210,13 @@ def _check_sizes(session: Any, sizes: tuple[int, int] | None) -> tuple[tuple[int
     batches = {shape[-2] for shape in (*shapes, *states) if isinstance(shape[-2], int)}
     if batches - {1}:
         raise ValueError(f"its batch must be free, or of one robot, got {max(batches)}: make its first axis dynamic")
-    widths: list[Any] = [shape[1] for shape in shapes]
-    if sizes is None and not all(isinstance(width, int) for width in widths):
+    widths: tuple[Any, Any] = (shapes[0][1], shapes[1][1])
+    sizes = sizes or widths
+    if not all(isinstance(size, int) for size in sizes):
         raise ValueError(f"its rows must have known widths, got {widths}")
-    expected = sizes or (widths[0], widths[1])
-    if any(isinstance(width, int) and width != size for width, size in zip(widths, expected, strict=True)):
-        raise ValueError(f"expected {expected[0]} observations and {expected[1]} actions, got {widths}")
-    return expected, states, bool(batches)
+    if any(isinstance(width, int) and width != size for width, size in zip(widths, sizes, strict=True)):
+        raise ValueError(f"expected {sizes[0]} observations and {sizes[1]} actions, got {widths}")
+    return sizes, states, bool(batches)
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:
@@ -256,17 +243,14 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
     if policy.normalised:  # the 1e-2 is rsl_rl's
         value = node("Sub", value, "centred", {"mean": policy.mean})
         value = node("Div", value, "normalised", {"scale": policy.std + 1e-2})
-    last = len(policy.layers) - 1
     for k, layer in enumerate(policy.layers):
-        name = "action" if k == last else f"layer_{k}"
+        name = "action" if k == len(policy.layers) - 1 else f"layer_{k}"
         if isinstance(layer, torch.nn.Linear):
             value = node("Gemm", value, name, {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}, transB=1)
         else:
-            value = node(_OPERATORS[policy.activation], value, name, {}, **_ATTRIBUTES.get(policy.activation, {}))
-    ports = [
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])]
-        for name, size in zip(("observation", "action"), policy.sizes, strict=True)
-    ]
+            value = node(_OPERATORS[policy.activation], value, name, {})
+    ends = zip(("observation", "action"), policy.sizes, strict=True)
+    ports = [[helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])] for name, size in ends]
     graph = helper.make_graph(nodes, "policy", *ports, initializer=weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
     write_atomically(path, model.SerializeToString(deterministic=True))

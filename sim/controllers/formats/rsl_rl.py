@@ -22,6 +22,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 """What rsl_rl calls the functions between layers."""
 _FORMER_NAMES = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
 """Prefixes of an actor's tensors in rsl_rl 1 to 4, and in rsl_rl 5."""
+_FORMER_PREFIX = re.compile(f"^({'|'.join(map(re.escape, _FORMER_NAMES))})")
 _KNOWN_NAMES = (
     r"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|obs_normalizer\.(_mean|_var|_std|count)|"
     r"distribution\.(log_)?std_param|(log_)?std|critic.*|memory_c\.rnn\.\w+"
@@ -86,10 +87,7 @@ class RnnPolicy(Recurrent):
 
 
 def read_weights(path: Path) -> Any:
-    """What ``torch.save`` wrote: plain tensors and values, as data only, and compared with its checksums.
-
-    It raises a ValueError if the file is damaged, and any error if it is foreign or holds code.
-    """
+    """What ``torch.save`` wrote, as data only; a ValueError if it is damaged, any error if it is foreign or code."""
     check_zip(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns of TorchScript files
@@ -109,21 +107,19 @@ def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | 
 
 def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
     """The actor's tensors by rsl_rl 5's names."""
-    keys = ("actor_state_dict", "model_state_dict")
-    state = next((content[key] for key in keys if isinstance(content, dict) and key in content), None)
-    names = {key: _rename(key) for key in map(str, state if isinstance(state, dict) else ())}
-    if not isinstance(state, dict) or "mlp.0.weight" not in names.values():
+    tables = [content.get(f"{kind}_state_dict") for kind in ("actor", "model")] if isinstance(content, dict) else []
+    state: dict[Any, torch.Tensor] = next((table for table in tables if isinstance(table, dict)), {})
+    names = {key: _FORMER_PREFIX.sub(lambda match: _FORMER_NAMES[match[0]], str(key)) for key in state}
+    if "mlp.0.weight" not in names.values():
         got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(
-            f"policy '{path}' is no rsl_rl checkpoint: expected 'actor_state_dict' with 'mlp.0.weight', or "
-            f"'model_state_dict' with 'actor.0.weight', got {got}"
-        )
+        must = "'actor_state_dict' with 'mlp.0.weight', or 'model_state_dict' with 'actor.0.weight'"
+        raise ValueError(f"policy '{path}' is no rsl_rl checkpoint: expected {must}, got {got}")
     separate = content.get("obs_norm_state_dict") or {}
     if not isinstance(separate, dict):
         raise ValueError(f"policy '{path}': obs_norm_state_dict must be a table, got {type(separate).__name__}")
     normaliser = {f"obs_normalizer.{key}": value for key, value in separate.items()}
     names |= {key: key for key in normaliser}
-    if unknown := [key for key, name in names.items() if not re.fullmatch(_KNOWN_NAMES, name)]:
+    if unknown := [str(key) for key, name in names.items() if not re.fullmatch(_KNOWN_NAMES, name)]:
         what = f"has more than a perceptron or a recurrent network: {', '.join(unknown)}"
         raise ValueError(f"policy '{path}' {what}: export it as TorchScript or ONNX")
     statistics = {name.partition(".")[2] for name in names.values() if name.startswith("obs_normalizer.")}
@@ -133,23 +129,16 @@ def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
     return {names[key]: value for key, value in state.items()} | normaliser
 
 
-def _rename(key: str) -> str:
-    prefix = next((prefix for prefix in _FORMER_NAMES if key.startswith(prefix)), "")
-    return _FORMER_NAMES.get(prefix, "") + key.removeprefix(prefix)
-
-
 def _find_activation(content: dict[str, Any], path: Path) -> str:
     """The function between a checkpoint's layers, by its file or by the agent.yaml of its training."""
     ours = str(content.get("format", "")).startswith("faultline") or ("iter" in content and content.keys() <= _ELU_KEYS)
     activation = content.get("activation", "elu" if ours else None)
-    agent = agent_file(path)
-    if activation is None and agent is not None:
+    if activation is None and (agent := agent_file(path)) is not None:
         activation = read_activation(read_yaml(agent))
     if activation is None:
-        raise ValueError(
-            f"policy '{path}' does not say what is between its layers: put the agent.yaml of its training "
-            'beside it, or describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
-        )
+        described = 'describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
+        remedy = f"put the agent.yaml of its training beside it, or {described}"
+        raise ValueError(f"policy '{path}' does not say what is between its layers: {remedy}")
     if not isinstance(activation, str) or activation not in ACTIVATIONS:
         raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")
     return activation
