@@ -73,7 +73,6 @@ API = {
 }
 """Functions and settings for Python by their modules, loaded when they are used; type checkers see them above."""
 
-
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
@@ -91,25 +90,19 @@ def load_command(name: str) -> Any:
     return getattr(importlib.import_module(_BY_NAME[name].module), f"{name.capitalize()}Command")
 
 
-def _print_usage() -> None:
-    from sim.files.command import say
-
-    say("usage: faultline COMMAND [OPTIONS]\n\nFind the terrains that break a legged robot's controller.\n")
-    for title, group in COMMANDS.items():
-        say((f"{title}:", "bold"))
-        for name, command in group.items():
-            say((f"  {name:<12}", "cyan"), command.summary)
-        print()
-    say("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Runs the command that a command line names; returns its exit status, 2 if there is none of that name."""
     from sim.files.command import run_command, say
 
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help", "help"):
-        _print_usage()
+        say("usage: faultline COMMAND [OPTIONS]\n\nFind the terrains that break a legged robot's controller.\n")
+        for title, group in COMMANDS.items():
+            say((f"{title}:", "bold"))
+            for name, command in group.items():
+                say((f"  {name:<12}", "cyan"), command.summary)
+            print()
+        say("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
         return 0
     if name not in _BY_NAME:
         near = difflib.get_close_matches(name, _BY_NAME, n=1)

@@ -17,11 +17,7 @@ HEAVY = ("torch", "warp", "newton", "mujoco", "ribs", "rsl_rl", "matplotlib", "s
 
 def loaded_by(*argv: str) -> tuple[str, set[str]]:
     """What a command line prints, and the heavy packages that it loads, in a process of its own."""
-    script = (
-        "import sys, faultline\n"
-        "try:\n    faultline.main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
-        f"print('LOADED', *[name for name in {HEAVY!r} if name in sys.modules])"
-    )
+    script = f"import sys, faultline; faultline.main(sys.argv[1:]); print('LOADED', *{{*{HEAVY!r}}} & {{*sys.modules}})"
     command = [sys.executable, "-c", script, *argv]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
     text, _, loaded = done.stdout.rpartition("LOADED")

@@ -176,24 +176,21 @@ class Described(torch.nn.Module):
 
         robot_pose = self.robot.default_joint_pos
         moved_pose = [robot_pose[k] for k in self._moved]
-        pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, cfg.default or moved_pose, strict=True))
-        zeros: list[float] = []
-        limits: list[Any] = []
-        scale: list[float] = []
-        for term, columns in zip(cfg.observation, self._columns, strict=True):
-            zeros += [pose[k] if term.term == "joint_pos" else term.offset or 0.0 for k in columns]
-            scale += [*np.broadcast_to(term.scale, len(columns))]
-            sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(columns))
-            limits += [np.clip((-size, size), *_limits(term.clip)) for size in sizes]
-        self._index = [torch.tensor(columns, device=device) for columns in self._columns]
+        default = cfg.default or moved_pose
+        pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, default, strict=True))
+        columns: list[tuple[Any, ...]] = []  # zero, lower and upper limit, and scale
+        for term, indices in zip(cfg.observation, self._columns, strict=True):
+            zeros = [pose[k] if term.term == "joint_pos" else term.offset or 0.0 for k in indices]
+            sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(indices))
+            low, high = np.clip([-sizes, sizes], *_limits(term.clip))
+            columns += zip(zeros, low, high, np.broadcast_to(term.scale, len(indices)), strict=True)
+        self._index = [torch.tensor(indices, device=device) for indices in self._columns]
         self._sensors = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
-        self._zeros = constant(zeros)
-        self._limits = constant(limits).T
-        self._scale = constant(scale)
+        self._zeros, self._low, self._high, self._scale = constant(columns).T
         self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (self.num_actions, 2))).T
         self._joints = torch.tensor(self._moved, device=device)
         self._pose = constant(moved_pose)
-        self._offset = constant(cfg.action_offset or [pose[k] for k in self._moved])
+        self._offset = constant(cfg.action_offset or default)
         self._radians = constant(np.broadcast_to(cfg.action_scale, self.num_actions))
 
     def _refuse(self, problem: str) -> None:
@@ -278,7 +275,7 @@ class Described(torch.nn.Module):
             self._compute_quantity(term, sensed, memory, sensor)[:, index]
             for term, sensor, index in zip(self.cfg.observation, self._sensors, self._index, strict=True)
         ]
-        now = (torch.cat(columns, dim=1) - self._zeros).clamp(*self._limits) * self._scale
+        now = (torch.cat(columns, dim=1) - self._zeros).clamp(self._low, self._high) * self._scale
         now = now if clip is None else now.clamp(-clip, clip)
         history = self.cfg.history
         if history is None:

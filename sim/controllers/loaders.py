@@ -79,7 +79,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
         what = "fails, or acts differently in an episode's first step, beside other rows or after other steps"
         why = "it mixes rows, draws at random, or remembers across a reset"
         raise ValueError(f"policy '{spec}' {what}: {why}: export it without that")
-    if named.file is not None:
+    if named.file is not None and multiprocessing.parent_process() is None:  # a worker's parent warns
         _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
 
@@ -90,9 +90,7 @@ def _warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
         trained = read_json(record)["settings"]["robot_sha256"]
     except (OSError, ValueError, LookupError, TypeError):  # no record, or a damaged one
         return
-    if (
-        trained in (None, robot_digest(robot)) or multiprocessing.parent_process() is not None
-    ):  # a worker's parent warns
+    if trained in (None, robot_digest(robot)):
         return
     now = robot_digest(get_robot(robot.spec))  # a command may have changed its time step or capacities by itself
     if trained != now:
@@ -112,18 +110,19 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
         raise ValueError(f"policy '{spec}' cannot be imported: {in_one_line(error)}; {_EXPECTED}") from error
     if not callable(target):
         raise ValueError(f"policy '{spec}' must be callable, got {type(target).__name__}; {_EXPECTED}")
-    arguments: tuple[Any, ...] = (robot, device)
     if spec.file is not None:
-        arguments = (_load_file(Path(spec.file), robot, device, fits=False), robot)
-    elif not getattr(target, "faultline_factory", False):
-        if inspect.isclass(target):
-            raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; {_EXPECTED}")
+        arguments = {"controller": _load_file(Path(spec.file), robot, device, fits=False), "robot": robot}
+    elif getattr(target, "faultline_factory", False):
+        arguments = {"robot": robot, "device": device}
+    elif inspect.isclass(target):
+        raise ValueError(f"policy '{spec}' is a class: mark it by `faultline_factory = True`; {_EXPECTED}")
+    else:
         return target
     try:
-        policy = target(*arguments)
+        policy = target(*arguments.values())
     except Exception as error:
-        kinds = "robot, device" if spec.file is None else "controller, robot"
-        raise ValueError(f"policy '{spec}' failed, called with ({kinds}): {in_one_line(error)}") from error
+        what = f"failed, called with ({', '.join(arguments)})"
+        raise ValueError(f"policy '{spec}' {what}: {in_one_line(error)}") from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy

@@ -75,7 +75,7 @@ class Recurrent(torch.nn.Module):
         super().__init__()
         self._axis = axis
         self._states: dict[int, list[torch.Tensor]] = {}  # by the number of robots: a graph keeps their addresses
-        copies = [torch.nn.Parameter(state.detach().clone(), requires_grad=False) for state in initial]
+        copies = (torch.nn.Parameter(state.detach().clone(), requires_grad=False) for state in initial)
         self._initial = torch.nn.ParameterList(copies)
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -92,9 +92,8 @@ class Recurrent(torch.nn.Module):
     def reset(self, rows: torch.Tensor) -> None:
         """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
         for initial, state in zip(self._initial, self._get_state(len(rows)), strict=True):
-            robots = state.narrow(self._axis, 0, len(rows))
-            begins = rows.reshape([-1 if axis == self._axis else 1 for axis in range(state.ndim)])
-            robots.copy_(torch.where(begins, initial, robots))
+            robots = state.movedim(self._axis, -1)[..., : len(rows)]
+            robots.copy_(torch.where(rows, initial.movedim(self._axis, -1), robots))
 
     @torch.inference_mode()
     def forward(self, rows: torch.Tensor) -> torch.Tensor:

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import os
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 import msgspec
 
 _TEMPORARY = ".tmp"
-_PROBE = ".write-test"
 
 
 @contextlib.contextmanager
@@ -45,15 +45,13 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 def is_leftover(path: Path) -> bool:
     """Whether a killed write left this file, which the next write replaces."""
-    return path.name == _PROBE or (path.name.startswith(".") and path.name.endswith(_TEMPORARY))
+    return path.name.startswith(".") and path.name.endswith(_TEMPORARY)
 
 
 def check_writable(folder: Path) -> None:
     """Raises a ValueError if files cannot be made in a folder: to be called before long work."""
-    probe = folder / _PROBE
     try:
-        probe.touch()
-        probe.unlink(missing_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise ValueError(f"{folder} cannot be written to: {error.strerror}: give another place") from None
 

@@ -61,12 +61,11 @@ def bootstrap_interval(
     """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
     One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
-    Terrains of one family, by their numbers (num_terrains,), are not independent: they are drawn together. The fewer
-    families, the farther out are the quantiles (the expanded percentile interval of Hesterberg 2015).
+    Terrains of one family, by their numbers (num_terrains,), are drawn together. The fewer families, the farther out
+    are the quantiles (the expanded percentile interval of Hesterberg 2015).
 
-    If nearly all values are equal, such as rates of 1, the terrains may lack rare values, and so do the resamples. With
-    ``bounds``, :data:`RATES` or :data:`DIFFERENCES`, the interval is then at least as wide as Wilson's for so many
-    families; for differences its ends are combined after Newcombe (1998, method 10).
+    Where nearly all values are equal, resamples lack rare ones. With ``bounds``, :data:`RATES` or :data:`DIFFERENCES`,
+    the interval is then at least as wide as Wilson's, for differences combined after Newcombe (1998, method 10).
     """
     family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
     count = int(family.max(initial=-1)) + 1
@@ -77,9 +76,9 @@ def bootstrap_interval(
     tail = ndtr(-stdtrit(count - 1, 0.975) * math.sqrt(count / (count - 1)))
     low, high = np.quantile(means, [tail, 1.0 - tail])
     if bounds is not None:
-        widest = _bound_rare(values, family, count, bounds)
-        low = min(low, widest[0])
-        high = max(high, widest[1])
+        lowest, highest = _bound_rare(values, family, count, bounds)
+        low = min(low, lowest)
+        high = max(high, highest)
     return [float(low), float(high)]
 
 

@@ -25,7 +25,7 @@ _SOURCES = (".py", ".cu", ".xml")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
-    """Command, commit, hash of the sources, device, versions, seed and date of the running program.
+    """Command (by :func:`without_machine`), commit, hash of the sources, device, versions, seed and date of a result.
 
     ``dirty`` says whether sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT names
     the commit where there is no git, and ends in -dirty if they differ.
@@ -38,8 +38,11 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
         changes = _run(["git", "status", "--porcelain", "--untracked-files=no", "--", *folders])
         commit = _run(["git", "rev-parse", "HEAD"])
         dirty = None if changes is None else changes != ""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
+    program = ["faultline"] if module == "faultline" else ["python", "-m", module]
     return {
-        "command": _command(),
+        "command": shlex.join([*program, *map(without_machine, sys.argv[1:])]),
         "commit": commit,
         "sources_sha256": sources_sha256(),
         "dirty": dirty,
@@ -69,14 +72,6 @@ def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
 def code_fingerprint(rooms: Sequence[str]) -> str:
     """SHA-256 of the sources of rooms and of all package versions; equal ones compute the same."""
     return hashlib.sha256(json.dumps([sources_sha256(rooms), versions()], sort_keys=True).encode()).hexdigest()
-
-
-def _command() -> str:
-    """The running command as a user types it, by :func:`without_machine`."""
-    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    module = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).stem
-    program = ["faultline"] if module == "faultline" else ["python", "-m", module]
-    return shlex.join([*program, *map(without_machine, sys.argv[1:])])
 
 
 def without_machine(argument: str) -> str:

@@ -30,10 +30,7 @@ Settings = TypeVar("Settings")
 
 
 def problems(settings: Any, prefix: str = "") -> list[str]:
-    """What is wrong with the values of a settings dataclass and of those inside it: a line each, its field first.
-
-    The prefix stands before each field's name, for example ``task.``.
-    """
+    """What is wrong with the values of a settings dataclass and those in it: a line each, prefix and field first."""
     lines: list[str] = []
     for setting in fields(settings):
         name = f"{prefix}{setting.name}"
@@ -60,12 +57,11 @@ def from_builtins(cls: type[Settings], data: Any, name: str) -> Settings:
     """A settings dataclass of JSON values by the names of its fields; an error calls it ``name``."""
     try:
         settings = msgspec.convert(data, cls, dec_hook=lambda kind, value: kind(value))
-    except (msgspec.ValidationError, TypeError) as error:
+        check_settings(settings)
+    except (ValueError, TypeError) as error:  # msgspec's errors are ValueErrors
         raise ValueError(f"{name}: {error}") from None
     if unknown := list(_unknown(data, settings)):
         raise ValueError(f"{name} has no setting {'; and no '.join(unknown)}")
-    if lines := problems(settings):
-        raise ValueError(f"{name}: {'; '.join(lines)}")
     return settings
 
 

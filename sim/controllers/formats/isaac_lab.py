@@ -47,7 +47,12 @@ class IsaacLab:
         source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
         _read_actuators(articulation["actuators"], source)
         source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
-        _read_speed(env, source)
+        commands = [command for command in (env.get("commands") or {}).values() if isinstance(command, dict)]
+        ranges = [command.get("ranges") or {} for command in commands]
+        speed = next((limits["lin_vel_x"][1] for limits in ranges if "lin_vel_x" in limits), 0.0)
+        if 0.0 < speed < RobotCfg.speed:
+            source.set(speed=speed, reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
+            source.set(max_duration_s=round(15.0 / speed, 1), reason="in proportion")
         joint_order = _read_action(env["actions"], path, source)
         group = env["observations"]["policy"]
         terms = {name: term for name, term in group.items() if isinstance(term, dict)}
@@ -105,16 +110,6 @@ def _read_actuators(groups: dict[str, Any], source: Source) -> None:
         spans = ", ".join(f"{name} ({shortest} to {longest})" for name, (shortest, longest) in delays.items())
         mean = int(np.mean([*delays.values()]) + 0.5)
         source.set(drive_delay_steps=mean, reason=f"the mean of the delays of {spans}")
-
-
-def _read_speed(env: dict[str, Any], source: Source) -> None:
-    """A speed below the usual one, and the time that it takes."""
-    commands = [command for command in (env.get("commands") or {}).values() if isinstance(command, dict)]
-    ranges = [command.get("ranges") or {} for command in commands]
-    speeds = [limits["lin_vel_x"][1] for limits in ranges if "lin_vel_x" in limits]
-    if speeds and 0.0 < speeds[0] < RobotCfg.speed:
-        source.set(speed=speeds[0], reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
-        source.set(max_duration_s=round(15.0 / speeds[0], 1), reason="in proportion")
 
 
 def _match_joints(patterns: Any, joints: Sequence[str], keep_pattern_order: Any = False) -> list[str]:

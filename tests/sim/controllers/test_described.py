@@ -5,15 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
-import warp as wp
-from rsl_rl.models import RNNModel
-from tensordict import TensorDict
 
 from sim.controllers.described import Described, read_controller
 from sim.controllers.loaders import load_policy, prepare_torch
-from sim.controllers.runner import PolicyRunner
 from sim.controllers.spec import ControllerSpec, controller_hash
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
+from tests.sim.controllers.test_loaders import recurrent_actor, runner_on
 
 OURS = """{term = "lin_vel", scale = 2.0}, {term = "ang_vel", scale = 0.25}, {term = "gravity"},
   {term = "command", scale = [2, 2, 0.25]}, {term = "joint_pos"}, {term = "joint_vel", scale = 0.05},
@@ -120,11 +117,9 @@ def test_the_past_is_laid_out_as_described(seen_by, layout, expected):
 
 
 def test_a_term_may_have_a_past_of_its_own(seen_by):
-    seen, _ = seen_by(
-        [torch.full((1, OBSERVATIONS), 1.0), torch.full((1, OBSERVATIONS), 2.0)],
-        '{term = "gravity", history = 2}, {term = "lin_vel", scale = 2.0}',
-        'history = {length = 1, newest = "last", by = "term", fill = "zeros"}',
-    )
+    steps = [torch.full((1, OBSERVATIONS), value) for value in (1.0, 2.0)]
+    terms = '{term = "gravity", history = 2}, {term = "lin_vel", scale = 2.0}'
+    seen, _ = seen_by(steps, terms, 'history = {length = 1, newest = "last", by = "term", fill = "zeros"}')
     np.testing.assert_array_equal(seen[1, 0], [1, 1, 1, 2, 2, 2, 2, 2, 2])
 
 
@@ -140,14 +135,10 @@ def remembering(tmp_path, describe):
 @pytest.fixture(params=["perceptron", "lstm", "script"])
 def network(request, tmp_path, remembering):
     """Its weights: a perceptron, an LSTM, or an LSTM exported for one robot."""
-    if request.param == "perceptron":
-        return
-    torch.manual_seed(1)
-    row = TensorDict({"policy": torch.zeros(1, 3 * 29)}, batch_size=1)
-    actor = RNNModel(row, {"a": ["policy"]}, "a", ACTIONS, (16,), rnn_hidden_dim=8).eval()
+    actor = recurrent_actor(3 * 29)
     if request.param == "lstm":
         save_checkpoint(tmp_path / "weights.pt", actor.state_dict())
-    else:
+    elif request.param == "script":
         torch.jit.script(actor.as_jit().eval()).save(str(tmp_path / "weights.pt"))
 
 
@@ -158,25 +149,21 @@ def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
     prepare_torch(device)
     policy = load_policy(remembering, anymal, device)
     assert policy.graph_safe
-    count, steps = 5, torch.randn((12, 5, OBSERVATIONS), generator=torch.Generator().manual_seed(2))
-    observation, action = (wp.zeros((count, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
-    begins = wp.zeros(count, dtype=int, device=device)
-    runner, together = PolicyRunner(policy, observation, action, begins), []
+    steps, robots = rows_of(12, 5), np.arange(5)
+    runner, observation, action, begins = runner_on(policy, steps[0].numpy(), device)
+    together = []
     for k, rows in enumerate(steps):
         observation.assign(rows.numpy())
-        begins.assign([k == 0 or k % (robot + 3) == 0 for robot in range(count)])
+        begins.assign(k % (robots + 3) == 0)
         runner()
         together.append(action.numpy().copy())
     alone = load_policy(remembering, anymal, "cpu")
-    for robot in range(count):
+    near = {"rtol": 0.0, "atol": 0.0} if device == "cpu" else {"rtol": 2e-3, "atol": 5e-3}  # TF32
+    for robot in robots:
         for k, rows in enumerate(steps):
-            if k == 0 or k % (robot + 3) == 0:
+            if k % (robot + 3) == 0:
                 alone.reset(torch.ones(1, dtype=torch.bool))
-            action = alone(rows[robot : robot + 1])[0].numpy()
-            if device == "cpu":
-                np.testing.assert_array_equal(together[k][robot], action)
-            else:
-                np.testing.assert_allclose(together[k][robot], action, rtol=2e-3, atol=5e-3)  # TF32
+            np.testing.assert_allclose(together[k][robot], alone(rows[robot : robot + 1])[0].numpy(), **near)
 
 
 @pytest.mark.parametrize(

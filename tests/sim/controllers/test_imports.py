@@ -17,6 +17,7 @@ from tests.sim.dogs import JOINTS, mjcf
 RIGHT_FIRST = ["FR_hip", "FR_knee", "FL_hip", "FL_knee", "HR_hip", "HR_knee", "HL_hip", "HL_knee"]
 POSE = [0.6, -1.2, 0.5, -1.1] * 2  # of the right and the left legs
 IN_FILE = (0.5, -1.1, 0.6, -1.2) * 2
+BLIND_WITH_CLOCK = ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
 HIPS_FIRST = tuple(f"{leg}_{joint}" for joint in ("hip", "knee") for leg in ("FL", "FR", "HL", "HR"))
 RL_SAR = {
     "model_name": "policy.pt", "observations": ["ang_vel", "gravity_vec", "commands", "dof_pos", "dof_vel", "actions"],
@@ -78,28 +79,27 @@ observations:
 """
 
 
-def write_yaml(file, content):
+def write(file, content):
+    """Settings as YAML, or a layer of so many columns; returns the file."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(yaml.safe_dump(content))
+    if isinstance(content, int):
+        torch.jit.script(torch.nn.Linear(content, 8)).save(str(file))
+    else:
+        file.write_text(content if isinstance(content, str) else yaml.safe_dump(content))
     return file
-
-
-def write_weights(file, width):
-    file.parent.mkdir(parents=True, exist_ok=True)
-    torch.jit.script(torch.nn.Linear(width, 8)).save(str(file))
 
 
 def rl_sar(folder, width=2 * 33, **changes):
     base = {"dt": 0.005, "decimation": 4, "joint_names": list(JOINTS), "rl_kp": [1.0] * 8, "num_of_dofs": 8}
-    write_yaml(folder / "base.yaml", {"dog": base})
-    write_yaml(folder / "lab" / "config.yaml", {"dog/lab": RL_SAR | changes})
-    write_weights(folder / "lab" / "policy.pt", width)
+    write(folder / "base.yaml", {"dog": base})
+    write(folder / "lab" / "config.yaml", {"dog/lab": RL_SAR | changes})
+    write(folder / "lab" / "policy.pt", width)
     return folder / "lab"
 
 
 def deployment(folder, **changes):
-    write_weights(folder / "policy.pt", 35)
-    return write_yaml(folder / "dog.yaml", DEPLOYMENT | changes)
+    write(folder / "policy.pt", 35)
+    return write(folder / "dog.yaml", DEPLOYMENT | changes)
 
 
 def mjlab(folder, apart=False, **changes):
@@ -111,10 +111,9 @@ def mjlab(folder, apart=False, **changes):
 
 def isaac_lab(folder, old="", new=""):
     assert old in ISAAC
-    (folder / "params").mkdir(parents=True)
-    (folder / "params" / "env.yaml").write_text(ISAAC.replace(old, new))
-    (folder / "params" / "agent.yaml").write_text("clip_actions: 5.0\npolicy: {activation: relu}\n")
-    write_weights(folder / "exported" / "policy.pt", 3 + 3 + 8 + 8 + 6)
+    write(folder / "params" / "env.yaml", ISAAC.replace(old, new))
+    write(folder / "params" / "agent.yaml", {"clip_actions": 5.0, "policy": {"activation": "relu"}})
+    write(folder / "exported" / "policy.pt", 3 + 3 + 8 + 8 + 6)
     return folder
 
 
@@ -131,10 +130,6 @@ def imported(source, tmp_path):
     return robot, read_controller(out / "controller.toml")
 
 
-def tags(controller):
-    return [term.term for term in controller.observation]
-
-
 def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):
     source = rl_sar(tmp_path / "policy", 2 * 35, observations=[*RL_SAR["observations"], "g1_phase"])
     robot, controller = imported(source, tmp_path)
@@ -143,7 +138,7 @@ def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):
     assert (controller.joints, controller.action_scale) == (tuple(RIGHT_FIRST), (0.125, 0.25) * 4)
     assert (controller.action_clip, controller.observation_clip) == (9.0, 100.0)
     assert vars(controller.history) == {"length": 2, "newest": "first", "by": "row", "fill": "zeros"}
-    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
+    assert [term.term for term in controller.observation] == BLIND_WITH_CLOCK
     assert [term.scale for term in controller.observation] == [0.25, 1.0, (2.0, 2.0, 0.25), 1.0, 1.0, 1.0, 1.0]
     assert controller.observation[-1].period_s == 0.8
 
@@ -151,7 +146,7 @@ def test_rl_sar_is_read_over_the_base_of_its_robot(tmp_path):
 def test_a_deployment_of_unitree_has_its_scripts_observation(tmp_path):
     robot, controller = imported(deployment(tmp_path), tmp_path)
     assert (robot.physics_dt, robot.decimation, robot.stiffness) == (0.002, 10, (100, 150) * 4)
-    assert tags(controller) == ["ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action", "clock"]
+    assert [term.term for term in controller.observation] == BLIND_WITH_CLOCK
     assert (controller.joints, controller.observation[-1].period_s) == (None, 0.8)
     with pytest.raises(ValueError, match="--out"):  # which is not written over
         imported(tmp_path / "dog.yaml", tmp_path)
@@ -172,7 +167,7 @@ def test_a_run_of_isaac_lab_is_read(tmp_path):
     assert (robot.effort_limit, robot.speed, robot.max_duration_s) == ((20.0, 30.0) * 4, 0.5, 30.0)
     assert robot.saturation_effort is None and robot.velocity_limit is None  # which without a motor mean nothing here
     assert (controller.joints, controller.action_scale) == (HIPS_FIRST, (0.125,) * 4 + (0.25,) * 4)
-    assert tags(controller) == ["ang_vel", "command", "joint_pos", "last_action", "scan"]
+    assert [term.term for term in controller.observation] == ["ang_vel", "command", "joint_pos", "last_action", "scan"]
     # 0.4 m by 0.2 m in steps of 0.2 m about a point 0.1 m ahead.
     assert (robot.scan_x, robot.scan_y) == ((-0.1, 0.1, 0.3), (-0.1, 0.1))
     scan = controller.observation[-1]
@@ -194,8 +189,7 @@ def test_motors_and_delays_of_isaac_lab_are_kept(tmp_path, capsys):
 
 def test_descriptors_say_the_order_of_joints(tmp_path):
     run = isaac_lab(tmp_path / "run", ":base_ang_vel", ":base_lin_vel")
-    articulations = {"robot": {"joint_names": RIGHT_FIRST}}
-    write_yaml(run / "exported" / "x_IO_descriptors.yaml", {"articulations": articulations})
+    write(run / "exported/x_IO_descriptors.yaml", {"articulations": {"robot": {"joint_names": RIGHT_FIRST}}})
     _, controller = imported(run, tmp_path)
     assert controller.joints == tuple(RIGHT_FIRST)
     assert controller.observation[0].at == (0.0, 0.0, 0.0)  # the trunk's centre of mass
@@ -209,25 +203,23 @@ def test_other_weights_are_never_taken_and_a_training_says_what_is_between_layer
     with pytest.raises(ValueError, match="no gains"):  # which are to be filled in
         imported(tmp_path / "model_9.pt", tmp_path)
     assert 'activation = "tanh"' in (folder / "controller.toml").read_text()
-    for name in ("robot", "controller"):
-        (folder / f"{name}.toml").unlink()
+    for file in folder.glob("*.toml"):
+        file.unlink()
     (folder / "model_9.pt").write_bytes(b"older")
     with pytest.raises(ValueError, match=r"dog/model_9\.pt must be a copy"):
         imported(tmp_path / "model_9.pt", tmp_path)
 
 
 def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
-    torch.jit.script(torch.nn.Linear(36, 8)).save(str(tmp_path / "policy.pt"))
     with pytest.raises(ValueError, match=r"no gains for FL_hip"):
-        imported(tmp_path / "policy.pt", tmp_path)
+        imported(write(tmp_path / "policy.pt", 36), tmp_path)
     assert "Fill in default_joint_pos, stiffness, damping, action_scale, observation" in capsys.readouterr().out
-    folder = tmp_path / "mine" / "dog"
-    lines = [line for name in ("robot", "controller") for line in (folder / f"{name}.toml").read_text().splitlines()]
+    lines = [line for file in (tmp_path / "mine" / "dog").glob("*.toml") for line in file.read_text().splitlines()]
     assert len(lines) <= 12 and any("its 36 columns" in line for line in lines)
 
 
 @pytest.mark.parametrize(
-    ("write", "change", "named"),
+    ("write_source", "change", "named"),
     [
         (rl_sar, {"gait": 3}, "gait"),
         (rl_sar, {"wheel_indices": [3]}, "wheel_indices"),
@@ -252,10 +244,9 @@ def test_what_nobody_says_is_left_to_be_filled_in(tmp_path, capsys):
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
     ],
 )
-def test_what_is_not_understood_is_refused_by_its_name(tmp_path, write, change, named):
-    folder = tmp_path / "source"
-    folder.mkdir()
-    source = write(folder / "run" if write is isaac_lab else folder, **change)
+def test_what_is_not_understood_is_refused_by_its_name(tmp_path, write_source, change, named):
+    (tmp_path / "source").mkdir()
+    source = write_source(tmp_path / "source", **change)
     with pytest.raises(ValueError, match=re.escape(named)):
         imported(source, tmp_path)
     assert not (tmp_path / "mine").exists()

@@ -1,15 +1,19 @@
-"""Controllers from files: what is accepted (that nothing in them runs: tests/kills); and the runner that calls them."""
+"""Controllers from files: what is accepted (that nothing in them runs: tests/kills), whose training it is, what they
+remember; and the runner that calls them."""
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from rsl_rl.models import RNNModel
+from tensordict import TensorDict
 
 from sim.controllers.loaders import load_policy, prepare_torch
-from sim.controllers.runner import PolicyRunner
-from tests.builders import ACTIONS, OBSERVATIONS, rsl_rl_actor, save_checkpoint
+from sim.controllers.runner import Memory, PolicyRunner, find_memory
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
 
 STATE = rsl_rl_actor().state_dict()
+ACTOR = rsl_rl_actor(normalised=True).state_dict()
 CHECKPOINTS = {
     "another robot's rows": rsl_rl_actor(48).state_dict(),
     "NaN": STATE | {"mlp.0.bias": STATE["mlp.0.bias"] * float("nan")},
@@ -17,6 +21,49 @@ CHECKPOINTS = {
     "a layer that does not fit": STATE | {"mlp.2.weight": torch.zeros(16, 31)},
     "no multilayer perceptron": {"rnn.weight": torch.zeros(2)},
 }
+
+
+def runner_on(policy, rows, device="cpu"):
+    """A runner, the rows that it sees, its actions, and where episodes begin: nowhere at first."""
+    with wp.ScopedDevice(device):
+        buffers = (
+            wp.array(rows, dtype=float),
+            wp.zeros((len(rows), ACTIONS), dtype=float),
+            wp.zeros(len(rows), dtype=int),
+        )
+    return PolicyRunner(policy, *buffers), *buffers
+
+
+def recurrent_actor(width, *, rnn_type="lstm", layers=1, normalised=False):
+    """rsl_rl's own recurrent actor, with a normaliser that has seen 64 rows if it has one."""
+    torch.manual_seed(3)
+    rows = TensorDict({"policy": rows_of(64)[:, :width]}, batch_size=64)
+    options = {"rnn_type": rnn_type, "rnn_hidden_dim": 8, "rnn_num_layers": layers}
+    actor = RNNModel(rows, {"actor": ["policy"]}, "actor", ACTIONS, (16,), "elu", normalised, **options)
+    if normalised:
+        actor.train()
+        actor.obs_normalizer.update(rows["policy"])
+    return actor.eval()
+
+
+def rename(state, names):
+    """The tensors whose names begin with a key of ``names``, which becomes its value."""
+    return {new + key.removeprefix(old): value for old, new in names.items() for key, value in state.items()
+            if key.startswith(old)}  # fmt: skip
+
+
+def old_checkpoints():
+    """The same actor as rsl_rl 1 or 2, with a normaliser of its own, and 3 or 4 keep it."""
+    critic = {"critic.0.weight": torch.zeros(16, 9), "critic.0.bias": torch.zeros(16)}
+    layers = rename(ACTOR, {"mlp.": "actor."}) | critic
+    bare = rename(ACTOR, {"obs_normalizer.": ""})
+    named = rename(ACTOR, {"obs_normalizer.": "actor_obs_normalizer."})
+    rest = {"optimizer_state_dict": {}, "iter": 3, "infos": None}
+    return {
+        "2": {"model_state_dict": layers | {"std": torch.ones(12)}, "obs_norm_state_dict": bare} | rest,
+        "3": {"model_state_dict": layers | named | {"log_std": torch.ones(12)}} | rest,
+        "5": {"actor_state_dict": ACTOR, "critic_state_dict": {}} | rest,
+    }
 
 
 @pytest.mark.parametrize("state", CHECKPOINTS.values(), ids=CHECKPOINTS)
@@ -32,26 +79,139 @@ def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4  # among the weights
-    for content in (b"", whole[: len(whole) // 2], whole[:-9], bytes(flipped), b"\x80\x02.", b"hello\n"):
+    contents = [b"", whole[: len(whole) // 2], whole[:-9], bytes(flipped), b"\x80\x02.", b"hello\n"]
+    for content in ({"model_state_dict": {}, "iter": 3}, {"model_state_dict": 3}, torch.zeros(3)):
+        torch.save(content, path)
+        contents.append(path.read_bytes())
+    for other in (torch.nn.Linear(169, 10), torch.nn.LSTM(OBSERVATIONS, ACTIONS)):  # which returns its state too
+        torch.jit.script(other).save(str(path))
+        contents.append(path.read_bytes())
+    for content in contents:
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"model\.pt") as raised:
             load_policy(path, anymal, "cpu")
         assert "internal miniz" not in str(raised.value) and ":callable" not in str(raised.value)
-    for content in ({"model_state_dict": {}, "iter": 3}, torch.zeros(3)):
-        torch.save(content, path)
-        with pytest.raises(ValueError, match=r"model\.pt"):
-            load_policy(path, anymal, "cpu")
-    for other in (torch.nn.Linear(169, 10), torch.nn.LSTM(OBSERVATIONS, ACTIONS)):  # which returns its state too
-        torch.jit.script(other).save(str(path))
-        with pytest.raises(ValueError, match=r"model\.pt"):
-            load_policy(path, anymal, "cpu")
     with pytest.raises(ValueError, match=r"gone\.pt"):
         load_policy(tmp_path / "gone.pt", anymal, "cpu")
 
 
-def runner_of(policy, observation, action):
-    """A runner in the middle of episodes: none begins."""
-    return PolicyRunner(policy, observation, action, wp.zeros(len(action), dtype=int, device=action.device))
+@pytest.mark.parametrize(("version", "file"), [("2", "agent.yaml"), ("3", "params/agent.yaml"), ("5", "agent.yaml")])
+def test_a_checkpoint_of_any_rsl_rl_acts_as_its_training_says(tmp_path, anymal, version, file):
+    path, agent = tmp_path / "model_9.pt", tmp_path / file
+    torch.save(old_checkpoints()[version], path)
+    with pytest.raises(ValueError, match=r"model_9\.pt.*agent\.yaml"):  # it does not say what is between its layers
+        load_policy(path, anymal, "cpu")
+    agent.parent.mkdir(exist_ok=True)
+    tags = "range: !!python/tuple [0, 1]\nact: !!python/name:torch.nn.Tanh\n"
+    agent.write_text(f"{tags}{'actor' if version == '5' else 'policy'}:\n  class_name: X\n  activation: tanh\n")
+    rows = rows_of(4)
+    x = (rows - ACTOR["obs_normalizer._mean"]) / (ACTOR["obs_normalizer._std"] + 1e-2)
+    for k in (0, 2, 4):
+        x = x @ ACTOR[f"mlp.{k}.weight"].T + ACTOR[f"mlp.{k}.bias"]
+        x = torch.tanh(x) if k < 4 else x
+    torch.testing.assert_close(load_policy(path, anymal, "cpu")(rows).detach(), x, rtol=1e-5, atol=1e-5)
+    agent.write_text("policy: {activation: !!python/object/apply:os.system [exit]}")
+    with pytest.raises(ValueError, match="activation"):
+        load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize(
+    "key", ["student.0.weight", "estimator.0.bias", "actor.1.running_mean", "obs_normalizer.running_mean"]
+)
+def test_what_is_no_part_of_a_known_network_is_refused_by_name(tmp_path, anymal, key):
+    content = old_checkpoints()["2"]
+    table = "obs_norm_state_dict" if "normalizer" in key else "model_state_dict"
+    content[table][key.removeprefix("obs_normalizer.")] = torch.zeros(3)
+    for state, named in ((content, key), (content | {"obs_norm_state_dict": [1.0]}, "obs_norm_state_dict .* list")):
+        torch.save(state | {"activation": "elu"}, tmp_path / "model.pt")
+        with pytest.raises(ValueError, match=rf"model\.pt.*{named}"):
+            load_policy(tmp_path / "model.pt", anymal, "cpu")
+
+
+@pytest.fixture(scope="module", params=["lstm", "gru"])
+def recurrent(request):
+    """rsl_rl's own recurrent actor of two layers, with a normaliser; and what it does with 12 steps of 5 robots."""
+    actor = recurrent_actor(OBSERVATIONS, rnn_type=request.param, layers=2, normalised=True)
+    steps = rows_of(12, 5)
+    with torch.inference_mode():
+        expected = [actor(TensorDict({"policy": step}, batch_size=5)) for step in steps]
+    return actor, steps, torch.stack(expected)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit", "ignore:.torch.onnx", "ignore:You are using the legacy")
+@pytest.mark.parametrize("kind", ["checkpoint", "script", "onnx"])
+def test_what_remembers_one_robot_remembers_any_number_apart(tmp_path, anymal, recurrent, kind):
+    actor, steps, expected = recurrent
+    path = tmp_path / ("policy.onnx" if kind == "onnx" else "policy.pt")
+    if kind == "checkpoint":  # of rsl_rl 3
+        names = {"rnn.rnn.": "memory_a.rnn.", "mlp.": "actor.", "obs_normalizer.": "actor_obs_normalizer."}
+        torch.save({"model_state_dict": rename(actor.state_dict(), names), "activation": "elu"}, path)
+    elif kind == "script":
+        torch.jit.script(actor.as_jit().eval()).save(str(path))
+    else:
+        model = actor.as_onnx(False).eval()
+        names = {"input_names": model.input_names, "output_names": model.output_names}
+        torch.onnx.export(model, model.get_dummy_inputs(), str(path), **names, opset_version=18, dynamo=False)
+    policy = load_policy(path, anymal, "cpu")
+    assert find_memory(policy) is Memory.PER_ROBOT
+    policy.reset(torch.ones(5, dtype=torch.bool))
+    for step, actions in zip(steps, expected, strict=True):
+        torch.testing.assert_close(policy(step), actions, rtol=1e-4, atol=1e-5)
+    policy.reset(torch.tensor([False, True, False, False, True]))  # these two begin again
+    again = torch.stack([policy(step) for step in steps])
+    torch.testing.assert_close(again[:, [1, 4]], expected[:, [1, 4]], rtol=1e-4, atol=1e-5)
+    assert (again - expected)[:, [0, 2, 3]].abs().amax() > 1e-3
+    alone = []
+    for count in (1, 3, 40):  # bit for bit beside any others
+        policy.reset(torch.ones(count, dtype=torch.bool))
+        alone.append(torch.stack([policy(step[:1].expand(count, -1))[0] for step in steps]))
+    assert torch.equal(alone[0], alone[1]) and torch.equal(alone[0], alone[2])
+
+
+class Exported(torch.nn.Module):
+    """A layer as exporters write it, with a ``reset`` that does nothing, or a memory."""
+
+    def __init__(self, kind: str):
+        super().__init__()
+        self.kind, self.layer = kind, torch.nn.Linear(OBSERVATIONS, ACTIONS)
+        self.last = torch.nn.Buffer(torch.zeros(1, OBSERVATIONS))
+        self.calls: int = 0
+
+    @torch.jit.export
+    def reset(self) -> None:
+        if self.kind == "averages":
+            self.last[:] = 0.0
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.kind == "averages":
+            self.last[:] = 0.5 * self.last + 0.5 * x
+            return self.layer(self.last)
+        if self.kind == "counts":
+            self.calls += 1
+            return self.layer(x) * float(max(self.calls, 9))
+        if self.kind == "the first row's":
+            assert len(self.last) == 1  # whose error is of a kind of its own
+            self.last[:] = 0.5 * self.last + 0.5 * x[:1]
+            return self.layer(x + self.last[:1])
+        return self.layer(x)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
+    def load(kind):
+        torch.manual_seed(0)
+        torch.jit.script(Exported(kind)).save(str(tmp_path / f"{kind}.pt"))
+        return load_policy(tmp_path / f"{kind}.pt", anymal, "cpu")
+
+    assert find_memory(load("plain")) is Memory.NONE
+    averages, rows = load("averages"), rows_of(4)
+    assert find_memory(averages) is Memory.PER_ROBOT
+    torch.manual_seed(0)
+    layer = Exported("plain").layer
+    torch.testing.assert_close(averages(rows), layer(rows / 2).detach(), rtol=1e-4, atol=1e-5)
+    for kind, named in (("the first row's", r"row's\.pt.* last"), ("counts", r"counts\.pt.* other steps")):
+        with pytest.raises(ValueError, match=named):
+            load(kind)
 
 
 def test_a_robots_action_is_the_same_bit_for_bit_beside_any_others(anymal):
@@ -60,8 +220,8 @@ def test_a_robots_action_is_the_same_bit_for_bit_beside_any_others(anymal):
     policy, actions = load_policy(anymal.policy_file, anymal, "cpu"), {}
     prepare_torch("cpu")
     for count in (*range(1, 40), 100):
-        action = wp.zeros((count, ACTIONS), dtype=float, device="cpu")
-        runner_of(policy, wp.array(rows[:count], dtype=float, device="cpu"), action)()
+        runner, _, action, _ = runner_on(policy, rows[:count])
+        runner()
         actions[count] = action.numpy()
         with torch.inference_mode():  # as one that calls it in Python does
             np.testing.assert_array_equal(policy(torch.from_numpy(rows[:count])), actions[count])
@@ -78,8 +238,7 @@ def test_a_controller_may_keep_and_change_its_row():
         row += 1.0
         return row[:, :ACTIONS]
 
-    observation, action = (wp.full((5, size), 0.5, dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
-    runner = runner_of(policy, observation, action)
+    runner, observation, action, _ = runner_on(policy, np.full((5, OBSERVATIONS), 0.5))
     runner()
     np.testing.assert_array_equal(observation.numpy(), 0.5)
     observation.fill_(-1.0)
@@ -89,7 +248,7 @@ def test_a_controller_may_keep_and_change_its_row():
 
 
 @pytest.mark.parametrize(
-    ("policy", "words"),
+    ("policy", "named"),
     [
         (lambda row: torch.zeros(1, ACTIONS), r"\(1, 12\)"),
         (lambda row: torch.zeros(5, ACTIONS, dtype=torch.complex64), "complex64"),
@@ -99,7 +258,7 @@ def test_a_controller_may_keep_and_change_its_row():
         (lambda row: row.no_such_name, r"AttributeError: .*test_loaders\.py, line \d+\)$"),
     ],
 )
-def test_what_goes_wrong_in_a_crossing_is_named(policy, words):
-    observation, action = (wp.zeros((5, size), dtype=float, device="cpu") for size in (OBSERVATIONS, ACTIONS))
-    with pytest.raises(ValueError, match=words):
-        runner_of(policy, observation, action)()
+def test_what_goes_wrong_in_a_crossing_is_named(policy, named):
+    runner, *_ = runner_on(policy, np.zeros((5, OBSERVATIONS)))
+    with pytest.raises(ValueError, match=named):
+        runner()

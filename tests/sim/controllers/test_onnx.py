@@ -5,19 +5,17 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-import warp as wp
 from onnx import TensorProto, helper, numpy_helper
 
 from sim.controllers.formats.onnx import export_onnx, load_onnx
 from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_actor, load_policy
-from sim.controllers.runner import PolicyRunner, is_graph_safe
+from sim.controllers.runner import is_graph_safe
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
+from tests.sim.controllers.test_loaders import runner_on
 
-FLOAT, DOUBLE = TensorProto.FLOAT, TensorProto.DOUBLE
 
-
-def port(name, shape, kind=FLOAT):
+def port(name, shape, kind=TensorProto.FLOAT):
     return helper.make_tensor_value_info(name, kind, shape)
 
 
@@ -51,8 +49,8 @@ def chain(last, bound=False):
         "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
         "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
     )  # fmt: skip
-    words = [(before.split(), after.split()) for before, after in (step.split(" > ") for step in steps)]
-    nodes = [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in words]
+    ends = [[end.split() for end in step.split(" > ")] for step in steps]
+    nodes = [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in ends]
     nodes[-2].attribute.append(helper.make_attribute("axis", -1))
     tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
     return graph_model(nodes, [port("obs", [1, width])], [port("actions", [1, ACTIONS])], tensors), weights
@@ -71,8 +69,7 @@ def test_it_acts_as_its_weights_say_captured_if_its_operators_are_known(tmp_path
     model, weights = chain(last)
     policy = load_policy(str(save(tmp_path / "policy.onnx", model)), anymal, device)
     assert is_graph_safe(policy) == (last == "Tanh")
-    observation, action = (wp.zeros((33, size), dtype=float, device=device) for size in (OBSERVATIONS, ACTIONS))
-    runner = PolicyRunner(policy, observation, action, wp.zeros(33, dtype=int, device=device))
+    runner, observation, action, _ = runner_on(policy, rows_of(33).numpy(), device)
     for rows in (rows_of(33).numpy(), -rows_of(33).numpy()):
         observation.assign(rows)
         runner()
@@ -83,13 +80,11 @@ def test_it_acts_as_its_weights_say_captured_if_its_operators_are_known(tmp_path
         np.testing.assert_allclose(action.numpy(), function(out[:, :ACTIONS]), **near)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_path, anymal, known):
-    model = linear(columns="columns") if known else chain("Softsign")[0]
+@pytest.mark.parametrize("model", [linear(columns="columns"), chain("Softsign")[0]], ids=["torch", "onnxruntime"])
+def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_path, anymal, model):
     policy = load_policy(save(tmp_path / "policy.onnx", model), anymal, "cpu")
-    together = policy(rows_of(60))
     for size in (1, 4, 7, 20):
-        assert torch.equal(torch.cat([policy(part) for part in rows_of(60).split(size)]), together), size
+        assert torch.equal(torch.cat([policy(rows) for rows in rows_of(60).split(size)]), policy(rows_of(60))), size
 
 
 def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
@@ -99,28 +94,28 @@ def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
     torch.testing.assert_close(bound(rows_of(7)), known(rows_of(7)), rtol=1e-4, atol=1e-4)
 
 
+def identity(**shapes):
+    """A graph that returns its inputs, each of them called ``..._x``."""
+    nodes = [helper.make_node("Identity", [name], [f"{name}_x"]) for name in shapes]
+    return graph_model(nodes, *([port(name + end, *of) for name, of in shapes.items()] for end in ("", "_x")))
+
+
 MODELS = {
     "another robot's rows": linear(48),
     "another robot's rows, of unknown width": linear(48, columns="columns"),
     "a batch of four": linear(batch=4),
     "NaN": linear(bias=np.full(ACTIONS, np.nan, np.float32)),
-    "no batch": graph_model([helper.make_node("Identity", ["obs"], ["a"])], [port("obs", [12])], [port("a", [12])]),
-    "doubles": graph_model(
-        [helper.make_node("Identity", ["obs"], ["a"])], [port("obs", ["b", 12], DOUBLE)], [port("a", ["b", 12], DOUBLE)]
-    ),
-    "no state that comes out": graph_model(
-        [helper.make_node("Identity", [name], [name + "_x"]) for name in ("obs", "h_in")],
-        [port("obs", ["n", OBSERVATIONS]), port("h_in", [1, "n", 3])],
-        [port("obs_x", ["n", OBSERVATIONS]), port("h_in_x", [1, "n", 3])],
-    ),
+    "no batch": identity(obs=([12],)),
+    "doubles": identity(obs=(["b", 12], TensorProto.DOUBLE)),
+    "no state that comes out": identity(obs=(["n", OBSERVATIONS],), h_in=([1, "n", 3],)),
     "rows that are mixed": graph_model(
-        [
-            helper.make_node("Slice", ["obs", "first", "last", "columns"], ["some"]),
-            helper.make_node("Softmax", ["some"], ["a"], axis=0),
-        ],
+        [helper.make_node("CumSum", ["obs", "axis"], ["sums"]), helper.make_node("Gemm", ["sums", "w"], ["a"])],
         [port("obs", ["n", OBSERVATIONS])],
         [port("a", ["n", ACTIONS])],
-        [numpy_helper.from_array(np.array([k]), name) for name, k in (("first", 0), ("last", ACTIONS), ("columns", 1))],
+        [
+            numpy_helper.from_array(np.array(0), "axis"),
+            numpy_helper.from_array(np.eye(OBSERVATIONS, 12, dtype="f4"), "w"),
+        ],
     ),
     "no graph": graph_model([], [], []),
     "half a file": linear().SerializeToString()[:-9],
@@ -140,9 +135,8 @@ def test_weights_in_another_file_are_refused(tmp_path, anymal, deep):
     onnx.save(linear(), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
     if deep:
         tensor, model = onnx.load(path, load_external_data=False).graph.initializer[1], linear()
-        branch = helper.make_graph(
-            [helper.make_node("Constant", [], ["c"], value=tensor)], "branch", [], [port("c", [ACTIONS])]
-        )
+        constant = helper.make_node("Constant", [], ["c"], value=tensor)
+        branch = helper.make_graph([constant], "branch", [], [port("c", [ACTIONS])])
         model.graph.node.append(helper.make_node("If", ["yes"], ["unused"], then_branch=branch, else_branch=branch))
         save(path, model)
     with pytest.raises(ValueError, match="2 of its tensors"):

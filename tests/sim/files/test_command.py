@@ -35,15 +35,11 @@ ERRORS = {  # what is raised, the exit status, and the line on stderr, or what i
 class Toy:
     """Fail as told."""
 
-    how: str = ""
-    """What to raise."""
+    how: str = ""  # what to raise; "term" waits for a signal that arrives while code is compiled
     status: NonNegativeInt | None = None
-    """What to return."""
     size: tuple[float, float] | None = None
-    """Of nothing."""
 
     def execute(self) -> int | None:
-        """Raises or returns what its flags say; "term" waits for a signal that arrives while code is compiled."""
         if self.how == "term":
             compiled = {"kill": lambda: os.kill(os.getpid(), signal.SIGTERM)}
             exec(compile("def called_from_c():\n kill()\n reached = True", "/x/llvmlite/engine.py", "exec"), compiled)
@@ -74,15 +70,6 @@ def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsy
     assert all(flag in errors for flag in ("--size", "--status", "--nobody"))
 
 
-def test_help_fits_the_terminal_and_says_no_none(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "46")
-    assert run("--help") == 0
-    text = capsys.readouterr().out
-    assert text.startswith("Fail as told.") and "usage: faultline toy" in text and "--status INT" in text
-    assert "None" not in text and "(default: )" not in text
-    assert max(len(line) for line in text.splitlines() if not line.startswith("usage")) <= 46
-
-
 HELP_IN_ANY_WIDTH = """
 import os
 import faultline
@@ -93,19 +80,17 @@ for columns in (1, 2, 3, 5, 8, 13, 20, 39, 40, 41, 80, 200, 399, 400):
 """
 
 
-def test_help_ends_in_a_terminal_of_any_width(capsys, monkeypatch):
+def test_help_fits_a_terminal_of_any_width_and_says_no_none(capsys, monkeypatch):
     for columns in range(1, 401):
         monkeypatch.setenv("COLUMNS", str(columns))
         assert run("--help") == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert max(len(line) for line in lines if not line.startswith("usage")) <= max(columns, 40)
+        text = capsys.readouterr().out
+        assert text.startswith("Fail as told.") and "usage: faultline toy" in text and "--status INT" in text
+        assert "None" not in text and "(default: )" not in text
+        assert max(len(line) for line in text.splitlines() if not line.startswith("usage")) <= max(columns, 40)
     limit = (2**33, 2**33)  # [B]; a help that never ends would take all memory
-    done = subprocess.run(
-        [sys.executable, "-c", HELP_IN_ANY_WIDTH],
-        capture_output=True,
-        timeout=120,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, limit),
-    )
+    options = {"capture_output": True, "preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_AS, limit)}
+    done = subprocess.run([sys.executable, "-c", HELP_IN_ANY_WIDTH], timeout=120, **options)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
@@ -156,11 +141,8 @@ def test_where_nobody_reads_its_output_any_more_a_command_ends_without_a_word(fl
     done = subprocess.run([sys.executable, "-c", TALKS, flag], stdout=write, stderr=subprocess.PIPE, text=True)
     os.close(write)
     assert done.returncode == 1 and not done.stderr
-
-
-def test_another_broken_pipe_is_an_error():
-    done = subprocess.run([sys.executable, "-c", TALKS, "--how=other"], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.startswith("error: ")
+    another = subprocess.run([sys.executable, "-c", TALKS, "--how=other"], capture_output=True, text=True)
+    assert another.returncode == 2 and another.stderr.startswith("error: ")
 
 
 def test_a_command_line_can_be_typed():

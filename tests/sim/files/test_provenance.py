@@ -22,8 +22,7 @@ def test_provenance_has_its_keys(monkeypatch):
     assert all(re.match(r"\d+\.", number) for number in origin["versions"].values())
     json.dumps(origin, allow_nan=False)
     monkeypatch.delenv("FAULTLINE_COMMIT")
-    commit = provenance("cpu", 0)["commit"]
-    assert commit is None or re.fullmatch(r"[0-9a-f]{40}", commit)
+    assert re.fullmatch(r"[0-9a-f]{40}|None", str(provenance("cpu", 0)["commit"]))
 
 
 def test_json_comes_back_and_a_failed_write_leaves_the_old_file(tmp_path):

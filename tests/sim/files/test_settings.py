@@ -27,19 +27,19 @@ class Outer:
     inner: Inner = field(default_factory=Inner)
 
 
-def test_values_within_their_ranges_pass():
+def test_values_within_their_ranges_pass_and_all_problems_are_named_at_once():
     inner, gains = Inner(share=1, span=(2.0, 2.0)), (0.0, np.float64(2.0))
     check_settings(Outer(count=3, length=np.float64(2), maybe=0.0, names=("a",), gains=gains, inner=inner))
+    with pytest.raises(ValueError, match=r"count = 0: .*; inner\.share = 2\.0: "):
+        check_settings(Outer(count=0, inner=Inner(share=2.0)))
 
 
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"count": 0}, "count"),
         ({"length": math.inf}, "length"),
         ({"gains": (1.0, math.nan)}, "gains"),
         ({"inner": 3}, "inner"),
-        ({"inner": Inner(share=1.5)}, "inner.share"),
         ({"inner": Inner(span=(1.0, 0.0))}, "inner.span"),
     ],
     ids=str,
@@ -47,11 +47,6 @@ def test_values_within_their_ranges_pass():
 def test_a_wrong_value_is_named(values, field):
     (line,) = problems(Outer(**values))
     assert line.startswith(f"{field} = ")
-
-
-def test_all_problems_are_named_at_once():
-    with pytest.raises(ValueError, match=r"count = 0: .*; inner\.share = 2\.0: "):
-        check_settings(Outer(count=0, inner=Inner(share=2.0)))
 
 
 def test_settings_come_back_from_json():
@@ -70,7 +65,6 @@ def test_settings_come_back_from_json():
         ({"count": 0}, "count"),
         ({"maybe": "x"}, "maybe"),
         ({"inner": {"span": [2, 1]}}, "span"),
-        ({"length": math.nan}, "length"),
     ],
     ids=str,
 )
