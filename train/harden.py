@@ -93,8 +93,13 @@ class _Hardening:
         terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
         terrains, episodes = fill_sizes(compute, terrains, episodes, full=full, small=(24, 4))
         self.cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
-        self.robot, self.path, self.compute, self.certifiers = robot, path, compute, certifiers
+        self.robot = robot
+        self.path = path
+        self.compute = compute
+        self.certifiers = certifiers
         self.space = space_at(load_space(cfg.space), None, robot)
+        self.crossing: dict[str, Any] = {"robot": robot, "compute": compute, "episodes": episodes}
+        self.crossing["cache"] = path / "crossings"
         self.policies = {"base": base}  # after each round so far
         self.start = cfg.policy  # of the next training: the base, or the last checkpoint kept, with its critic
         self.rows: list[dict[str, Any]] = []
@@ -103,9 +108,8 @@ class _Hardening:
 
     def _read_content(self, base: str) -> dict[str, Any]:
         """What ``rounds.json`` has, or is to begin with."""
-        settings = json.loads(
-            to_json({**asdict(self.cfg), **controller_identity(self.robot, base)})
-        )  # as they are read again
+        identity = controller_identity(self.robot, base)
+        settings = json.loads(to_json({**asdict(self.cfg), **identity}))  # as they are read again
         del settings["rounds"]
         file = self.path / ROUNDS_FILE
         if file.exists():
@@ -143,42 +147,34 @@ class _Hardening:
         base = self.policies["base"]
         # Noise of the actions grows in a training: each begins with that of the base.
         recipe = replace(self.cfg.tune.recipe, noise_of=base if self.start != self.cfg.policy else None)
-        cfg = replace(
-            self.cfg.tune, seed=self._seed(number), policy=self.start, archive=tuple(map(str, searches)),
-            space=self.space.name, recipe=recipe,
-        )  # fmt: skip
+        cfg = replace(self.cfg.tune, seed=self._seed(number), policy=self.start, space=self.space.name, recipe=recipe)
+        cfg = replace(cfg, archive=tuple(map(str, searches)))
         after = str(finetune(self.robot, cfg, run, RunCfg(device=self.compute.device)))
         before = list(self.policies.values())[-1]
-        choice = self._choose({"base": base, "before": before, "after": after}, searches)
+        controllers = {"base": base, "before": before, "after": after}
+        sets = self._sets(searches, "validation")
+        results = cross_sets(controllers, sets, reward=True, note=", validation", **self.crossing)
+        goal: dict[str, dict[str, float]] = {}
+        for when in controllers:
+            rates = {name: terrain_rates(results[name][when])["goal"] for name in sets}
+            # Elites of all archives are one set, since a small archive has few for validation.
+            rates["elites"] = np.concatenate([rates.pop(search.name) for search in searches])
+            goal[when] = {name: float(np.nanmean(values)) for name, values in rates.items()}
+        choice = {**verdict(**goal), "goal": goal}
         self.choices[run.name] = choice
         print(f"{run.name} is {'kept' if choice['kept'] else 'not kept'}: {choice['why']}", flush=True)
         if choice["kept"]:
             self.start = str(run / CHECKPOINT)
         self.policies[f"round-{number}"] = after if choice["kept"] else before
 
-    def _choose(self, controllers: Mapping[str, str], searches: Sequence[Path]) -> dict[str, Any]:
-        """Whether to keep a training, by goal rates on validation terrains."""
-        sets = self._sets(searches, "validation")
-        results = cross_sets(
-            controllers, sets, robot=self.robot, compute=self.compute, episodes=self.cfg.evaluation.episodes,
-            reward=True, cache=self.path / "crossings", note=", validation",
-        )  # fmt: skip
-        goal: dict[str, dict[str, float]] = {}
-        for when in controllers:
-            rates = {name: terrain_rates(results[name][when])["goal"] for name in sets}
-            # Elites of all archives are one set, since a small archive has few for validation.
-            elites = np.concatenate([rates.pop(run.name) for run in searches])
-            goal[when] = {name: float(np.nanmean(values)) for name, values in (rates | {"elites": elites}).items()}
-        return {**verdict(goal["base"], goal["before"], goal["after"]), "goal": goal}
-
     def _sets(self, searches: Sequence[Path], purpose: Purpose) -> dict[str, TerrainSet]:
         """The fixed sets, and for each search, by its name, the elites that no training draws."""
         terrains = self.cfg.evaluation.terrains
-        sets = dict(make_sets(FIXED_SETS, terrains, 0, space=self.space, purpose=purpose))
-        for run in searches:
-            archive = read_robot_archive(self.robot, run, self.space.name)
-            sets[run.name] = generated_set(archive, terrains, 0, purpose)
-        return sets
+        archives = {run.name: read_robot_archive(self.robot, run, self.space.name) for run in searches}
+        return {
+            **make_sets(FIXED_SETS, terrains, 0, space=self.space, purpose=purpose),
+            **{name: generated_set(archive, terrains, 0, purpose) for name, archive in archives.items()},
+        }
 
     def search(self, number: int) -> None:
         """Searches for what breaks the controller of a round, and counts its faults."""
@@ -193,12 +189,18 @@ class _Hardening:
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
         judge(run, certifiers=self.certifiers, **settings)
         counts = RunDirectory(run).read_summary()
-        digest = {
-            key: value for key, value in controller_identity(self.robot, policy).items() if key.startswith("policy")
-        }
+        identity = controller_identity(self.robot, policy)
         tuned = f"tune-{number}" if number else None
-        row = {"controller": name, **digest, "tuned": tuned, "kept": tuned and self.choices[tuned]["kept"]}
-        self.rows.append({**row, "search": run.name, **{key: counts.get(key) for key in _COUNTS}})
+        self.rows.append(
+            {
+                "controller": name,
+                **{key: identity[key] for key in ("policy", "policy_sha256")},
+                "tuned": tuned,
+                "kept": tuned and self.choices[tuned]["kept"],
+                "search": run.name,
+                **{key: counts.get(key) for key in _COUNTS},
+            }
+        )
 
     def search_cfg(self, number: int, policy: str | None) -> SearchCfg:
         """The search of a round against a controller, the robot's own if None."""
@@ -213,10 +215,7 @@ class _Hardening:
         """Evaluates all controllers so far, and writes ``rounds.json`` where these rounds are not all in it."""
         if len(self.rows) < len(self.content["rounds"]):
             return
-        tables = evaluate(
-            self.policies, self._sets(self._searches(), "test"), robot=self.robot, compute=self.compute,
-            episodes=self.cfg.evaluation.episodes, cache=self.path / "crossings",
-        )  # fmt: skip
+        tables = evaluate(self.policies, self._sets(self._searches(), "test"), **self.crossing)
         self.content |= {"rounds": self.rows, "choices": self.choices, "tables": dict(tables)}
         write_atomically(self.path / ROUNDS_FILE, to_json(self.content))
 
@@ -237,9 +236,10 @@ def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, f
 def _show(content: Mapping[str, Any]) -> None:
     goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
     counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
-    rows = [
-        [row["controller"], *("-" if row[name] is None else f"{row[name]:,}" for name in counts),
-         *(format_value(goal[name].get(row["controller"]), limits[name].get(row["controller"])) for name in FIXED_SETS)]
-        for row in content["rounds"]
-    ]  # fmt: skip
+    rows = []
+    for row in content["rounds"]:
+        name = row["controller"]
+        cells = ("-" if row[count] is None else f"{row[count]:,}" for count in counts)
+        rates = (format_value(goal[fixed].get(name), limits[fixed].get(name)) for fixed in FIXED_SETS)
+        rows.append((name, *cells, *rates))
     show_table("Rounds", ["controller", *counts, *(f"goal on {name}" for name in FIXED_SETS)], rows)

@@ -128,19 +128,33 @@ class Mix:
     def terrains(self) -> Tiles:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
         rng = self._rng(0)
-        heights, numbers, _ = hand_crafted_crossings(self.num_hand_crafted, rng)
-        heights *= np.float32(min(space.height_share for space in self.spaces))
+        first = self.num_hand_crafted
+        hand_crafted, numbers, _ = hand_crafted_crossings(first, rng)
+        hand_crafted *= np.float32(min(space.height_share for space in self.spaces))
         types = tuple(CROSSING_TYPES[number] for number in numbers)
         if self.kind == "hand-crafted":
-            return Tiles(heights=heights, type_of_column=types)
-        count = self.num_terrains - self.num_hand_crafted
-        if self.kind == "generated":
-            drawn, ground = self._rasterise_elites()
-        else:
-            drawn, ground = make_terrains(self.spaces[0].hard_random(count, rng), self.spaces[0], device=self.device)
-        if ground is not None:
-            ground = GroundMaps.plain(self.num_hand_crafted).joined(ground)
-        heights = np.concatenate([heights, drawn])
+            return Tiles(heights=hand_crafted, type_of_column=types)
+        count = self.num_terrains - first
+        rows = self.rows
+        genes = self.genes
+        if self.kind == "hard-random":
+            rows = np.arange(count)
+            genes = (self.spaces[0].hard_random(count, rng),)
+        heights = np.concatenate([hand_crafted, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
+        ground = GroundMaps.plain(first)
+        if any(space.conditions for space in self.spaces):
+            ground = replace(ground, conditions=ground.rows)
+        order = [np.arange(first)]
+        start = 0
+        for elites, space in zip(genes, self.spaces, strict=True):
+            (drawn,) = np.nonzero((start <= rows) & (rows < start + len(elites)))
+            if len(drawn):
+                heights[first + drawn], maps = make_terrains(elites[rows[drawn] - start], space, device=self.device)
+                ground = ground.joined(maps or GroundMaps.plain(len(drawn)))
+                order.append(first + drawn)
+            start += len(elites)
+        is_plain = not any(space.ground or space.conditions for space in self.spaces)
+        ground = None if is_plain else ground[np.argsort(np.concatenate(order))]
         return Tiles(heights=heights, type_of_column=(*types, *(self.kind,) * count), ground=ground)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
@@ -167,27 +181,6 @@ class Mix:
         """Rate at which each elite was crossed, shape (E,); its archive's goal rate, or 0, before any episode."""
         initial = 0.0 if self.goal_rate is None else self.goal_rate
         return np.where(self.episodes > 0, self.crossed / np.maximum(self.episodes, 1), initial)
-
-    def _rasterise_elites(self) -> tuple[NDArray[np.float32], GroundMaps | None]:
-        """Heights of the present elites, shape (rows, NUM_ROWS, NUM_COLS), and their ground if any space has maps."""
-        heights = np.empty((len(self.rows), NUM_ROWS, NUM_COLS), np.float32)
-        ground = None
-        if any(space.ground or space.conditions for space in self.spaces):
-            ground = GroundMaps.plain(len(self.rows))
-            if any(space.conditions for space in self.spaces):
-                ground = replace(ground, conditions=ground.rows)
-        first = 0
-        for genes, space in zip(self.genes, self.spaces, strict=True):
-            (indices,) = np.nonzero((first <= self.rows) & (self.rows < first + len(genes)))
-            if len(indices):
-                heights[indices], maps = make_terrains(genes[self.rows[indices] - first], space, device=self.device)
-                if ground is not None and maps is not None:
-                    ground.friction[indices] = maps.friction
-                    ground.time_constant_s[indices] = maps.time_constant_s
-                    if ground.conditions is not None:
-                        ground.conditions[indices] = maps.rows
-            first += len(genes)
-        return heights, ground
 
     def _rng(self, stream: int) -> np.random.Generator:
         return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
