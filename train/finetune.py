@@ -1,12 +1,11 @@
 """Fine-tune a controller on the terrains that broke it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.evaluate.sets import TRAINED_ON, elites_sha256, hash_elites, read_space, read_trained_on, split_elites
 from qd.faults.numbers import SPECIALIST as CERTIFIER
@@ -17,7 +16,6 @@ from sim.controllers.loaders import load_actor
 from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import load_space, space_at, space_key
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
@@ -32,7 +30,7 @@ from train.ppo.training import (
     read_saved,
     run_directory,
 )
-from train.task.tiles import Mix
+from train.task.tiles import Mix, TrainingElites
 
 _CRITIC_ITERATIONS = 50
 
@@ -108,20 +106,6 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainingElites:
-    """E elites to train on, by archive."""
-
-    genes: tuple[NDArray[np.float32], ...]
-    """Genes from each archive, shape (elites of the archive, genes of its space)."""
-    spaces: tuple[TerrainSpace, ...]
-    """Space of each archive; without elites that of hard-random terrains."""
-    goal_rate: NDArray[np.float64] | None = None
-    """Goal rate of each elite in its archive, shape (E,)."""
-    archives: list[dict[str, Any]] = field(default_factory=list)
-    """Sizes and hash of each archive, for the record."""
-
-
 def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     """The elites to train on, without those that any archive holds out."""
     if cfg.mix != "generated":
@@ -133,7 +117,9 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
         held_out.update(hash_elites(archive.genes[np.concatenate([split.test, split.validation])]))
-    chosen = []
+    genes = []
+    goal_rates = []
+    records = []
     for archive, split, path in zip(archives, splits, paths, strict=True):
         rows = split.train
         if cfg.recipe.only == "failing":
@@ -143,27 +129,17 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
                 judge = command_line("judge", robot=named_robot, run=find_directory(path), space=space)
                 raise ValueError(f"{path} must have fresh episodes, which say what fails, got none: run `{judge}`")
             rows = rows[archive.failing[rows]]
-        is_free = [elite not in held_out for elite in hash_elites(archive.genes[rows])]
-        chosen.append(rows[np.array(is_free, bool)])
-    if not any(map(len, chosen)):
+        rows = rows[np.array([elite not in held_out for elite in hash_elites(archive.genes[rows])], bool)]
+        genes.append(archive.genes[rows])
+        goal_rates.append((archive.fresh or archive).goal_rate[rows])
+        sizes = {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation)}
+        records.append({**sizes, "sha256": elites_sha256(archive)})
+    if not any(map(len, genes)):
         names = ", ".join(map(str, paths))
         raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
-    return TrainingElites(
-        genes=tuple(archive.genes[rows] for archive, rows in zip(archives, chosen, strict=True)),
-        spaces=tuple(map(read_space, archives)),
-        goal_rate=np.concatenate(
-            [(archive.fresh or archive).goal_rate[rows] for archive, rows in zip(archives, chosen, strict=True)]
-        ),
-        archives=[
-            {
-                "elites": len(archive),
-                "trained_on": len(rows),
-                "validation": len(split.validation),
-                "sha256": elites_sha256(archive),
-            }
-            for archive, rows, split in zip(archives, chosen, splits, strict=True)
-        ],
-    )
+    spaces = tuple(map(read_space, archives))
+    goal_rate = np.concatenate(goal_rates)
+    return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=goal_rate, archives=records)
 
 
 def begin_finetuning(
@@ -178,28 +154,25 @@ def begin_finetuning(
     start: Start,
 ) -> Training:
     """The fine-tuning of the networks of ``start`` on elites, or of a checkpoint; as of :class:`Training`."""
-    if saved is not None:
-        facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
-    else:
+    if saved is None:
+        critic_iterations = cfg.recipe.critic_iterations
+        if critic_iterations is None:
+            critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
         trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
-        critic_iterations = 0
-        if start.critic is None:
-            half = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
-            critic_iterations = half if cfg.recipe.critic_iterations is None else cfg.recipe.critic_iterations
         facts = {
             TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
-            "critic_iterations": critic_iterations,
+            "critic_iterations": critic_iterations if start.critic is None else 0,
         }
+    else:
+        facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
     mix = Mix(
         kind=cfg.mix,
         num_terrains=cfg.terrains,
         swap_every=cfg.recipe.swap_every,
         draw=cfg.recipe.draw,
-        genes=elites.genes,
-        spaces=elites.spaces,
+        elites=elites,
         seed=cfg.seed,
         device=device,
-        goal_rate=elites.goal_rate if cfg.recipe.draw == "learnable" else None,
     )
     return Training(
         robot, cfg, run_dir, device=device, settings=settings, saved=saved, mix=mix, facts=facts, start=start

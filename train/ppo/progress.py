@@ -34,16 +34,12 @@ class TrainingProgress:
 
         ``origin`` is the provenance of this piece, ``saved`` the :meth:`state` of the pieces before.
         """
-        saved = saved or {"curve": [], "pieces": [], "env_steps": 0, "wall_s": 0.0}
         self._learner = learner
         self._iterations = iterations
-        self._every = max(1, iterations // _ROWS)
         self._origin = origin
-        self._curve: list[dict[str, Any]] = list(saved["curve"])
-        self._pieces = [*saved["pieces"], {**origin, "from_iteration": learner.iteration}]
-        self._env_steps = saved["env_steps"]
-        self._saved_wall_s = saved["wall_s"]
-        self._began = time.monotonic()
+        self._state = saved or {"env_steps": 0, "wall_s": 0.0, "pieces": [], "curve": []}
+        self._state["pieces"].append({**origin, "from_iteration": learner.iteration})
+        self._began = time.monotonic() - self._state["wall_s"]
         self._window: list[Iteration] = []
         self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
         if learner.ranks.is_first:
@@ -53,23 +49,13 @@ class TrainingProgress:
     def add(self, step: Iteration) -> None:
         """Count an iteration; finish a row if one is due."""
         self._window.append(step)
-        self._env_steps += self._learner.steps_per_iteration
-        if self._learner.iteration % self._every == 0:
-            self._finish_row()
-
-    def close(self) -> None:
-        """Finish the last row."""
-        if self._window:
-            self._finish_row()
+        self._state["env_steps"] += self._learner.steps_per_iteration
+        if self._learner.iteration % max(1, self._iterations // _ROWS) == 0:
+            self.finish_row()
 
     def state(self) -> dict[str, Any]:
         """Plain data for the next piece."""
-        return {
-            "env_steps": self._env_steps,
-            "wall_s": round(self._saved_wall_s + time.monotonic() - self._began, 1),
-            "pieces": self._pieces,
-            "curve": self._curve,
-        }
+        return self._state | {"wall_s": round(time.monotonic() - self._began, 1)}
 
     def record(self) -> dict[str, Any]:
         """The training record: provenance, totals, the pieces of the training, and the curve."""
@@ -81,10 +67,14 @@ class TrainingProgress:
             **self.state(),
         }
 
-    def _finish_row(self) -> None:
+    def finish_row(self) -> None:
+        """Make a row of the iterations since the last one, if there are any."""
         learner = self._learner
         window = self._window
         task = learner.env.task
+        if not window:
+            return
+        self._window = []
         collection_s = sum(step.collection_s for step in window)
         learning_s = sum(step.learning_s for step in window)
         sums = task.read_statistics()
@@ -93,7 +83,7 @@ class TrainingProgress:
         dt = task.robot.control_dt
         row = {
             "iteration": learner.iteration,
-            "env_steps": self._env_steps,
+            "env_steps": self._state["env_steps"],
             "wall_s": self.state()["wall_s"],
             "env_steps_per_s": len(window) * learner.steps_per_iteration / (collection_s + learning_s),
             "collection_s": collection_s / len(window),
@@ -114,17 +104,15 @@ class TrainingProgress:
             "learning_rate": learner.alg.learning_rate,
             "noise_std": float(learner.actor_state()[STD].mean()),
         }
-        self._curve.append(_rounded(row))
-        self._window = []
+        self._state["curve"].append(_rounded(row))
         if learner.ranks.is_first:
             self._print(row)
-            groups = {"train": {name: value for name, value in row.items() if not isinstance(value, dict)}}
-            groups |= {name: values for name, values in row.items() if isinstance(values, dict)}
+            groups = {"train": row} | {name: values for name, values in row.items() if isinstance(values, dict)}
             scalars = [
                 Summary.Value(tag=f"{group}/{name}", simple_value=value)
                 for group, values in groups.items()
                 for name, value in values.items()
-                if value is not None
+                if isinstance(value, int | float)
             ]
             _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
 

@@ -76,8 +76,7 @@ def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> P
         if Ranks.from_environment().is_first:
             sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
             print(f"Training '{robot.name}': {sizes}, in {run_dir}", flush=True)
-        training = Training(robot, cfg, run_dir, device=device, settings=settings, saved=saved)
-        return training.run(run.export)
+        return Training(robot, cfg, run_dir, device=device, settings=settings, saved=saved).run(run.export)
 
 
 def find_device(name: str | None) -> str:
@@ -142,11 +141,11 @@ def check_resumed(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
     """Whether a training has done its iterations and written its controller, also to ``export``."""
     record = (run_dir / POLICY).with_suffix(".train.json")
-    is_exported = export is None or is_same_controller(str(export), str(run_dir / POLICY))
     if export is not None:
         last_written = ".toml" if (run_dir / DESCRIBED).exists() else ".train.json"
-        is_exported = is_exported and export.with_suffix(last_written).exists()
-    return is_exported and record.exists() and read_json(record).get("iterations") == iterations
+        if not (export.with_suffix(last_written).exists() and is_same_controller(str(export), str(run_dir / POLICY))):
+            return False
+    return record.exists() and read_json(record).get("iterations") == iterations
 
 
 class Training:
@@ -250,28 +249,23 @@ class Training:
         last_save = time.monotonic()
         if learner.iteration - learner.averaged < self.averaged_from:  # a shorter training averaged other actors
             learner.count_into_mean(False)
-        while learner.ranks.all_true(
-            learner.iteration < self._cfg.iterations and not stop.is_set(), learner.env.device
-        ):
+        ranks = learner.ranks
+        while ranks.all_true(learner.iteration < self._cfg.iterations and not stop.is_set(), learner.env.device):
             self.before_iteration()
             step = learner.iterate()
             learner.count_into_mean(learner.iteration > self.averaged_from)
             self.progress.add(step)
-            if time.monotonic() - last_save > SAVE_EVERY_S:
-                self._save()
+            if time.monotonic() - last_save > SAVE_EVERY_S and learner.ranks.is_first:
+                write_checkpoint(self._run_dir / CHECKPOINT, self.state())
                 last_save = time.monotonic()
-
-    def _save(self) -> None:
-        if self.learner.ranks.is_first:
-            write_checkpoint(self._run_dir / CHECKPOINT, self.state())
 
     def _finish(self, export: Path | None) -> None:
         learner = self.learner
         learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
-        self.progress.close()
-        self._save()
+        self.progress.finish_row()
         if not learner.ranks.is_first:
             return
+        write_checkpoint(self._run_dir / CHECKPOINT, self.state())
         record = {**self.progress.record(), "averaged": learner.averaged, **self._facts}
         for path in filter(None, (self._run_dir / POLICY, export)):
             write_controller(path, learner, record)

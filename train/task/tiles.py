@@ -20,7 +20,6 @@ from sim.terrains.hand_crafted import (
     training_tiles,
 )
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from train.cfg import CurriculumCfg
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
@@ -69,6 +68,20 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
     return Tiles(heights=grid.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingElites:
+    """E elites to train on, by archive."""
+
+    genes: tuple[NDArray[np.float32], ...]
+    """Genes from each archive, shape (elites of the archive, genes of its space)."""
+    spaces: tuple[TerrainSpace, ...]
+    """Space of each archive; without elites, that of hard-random terrains."""
+    goal_rate: NDArray[np.float64] | None = None
+    """Goal rate of each elite in its archive, shape (E,)."""
+    archives: list[dict[str, Any]] = field(default_factory=list)
+    """Sizes and hash of each archive, for the record."""
+
+
 @dataclass(kw_only=True)
 class Mix:
     """Draws the terrains of each exchange, and counts how often each elite was crossed when it was last trained on.
@@ -84,15 +97,12 @@ class Mix:
     """Iterations after which the terrains are exchanged."""
     draw: Draw = "uniform"
     """How elites are drawn (:class:`train.cfg.RecipeCfg`)."""
-    genes: tuple[NDArray[np.float32], ...]
-    """Elites to train on by archive, each of shape (elites, genes of its space), E in all; empty but for generated."""
+    elites: TrainingElites
+    """Hand-crafted terrains are scaled by the smallest height share of their spaces."""
     seed: int
     device: str
-    spaces: tuple[TerrainSpace, ...] = (SUPER_GAUSSIAN,)
-    """Space of each archive; the first is that of hard-random terrains. Hand-crafted terrains are scaled by the
-    smallest height share."""
-    goal_rate: NDArray[np.float64] | None = None
-    """Goal rate of each elite in its archive, shape (E,), used until the elite is trained on; None: 0."""
+    goal_rate: NDArray[np.float64] | None = field(init=False)
+    """Goal rate of each elite, shape (E,), which ``learnable`` uses until the elite is trained on; None: 0."""
     swap: int = -1
     """Number of the present exchange, from 0."""
     rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -103,7 +113,8 @@ class Mix:
     """How many of them reached the goal."""
 
     def __post_init__(self) -> None:
-        self.num_elites = sum(map(len, self.genes))
+        self.num_elites = sum(map(len, self.elites.genes))
+        self.goal_rate = self.elites.goal_rate if self.draw == "learnable" else None
         self.num_hand_crafted = self.num_terrains if self.kind == "hand-crafted" else self.num_terrains // 2
         self.episodes = np.zeros(self.num_elites, np.int64)
         self.crossed = np.zeros(self.num_elites, np.int64)
@@ -130,30 +141,30 @@ class Mix:
         rng = self._rng(0)
         first = self.num_hand_crafted
         hand_crafted, numbers, _ = hand_crafted_crossings(first, rng)
-        hand_crafted *= np.float32(min(space.height_share for space in self.spaces))
+        hand_crafted *= np.float32(min(space.height_share for space in self.elites.spaces))
         types = tuple(CROSSING_TYPES[number] for number in numbers)
         if self.kind == "hand-crafted":
             return Tiles(heights=hand_crafted, type_of_column=types)
         count = self.num_terrains - first
         rows = self.rows
-        genes = self.genes
+        genes = self.elites.genes
         if self.kind == "hard-random":
             rows = np.arange(count)
-            genes = (self.spaces[0].hard_random(count, rng),)
+            genes = (self.elites.spaces[0].hard_random(count, rng),)
         heights = np.concatenate([hand_crafted, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
         ground = GroundMaps.plain(first)
-        if any(space.conditions for space in self.spaces):
+        if any(space.conditions for space in self.elites.spaces):
             ground = replace(ground, conditions=ground.rows)
         order = [np.arange(first)]
         start = 0
-        for elites, space in zip(genes, self.spaces, strict=True):
+        for elites, space in zip(genes, self.elites.spaces, strict=True):
             (drawn,) = np.nonzero((start <= rows) & (rows < start + len(elites)))
             if len(drawn):
                 heights[first + drawn], maps = make_terrains(elites[rows[drawn] - start], space, device=self.device)
                 ground = ground.joined(maps or GroundMaps.plain(len(drawn)))
                 order.append(first + drawn)
             start += len(elites)
-        is_plain = not any(space.ground or space.conditions for space in self.spaces)
+        is_plain = not any(space.ground or space.conditions for space in self.elites.spaces)
         ground = None if is_plain else ground[np.argsort(np.concatenate(order))]
         return Tiles(heights=heights, type_of_column=(*types, *(self.kind,) * count), ground=ground)
 
@@ -199,8 +210,8 @@ class Mix:
             "failing": 1.0 - rate + _MIN_WEIGHT,
             "learnable": 4.0 * rate * (1.0 - rate) + _MIN_WEIGHT,
         }[self.draw]
-        if len(self.genes) > 1:  # each archive gets an equal share
-            by_archive = np.split(weights, np.cumsum([len(genes) for genes in self.genes])[:-1])
+        if len(self.elites.genes) > 1:  # each archive gets an equal share
+            by_archive = np.split(weights, np.cumsum([len(genes) for genes in self.elites.genes])[:-1])
             weights = np.concatenate([values / values.sum() if len(values) else values for values in by_archive])
         rest = rng.choice(count, size=num_drawn - len(all_elites), replace=False, p=weights / weights.sum())
         return np.concatenate([all_elites, rest])

@@ -9,15 +9,16 @@ from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from train.cfg import CurriculumCfg
-from train.task.tiles import Mix, make_tiles
+from train.task.tiles import Mix, TrainingElites, make_tiles
 
 ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 
 
 def make_mix(*, kind="generated", terrains=6, elites=ELITES, seed=0, **changes) -> Mix:
-    genes = elites if kind == "generated" else np.zeros((0, 64), np.float32)
-    settings = {"genes": (genes,), "swap_every": 1, "device": "cpu", **changes}
-    return Mix(kind=kind, num_terrains=terrains, seed=seed, **settings)
+    given = {"genes": (elites if kind == "generated" else ELITES[:0],), "spaces": (SUPER_GAUSSIAN,)}
+    given |= {name: changes.pop(name) for name in ("genes", "spaces", "goal_rate") if name in changes}
+    made = TrainingElites(**given)
+    return Mix(kind=kind, num_terrains=terrains, swap_every=1, elites=made, seed=seed, device="cpu", **changes)
 
 
 def counts(goals, episodes, invalid=None):
