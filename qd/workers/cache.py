@@ -1,4 +1,4 @@
-"""Crosser and recordings on disk: arrays by key, in a folder of bounded size.
+"""Crossings and recordings on disk: arrays by key, in a folder of bounded size.
 
 A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored as
 soon as it is done, with a key for every terrain, and a terrain is found again in whatever lots.
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from qd.workers.shards import result_arrays
 from sim.files.atomic import locked, write_atomically
-from sim.files.npz import array_names, npz_bytes, read_arrays
+from sim.files.npz import npz_bytes, read_arrays
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
 
@@ -48,24 +48,20 @@ class Cache:
         """The arrays of a key; None if there are none. Reading only those of some ``names`` is no use of the file."""
         file = self.file(key)
         try:
-            stored = [name for name in array_names(file) if names is None or name in (*names, _KEY)]
-            arrays = read_arrays(file, stored)
+            arrays = read_arrays(file, None if names is None else [*names, _KEY])
             if str(arrays.pop(_KEY, "")) != key:
                 raise ValueError("it is another key's")
         except FileNotFoundError:  # never written, or removed by another process
             return None
         except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
-            self._remove_damaged(file, error)
+            with locked(self.folder):
+                if file.is_file():
+                    print(f"{file} is damaged ({' '.join(str(error).split())}): it is made again", flush=True)
+                    file.unlink(missing_ok=True)
             return None
         if names is None:
             self.touch(key)
         return arrays
-
-    def _remove_damaged(self, file: Path, error: Exception) -> None:
-        with locked(self.folder):
-            if file.is_file():
-                print(f"{file} is damaged ({' '.join(str(error).split())}): it is made again", flush=True)
-                file.unlink(missing_ok=True)
 
     def touch(self, key: str) -> None:
         """Notes that a file was used."""
@@ -84,18 +80,16 @@ class Cache:
         files = []
         for file in self.folder.glob("*.npz"):
             with suppress(FileNotFoundError):  # removed by another process
-                files.append((file, file.stat()))
-        size = sum(stat.st_size for _, stat in files)
-        for file, stat in sorted(files, key=lambda pair: pair[1].st_mtime_ns):
-            if size <= self._max_bytes:
-                return
-            if file.stem != but:
+                files.append((file.stat().st_mtime_ns, file.stat().st_size, file))
+        size = sum(size for _, size, _ in files)
+        for _, file_size, file in sorted(files):
+            if size > self._max_bytes and file.stem != but:
                 file.unlink(missing_ok=True)
-                size -= stat.st_size
+                size -= file_size
 
 
 class StoredCrossings:
-    """Crosser in a cache by the digest of terrain and seed; ``settings`` is the hash of all else that they depend on.
+    """Crossings in a cache by the digest of terrain and seed; ``settings`` is the hash of all else that they depend on.
 
     Files are looked through once; those that other processes write later are not found.
     """
@@ -106,8 +100,8 @@ class StoredCrossings:
         self._penalty_names = penalty_names
         self._index: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
         for key in cache.keys(settings):
-            rows = (cache.read(key, [_ROWS]) or {}).get(_ROWS, np.zeros((0, 32), np.uint8))
-            self._index.update({row.tobytes(): (key, number) for number, row in enumerate(rows)})
+            if stored := cache.read(key, [_ROWS]):
+                self._index.update({row.tobytes(): (key, number) for number, row in enumerate(stored[_ROWS])})
 
     def read(self, terrains: Terrains) -> Iterator[tuple[NDArray[np.intp], RolloutResult]]:
         """Which of the terrains have been crossed, and their results, file by file."""

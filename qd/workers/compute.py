@@ -1,17 +1,23 @@
-"""Where terrains are crossed: on which device, by how many workers, with how many robots at once."""
+"""Where terrains are crossed: on which device, by how many workers, with how many robots at once; the Ray cluster.
 
+Ray takes seconds to load and need not be installed.
+"""
+
+import importlib
+import logging
 import os
 import re
+import socket
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
-from qd.workers import cluster
 from sim.controllers.loaders import load_policy
 from sim.device import resolve_device
 from sim.files.provenance import provenance
 from sim.robots.robot import RobotCfg
 
 _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[1-9]\d{0,5})")
+_CONNECT_LIMIT_S = 10.0
 
 
 class Workers(NamedTuple):
@@ -67,15 +73,73 @@ class Compute:
 
 
 def choose_device(name: str | None, workers: str | None = None) -> str:
-    """Warp device name, on Ray of the cluster; None means CUDA where there is one, else the CPU."""
+    """Warp device name, on Ray of the cluster ``cuda`` or ``cpu``; None means CUDA where there is one, else the CPU."""
     on_ray, count = parse_workers(workers)
-    if on_ray:
-        cluster.connect(max(available_cores(), count or 1))
-        return cluster.resolve_worker_device(name, count)
-    device = resolve_device(name)
-    if device.startswith("cuda") and (count or 1) > 1:
-        raise ValueError(f"{count} workers need the CPU, got device {device}: give --device cpu, or --workers ray:N")
+    if not on_ray:
+        device = resolve_device(name)
+        if device.startswith("cuda") and (count or 1) > 1:
+            raise ValueError(
+                f"{count} workers need the CPU, got device {device}: give --device cpu, or --workers ray:N"
+            )
+        return device
+    connect(count)
+    if name not in (None, "cpu", "cuda"):
+        raise ValueError(f"with workers on Ray the device must be cpu or cuda, got {name}")
+    gpus = num_devices("cuda")
+    if name == "cuda" and not gpus:
+        raise ValueError(f"device cuda: the cluster has no GPU: {resources()}; give --device cpu, or add a node")
+    device = name or ("cuda" if gpus else "cpu")
+    limit = num_devices(device)
+    if count is not None and count > limit and not os.environ.get("RAY_ADDRESS"):
+        raise ValueError(f"workers must be at most ray:{limit}, one for each GPU of this machine, got ray:{count}")
     return device
+
+
+def connect(count: int | None) -> None:
+    """Joins the cluster that RAY_ADDRESS names, or starts Ray on this machine, with room for ``count`` workers."""
+    ray = load_ray()
+    if ray.is_initialized():
+        return
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's behaviour to come; it warns otherwise
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    address = os.environ.get("RAY_ADDRESS")
+    if address is None:
+        slots = max(available_cores(), count or 1)
+        ray.init(address="local", num_cpus=slots, include_dashboard=False, object_store_memory=256 << 20, **quiet)
+        return
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        if host and port.isdecimal():  # Ray itself would try for minutes where nothing listens
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT_LIMIT_S).close()
+        ray.init(address=address, **quiet)
+    except Exception as error:  # of many types: no such host, another version of Ray, a token that is missing
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise OSError(
+            f"no Ray cluster at RAY_ADDRESS={address}: {reason}: start one with `ray start --head`, or unset "
+            "RAY_ADDRESS to use this machine alone"
+        ) from None
+
+
+def load_ray() -> Any:
+    """The package ``ray``; a ValueError where it is not installed."""
+    try:
+        return importlib.import_module("ray")
+    except ModuleNotFoundError as error:
+        if error.name != "ray":
+            raise
+        raise ValueError("--workers ray needs Ray, which is not installed: pip install -e '.[cluster]'") from None
+
+
+def num_devices(device: str) -> int:
+    """GPUs or CPU cores that the cluster has now."""
+    return int(load_ray().cluster_resources().get("GPU" if device.startswith("cuda") else "CPU", 0))
+
+
+def resources() -> str:
+    """GPUs and CPU cores of the cluster as text."""
+    counts = load_ray().cluster_resources().items()
+    return ", ".join(f"{value:g} {name}" for name, value in counts if name in ("CPU", "GPU"))
 
 
 def check_policy(policy: str, robot: RobotCfg, device: str) -> None:

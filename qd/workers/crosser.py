@@ -7,20 +7,20 @@ crossings are found in the cache (:mod:`qd.workers.cache`).
 import hashlib
 import importlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.search.progress import Bar
 from qd.workers.cache import Cache, StoredCrossings
 from qd.workers.compute import Compute
 from qd.workers.invalid import report_invalid
-from qd.workers.pipeline import Build, Engine, Pipeline, PipelineCfg, Progress, build_simulator, open_processes
+from qd.workers.pipeline import Build, Engine, Pipeline, PipelineCfg, ProcessPipeline, Progress, build_simulator
+from qd.workers.process import WorkerProcess
 from qd.workers.shards import choose_rows, join_results
 from sim.controllers.spec import controller_hash, resolve_policy
 from sim.files.command import Interrupted
@@ -48,8 +48,16 @@ def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterat
     elif cfg.in_process:
         yield Pipeline(cfg.num_terrains, build(cfg, cfg.num_terrains))
     else:
-        with open_processes(cfg, build) as processes:
-            yield processes
+        processes: list[WorkerProcess] = []
+        with ExitStack() as stack:
+            for _ in range(cfg.num_workers):
+                processes.append(WorkerProcess(cfg.terrains_of_worker, build, cfg))
+                stack.callback(processes[-1].stop)
+                if len(processes) == 1:
+                    processes[0].receive()  # it compiles the kernels; the others then find them compiled
+            for process in processes[1:]:
+                process.receive()
+            yield ProcessPipeline(processes, cfg.num_terrains)
 
 
 class Crosser:
@@ -128,7 +136,8 @@ class Crosser:
         except KeyboardInterrupt:
             kept = "; what was crossed is kept, and the same command goes on" if stored else ""
             raise Interrupted(f"Stopped{kept}.") from None
-        result = _in_order(results)
+        order = np.argsort(np.concatenate([numbers for numbers, _ in results]))
+        result = choose_rows(join_results([result for _, result in results], join=1), order)
         report_invalid(result, label or policy, all_ok=invalid_ok)
         return result
 
@@ -211,12 +220,6 @@ def _lot_size(cfg: PipelineCfg) -> int:
         return _MUJOCO_C_LOT * cfg.num_workers
     episodes = _LOT_EPISODES["cuda" if cfg.compute.on_gpu else "cpu"]
     return max(1, min(episodes // cfg.replicas, _LOT_TERRAINS)) * cfg.num_workers
-
-
-def _in_order(results: Sequence[tuple[NDArray[np.intp], RolloutResult]]) -> RolloutResult:
-    """One result of several that hold some of the terrains each."""
-    order = np.argsort(np.concatenate([numbers for numbers, _ in results]))
-    return choose_rows(join_results([result for _, result in results], join=1), order)
 
 
 def _empty_result(cfg: PipelineCfg, penalty_names: tuple[str, ...]) -> RolloutResult:

@@ -7,13 +7,11 @@ however terrains are spread.
 import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
-from qd.workers import cluster
-from qd.workers.compute import Compute, available_cores, parse_workers
+from qd.workers.compute import Compute, available_cores, num_devices, parse_workers
 from qd.workers.process import WorkerProcess
 from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg, SolverCfg, resolved
@@ -93,7 +91,7 @@ class PipelineCfg:
         """How many work at once: one in this process; on the CPU no more than there is work for."""
         on_ray, count = parse_workers(self.compute.workers)
         if self.on_ray:
-            return count or cluster.num_devices(self.compute.device)
+            return count or num_devices(self.compute.device)
         if self.in_process:
             return 1
         cores = (None if on_ray else count) or available_cores()
@@ -131,22 +129,9 @@ class WorkerStatus(NamedTuple):
         return f"{self.workers} worker{'s' * (self.workers != 1)}{again}"
 
 
-class Simulator(Protocol):
-    """Crosses lots of terrains in one process, in the order in which they were put in."""
-
-    def put(self, terrains: Terrains) -> None:
-        """Queues a lot; waits for nothing."""
-        ...
-
-    def take(self, progress: Progress | None = None) -> RolloutResult:
-        """Waits for the lot that was put in first."""
-        ...
-
-    def clear(self) -> None:
-        """Drops all pending lots."""
-        ...
-
-
+Simulator = Rollout | RolloutRecorder | MujocoC
+"""Crosses lots of terrains in one process: it takes them in by ``put``, and gives their results in that order by
+``take``."""
 Build = Callable[[PipelineCfg, int], Simulator]
 """Makes a simulator with room for so many terrains; a module-level function, since processes import it by name."""
 
@@ -281,23 +266,6 @@ class ProcessPipeline(Pipeline):
         """Waits for all pending lots and drops them."""
         while self._lots:
             self.take()
-
-
-@contextmanager
-def open_processes(cfg: PipelineCfg, build: Build) -> Iterator[ProcessPipeline]:
-    """Starts the processes of a pipeline, and ends them."""
-    processes: list[WorkerProcess] = []
-    try:
-        for number in range(cfg.num_workers):
-            processes.append(WorkerProcess(cfg.terrains_of_worker, build, cfg))
-            if number == 0:
-                processes[0].receive()  # it compiles the kernels; the others then find them compiled
-        for process in processes[1:]:
-            process.receive()
-        yield ProcessPipeline(processes, cfg.num_terrains)
-    finally:
-        for process in processes:
-            process.stop()
 
 
 def _scale(progress: Progress, start: float, share: float) -> Progress:

@@ -86,7 +86,7 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
             if lot is None:
                 raise EOFError
             crosser.put(*lot)
-            under_way = under_way + 1
+            under_way += 1
             wait = False
 
     def report(share: float) -> None:
@@ -107,10 +107,11 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
             connection.send(("result", result))
     except (EOFError, ConnectionError):  # the other end is gone: closed, or killed with unread messages
         sys.exit(0)
-    except ValueError as error:
-        _send_last(connection, "refused", with_traceback(error, str(error)))
     except Exception as error:
-        _send_last(connection, "failed", with_traceback(error, f"{type(error).__name__}: {error}"))
+        refused = isinstance(error, ValueError)
+        text = with_traceback(error, str(error) if refused else f"{type(error).__name__}: {error}")
+        with contextlib.suppress(ConnectionError):  # nobody may be left to hear it
+            connection.send(("refused" if refused else "failed", text))
 
 
 def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[Any, ...] | None]") -> None:
@@ -122,9 +123,3 @@ def _read(connection: Connection, inbox: "queue.SimpleQueue[tuple[Any, ...] | No
         pass  # the other end is gone
     finally:  # after any failure, or the worker would wait for ever, and the other end for it
         inbox.put(None)
-
-
-def _send_last(connection: Connection, message: str, value: str) -> None:
-    """Says why the process ends, if anybody is left to hear it."""
-    with contextlib.suppress(ConnectionError):
-        connection.send((message, value))

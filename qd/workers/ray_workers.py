@@ -18,8 +18,7 @@ from typing import Any
 import ray
 from ray.exceptions import RayError, RayTaskError
 
-from qd.workers import cluster
-from qd.workers.compute import available_cores, parse_workers
+from qd.workers.compute import connect, num_devices, parse_workers, resources
 from qd.workers.pipeline import Build, Pipeline, PipelineCfg, WorkerStatus
 from qd.workers.process import EvaluatorError
 from qd.workers.shards import copied, find_flaw, join_results
@@ -202,7 +201,7 @@ class RayWorkers(Pipeline):
         if self.status().workers:
             self._seen_at = time.monotonic()
         elif time.monotonic() - self._seen_at > _PATIENCE_S:
-            raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {cluster.resources()}")
+            raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {resources()}")
         self._deal()
 
     def _start_missing(self) -> None:
@@ -210,7 +209,7 @@ class RayWorkers(Pipeline):
             return
         self._grown_at = time.monotonic()
         actor: Any = RayWorker
-        for _ in range((self._count or max(1, cluster.num_devices(self._cfg.compute.device))) - len(self._workers)):
+        for _ in range((self._count or max(1, num_devices(self._cfg.compute.device))) - len(self._workers)):
             worker = actor.options(**self._resources).remote(*self._arguments)
             self._workers.add(worker)
             self._tasks[worker.prepare.remote(self._shard_size(), self._code)] = worker, None
@@ -277,7 +276,7 @@ def _find_reason(error: BaseException) -> str:
 @contextmanager
 def open_ray_workers(cfg: PipelineCfg, build: Build) -> Iterator[RayWorkers]:
     """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.crosser.open_pipeline`."""
-    cluster.connect(max(available_cores(), parse_workers(cfg.compute.workers).count or 1))
+    connect(parse_workers(cfg.compute.workers).count)
     workers = RayWorkers(cfg, build)
     try:
         workers.open()
