@@ -22,7 +22,6 @@ from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
 from qd.workers.pipeline import Engine
-from qd.workers.shards import join_results
 from sim.controllers.spec import controller_identity, crosser_name
 from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -210,7 +209,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
             drawn = Terrains(genes=genes[rows], seeds=seeds[rows], space=space)
             label = f"hard-random terrains from {first + 1:,}"
             results.append(crosser.cross(policy, drawn, replicas=replicas, label=label))
-            result = join_results(results, join=1)
+            result = RolloutResult.join(results)
             if (num_failing := _failing(result).sum()) >= _ENOUGH:
                 break
             print(f"{num_failing} of {result.invalid.size} episodes did not reach the goal.", flush=True)

@@ -2,8 +2,8 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -77,6 +77,31 @@ class RolloutResult:
     def idle_share(self) -> float:
         """Share of the robots' steps in which they waited."""
         return 1.0 - self.busy_steps / self.robot_steps if self.robot_steps else 0.0
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Its arrays by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+    def __getitem__(self, rows: np.ndarray) -> "RolloutResult":
+        frames = None if self.frames is None else self.frames[rows]
+        return replace(self, **{name: values[rows] for name, values in self.arrays.items()}, frames=frames)
+
+    @staticmethod
+    def join(results: Sequence["RolloutResult"], *, at_once: bool = False, axis: int = 0) -> "RolloutResult":
+        """Results that ran one after the other, or at the same time if ``at_once``; terrains, or replicas on axis 1."""
+        if len(results) == 1:
+            return results[0]
+        changes: dict[str, Any] = {
+            name: np.concatenate([getattr(result, name) for result in results], axis=axis)
+            for name in results[0].arrays
+        }
+        if results[0].frames is not None:
+            changes["frames"] = Frames.join([result.frames for result in results if result.frames is not None])
+        for name in ("physics_steps", "robot_steps", "busy_steps", "wall_s"):
+            combine = max if at_once and name in ("physics_steps", "wall_s") else sum
+            changes[name] = combine(getattr(result, name) for result in results)
+        return replace(results[0], **changes)
 
 
 class Watcher(Protocol):

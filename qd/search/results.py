@@ -19,7 +19,6 @@ from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg
 from qd.show.figures import write_figures
 from qd.workers.invalid import invalid_iterations, invalid_reasons
-from qd.workers.shards import join_results
 from sim.files.atomic import to_json, write_atomically
 from sim.files.command import command_line, say
 from sim.files.settings import select_settings
@@ -55,7 +54,7 @@ def describe_metrics(
     archive: Archive, results: Sequence[RolloutResult], evaluations: Sequence[Evaluation]
 ) -> dict[str, Any]:
     """The metrics of the archive's last iteration without the search's times, by what its groups crossed."""
-    result, evaluation = join_results(results, join=1), join_evaluations(evaluations)
+    result, evaluation = RolloutResult.join(results), join_evaluations(evaluations)
     return {
         "iteration": archive.iterations,
         "elites": len(archive),

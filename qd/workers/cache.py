@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.workers.shards import result_arrays
 from sim.files.atomic import locked, write_atomically
 from sim.files.npz import npz_bytes, read_arrays
 from sim.rollout import RolloutResult
@@ -122,5 +121,5 @@ class StoredCrossings:
         """Stores a lot."""
         digests = terrains.digests()
         key = f"{self._settings}-{hashlib.sha256(b''.join(digests)).hexdigest()[:32]}"
-        self._cache.write(key, {_ROWS: np.array([[*row] for row in digests], np.uint8), **result_arrays(result)})
+        self._cache.write(key, {_ROWS: np.array([[*row] for row in digests], np.uint8), **result.arrays})
         self._index.update({row: (key, number) for number, row in enumerate(digests)})

@@ -21,7 +21,6 @@ from qd.workers.compute import Compute
 from qd.workers.invalid import report_invalid
 from qd.workers.pipeline import Build, Engine, Pipeline, PipelineCfg, ProcessPipeline, Progress, build_simulator
 from qd.workers.process import WorkerProcess
-from qd.workers.shards import choose_rows, join_results
 from sim.controllers.spec import controller_hash, resolve_policy
 from sim.files.command import Interrupted
 from sim.files.provenance import code_fingerprint
@@ -137,7 +136,7 @@ class Crosser:
             kept = "; what was crossed is kept, and the same command goes on" if stored else ""
             raise Interrupted(f"Stopped{kept}.") from None
         order = np.argsort(np.concatenate([numbers for numbers, _ in results]))
-        result = choose_rows(join_results([result for _, result in results], join=1), order)
+        result = RolloutResult.join([result for _, result in results])[order]
         report_invalid(result, label or policy, all_ok=invalid_ok)
         return result
 

@@ -1,9 +1,11 @@
-"""What is said of invalid episodes, and the error where there are no others."""
+"""What is said of invalid episodes, the error where there are no others, and results that cannot be true."""
 
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from kernels.episode import Invalidity
 from sim.files.command import UserError
@@ -71,3 +73,31 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
     words = explain_invalid(invalid_reasons(result), result.invalid.size)
     if words is not None:
         print(f"{label}: {words}", file=sys.stderr)
+
+
+def find_flaw(result: Any, count: int, replicas: int) -> str | None:
+    """Why a result cannot be one of ``count`` terrains, in words; None if it can.
+
+    Memory gone bad on another machine must not become a number in an archive: shapes, finite penalties of every valid
+    episode, and times that can be.
+    """
+    if not isinstance(result, RolloutResult):
+        return f"no result but {type(result).__name__}"
+    shape = (count, replicas)
+    shapes = {name: value.shape for name, value in result.arrays.items()}
+    wrong = [f"{name} of shape {got}" for name, got in shapes.items() if got[:2] != shape]
+    if wrong:
+        return f"{', '.join(wrong)} for {count} terrains of {replicas} episodes"
+    penalties = result.penalties
+    invalid = result.invalid
+    if penalties.shape != (*shape, len(result.penalty_names)):
+        return f"penalties of shape {penalties.shape}"
+    if not (np.isfinite(penalties[~invalid]) & (penalties[~invalid] >= 0.0)).all():
+        return "valid episodes with penalties that are negative or not finite"
+    if ((result.invalidity != 0) != invalid).any():
+        return "invalid episodes without a reason, or valid ones with one"
+    if result.reward is not None and not np.isfinite(result.reward[~invalid]).all():
+        return "valid episodes with rewards that are not finite"
+    if not (result.duration_s > 0.0).all() or not result.physics_steps > 0:
+        return "episodes that took no time"
+    return None

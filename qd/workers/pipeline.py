@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 
 from qd.workers.compute import Compute, available_cores, num_devices, parse_workers
 from qd.workers.process import WorkerProcess
-from qd.workers.shards import join_results
 from sim.crossing import CrossingCfg, SolverCfg, resolved
 from sim.mujoco_c.crossing import MujocoC
 from sim.recording.recorder import RolloutRecorder
@@ -193,7 +192,7 @@ class Pipeline:
         """Crosses each terrain once a replica, as :meth:`in_lots` does; all in one result."""
         count = len(terrains)
         size = count if count <= self.num_terrains else max(1, self.num_terrains // 2)
-        return join_results([result for _, result in self.in_lots(terrains, size, progress)], join=1)
+        return RolloutResult.join([result for _, result in self.in_lots(terrains, size, progress)])
 
     def in_lots(
         self, terrains: Terrains, size: int, progress: Progress | None = None
@@ -260,7 +259,7 @@ class ProcessPipeline(Pipeline):
             if progress is not None:
                 progress(sum(shares.values()) / len(shares))
         self._lots.popleft()
-        return join_results(list(results.values()), join=0)
+        return RolloutResult.join(list(results.values()), at_once=True)
 
     def clear(self) -> None:
         """Waits for all pending lots and drops them."""

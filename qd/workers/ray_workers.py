@@ -19,9 +19,9 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from qd.workers.compute import connect, num_devices, parse_workers, resources
+from qd.workers.invalid import find_flaw
 from qd.workers.pipeline import Build, Pipeline, PipelineCfg, WorkerStatus
 from qd.workers.process import EvaluatorError
-from qd.workers.shards import copied, find_flaw, join_results
 from sim.controllers.spec import ControllerSpec
 from sim.files.command import debugging
 from sim.files.provenance import code_fingerprint
@@ -68,34 +68,28 @@ _ray: Any = ray  # its annotations leave out what it documents
 class RayWorker:
     """One device's simulation, which Ray gave to this process; controller, robot and space come with their files."""
 
-    def __init__(
+    def prepare(
         self,
+        num_terrains: int,
+        code: str,
         cfg: PipelineCfg,
         controller: PackedCode,
         robot: PackedRobot | str,
         space: PackedCode | None,
         build: Build,
     ) -> None:
-        self._cfg = cfg
-        self._controller = controller
-        self._robot = robot
-        self._space = space
-        self._build = build
-
-    def prepare(self, num_terrains: int, code: str) -> None:
         """Builds the simulation; refuses to if this machine has other code."""
         if code_fingerprint(_ROOMS) != code:
             raise ValueError(f"{socket.gethostname()} has other code or packages: use the same commit everywhere")
         # The process may be killed at any time, so the folder must not live as long as it does.
         with tempfile.TemporaryDirectory(prefix="faultline-") as name:
             folder = Path(name)
-            cfg = self._cfg
-            robot = self._robot if isinstance(self._robot, str) else self._robot.unpacked(folder / "robot")
-            if self._space is not None:
-                code = self._space.unpacked(folder / "space")
+            if space is not None:
+                code = space.unpacked(folder / "space")
                 cfg = replace(cfg, space="+".join((code, *split_name(cfg.space)[1])))
-            cfg = replace(cfg, policy=self._controller.unpacked(folder / "controller"), robot=robot)
-            self._simulator = self._build(cfg, num_terrains)
+            unpacked = robot if isinstance(robot, str) else robot.unpacked(folder / "robot")
+            cfg = replace(cfg, policy=controller.unpacked(folder / "controller"), robot=unpacked)
+            self._simulator = build(cfg, num_terrains)
 
     def cross(self, terrains: Terrains) -> RolloutResult:
         """Crosses terrains, at most as many as it was prepared for."""
@@ -126,8 +120,7 @@ class RayWorkers(Pipeline):
         space = PackedCode.of(split_name(cfg.space)[0]) if is_user_space(cfg.space) else None
         packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
         compute = replace(cfg.compute, device="cuda:0" if gpus else "cpu")
-        self._arguments = replace(cfg, compute=compute, robot=""), *packed, build
-        self._code = code_fingerprint(_ROOMS)
+        self._arguments = code_fingerprint(_ROOMS), replace(cfg, compute=compute, robot=""), *packed, build
         self._size = cfg.terrains_of_worker
         self._workers: set[Any] = set()
         self._idle: deque[Any] = deque()
@@ -157,8 +150,9 @@ class RayWorkers(Pipeline):
 
     def put(self, terrains: Terrains) -> None:
         """Deals a lot out in shards of as many terrains as a worker has room for."""
-        size = self._shard_size()
-        lot = [_Shard(terrains[k : k + size]) for k in range(0, len(terrains), size)]
+        # Shards are smaller once the cluster has grown; never larger, for which workers have no room.
+        self._size = min(self._size, self._cfg.terrains_of_worker)
+        lot = [_Shard(terrains[k : k + self._size]) for k in range(0, len(terrains), self._size)]
         if not self._lots:
             self._result_at = time.perf_counter()
         self._lots.append(lot)
@@ -176,15 +170,10 @@ class RayWorkers(Pipeline):
         if progress is not None:
             progress(1.0)
         self._lots.popleft()
-        now = time.perf_counter()
-        wall_s = now - self._result_at
-        self._result_at = now
-        return replace(join_results([shard.result for shard in lot if shard.result is not None], join=0), wall_s=wall_s)
-
-    def _shard_size(self) -> int:
-        """Terrains of a shard: fewer once the cluster has grown; never more, for which workers have no room."""
-        self._size = min(self._size, self._cfg.terrains_of_worker)
-        return self._size
+        result = RolloutResult.join([shard.result for shard in lot if shard.result is not None], at_once=True)
+        began = self._result_at
+        self._result_at = time.perf_counter()
+        return replace(result, wall_s=self._result_at - began)
 
     def clear(self) -> None:
         """Drops all pending lots; what workers still cross of them counts for no later one."""
@@ -208,11 +197,10 @@ class RayWorkers(Pipeline):
         if time.monotonic() - self._grown_at < _GROW_EVERY_S:
             return
         self._grown_at = time.monotonic()
-        actor: Any = RayWorker
         for _ in range((self._count or max(1, num_devices(self._cfg.compute.device))) - len(self._workers)):
-            worker = actor.options(**self._resources).remote(*self._arguments)
+            worker = RayWorker.options(**self._resources).remote()
             self._workers.add(worker)
-            self._tasks[worker.prepare.remote(self._shard_size(), self._code)] = worker, None
+            self._tasks[worker.prepare.remote(self._size, *self._arguments)] = worker, None
 
     def _deal(self) -> None:
         while self._waiting and self._idle:
@@ -222,20 +210,19 @@ class RayWorkers(Pipeline):
 
     def _finish(self, task: Any, worker: Any, shard: _Shard | None) -> None:
         """Takes a task's result; replaces the worker if it failed."""
-        result: Any = None
-        error = None
-        flaw = None
+        refused = False
         try:
-            result = ray.get(task)
-            if shard is not None:
-                flaw = find_flaw(result, len(shard.terrains), self._cfg.replicas)
-        except RayError as raised:
-            error = raised
-            flaw = _find_reason(raised)
+            result: Any = ray.get(task)
+            flaw = shard and find_flaw(result, len(shard.terrains), self._cfg.replicas)
+        except RayError as error:
+            result = None
+            flaw = _find_reason(error)
+            refused = isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)  # the user can mend it
         if flaw is None:
             self._idle.append(worker)
             if shard is not None:
-                shard.result = copied(result)
+                # What Ray delivers cannot be written to, and holds its memory.
+                shard.result = replace(result, **{name: values.copy() for name, values in result.arrays.items()})
             return
         with suppress(RayError):
             ray.kill(worker)
@@ -243,13 +230,13 @@ class RayWorkers(Pipeline):
         self._grown_at = -_GROW_EVERY_S  # another is started at once
         if shard is None:
             self._failed_starts += 1
-            if _is_refusal(error) or self._failed_starts >= _MOST_TRIES:
-                kind = ValueError if _is_refusal(error) else EvaluatorError
+            if refused or self._failed_starts >= _MOST_TRIES:
+                kind = ValueError if refused else EvaluatorError
                 raise kind(f"a worker cannot build its simulation: {flaw}")
             return
         if not any(shard in lot for lot in self._lots):  # forgotten meanwhile
             return
-        if _is_refusal(error):  # as any other worker would
+        if refused:  # as any other worker would
             raise ValueError(flaw)
         shard.tries += 1
         self._retries += 1
@@ -258,11 +245,6 @@ class RayWorkers(Pipeline):
             raise EvaluatorError(f"{what} failed {_MOST_TRIES} times; the last time: {flaw}")
         print(f"a worker failed ({flaw}); its {what} are crossed again by another", file=sys.stderr)
         self._waiting.appendleft(shard)
-
-
-def _is_refusal(error: BaseException | None) -> bool:
-    """Whether a worker raised a ValueError, which the user can mend."""
-    return isinstance(error, RayTaskError) and isinstance(error.cause, ValueError)
 
 
 def _find_reason(error: BaseException) -> str:

@@ -18,7 +18,6 @@ from qd.search.loop import search
 from qd.search.settings import SearchCfg
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from qd.workers.shards import result_arrays
 from results.make.common import ONCE, parse
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
@@ -38,7 +37,7 @@ def look_again(archive: Archive, cfg: SearchCfg, policy: str, crosser: Crosser) 
     label = "fresh episodes"
     terrains = Terrains(genes=genes, seeds=seeds, space=get_space(cfg.space))
     result = crosser.cross(policy, terrains, replicas=cfg.replicas, label=label)
-    by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in result_arrays(result).items()}
+    by_elite = {name: value.reshape(len(some), -1, *value.shape[2:]) for name, value in result.arrays.items()}
     result = replace(result, **{name: value[:, :FRESH_EPISODES] for name, value in by_elite.items()})
     return fresh_numbers(some, fresh_values(some, result, cfg.fitness)) | {"elites": len(archive)}
 

@@ -1,9 +1,8 @@
 """Crossings in plain MuJoCo C, one after another."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -271,15 +270,7 @@ class MujocoC:
                 )
                 for first in range(0, self._replicas, _CHUNK)
             ]  # fmt: skip
-            results.append(_join(chunks, axis=1))
+            results.append(RolloutResult.join(chunks, axis=1))
             if progress is not None:
                 progress((index + 1) / len(heights))
-        return _join(results, axis=0)
-
-
-def _join(results: Sequence[RolloutResult], *, axis: int) -> RolloutResult:
-    names = [name for name, value in vars(results[0]).items() if isinstance(value, np.ndarray)]
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(result, name) for result in results], axis=axis) for name in names
-    }
-    return replace(results[0], **joined)
+        return RolloutResult.join(results)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.workers.shards import find_flaw
+from qd.workers.invalid import find_flaw
 from tests.qd import stand_in
 
 RESULT = stand_in.evaluate(np.zeros((3, 64), np.float32), np.arange(3), 4)
