@@ -202,7 +202,7 @@ class MinimiseCommand(_RunFlags):
 
     def execute(self) -> None:
         """Finds the minimal terrains, and prints them."""
-        from qd.faults.minimise.minimise import minimise
+        from qd.faults.minimise import minimise
 
         run, named = self.named()
         minimise(run, elite=self.elite, how=self.how, judged=self.judge or bool(self.certifiers), **named)

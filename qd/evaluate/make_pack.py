@@ -27,8 +27,7 @@ from qd.evaluate.pack import (
 )
 from qd.evaluate.sets import hash_elites, read_trained_on
 from qd.faults.families import VERDICTS, find_families, find_verdicts, rank
-from qd.faults.minimise.results import read_minimal
-from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers
+from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_certifiers
 from qd.search.archive import Archive
 from qd.search.directory import RUNS

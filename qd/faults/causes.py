@@ -16,18 +16,12 @@ from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.wider import WiderSpace
 
-LEAST_HEIGHT = 0.03
-"""A part that is lower and less deep everywhere under the robot lies beside its way [m]."""
-GENTLE = 10.0
-"""Slopes below are gentle [degrees]."""
-HEAD_ON = 30.0
-"""A slope that rises or falls at a smaller angle to the way is met head on [degrees]."""
-SIDEWAYS = 60.0
-"""A slope at a larger angle to the way is met from the side [degrees]."""
-SHORT = 1.0
-"""A part that keeps half of its height over no more of the way is a ridge or a ditch [m]."""
-NARROW = 0.5
-"""A part that falls to half of its height within this distance of the way ends there [m]."""
+_LEAST_HEIGHT = 0.03  # a part that is lower and less deep everywhere under the robot lies beside its way [m]
+_GENTLE = 10.0  # slopes below are gentle [degrees]
+_HEAD_ON = 30.0  # a slope that rises or falls at a smaller angle to the way is met head on [degrees]
+_SIDEWAYS = 60.0  # a slope at a larger angle to the way is met from the side [degrees]
+_SHORT = 1.0  # a part that keeps half of its height over no more of the way is a ridge or a ditch [m]
+_NARROW = 0.5  # a part that falls to half of its height within this distance of the way ends there [m]
 
 SLIPPERY = "slippery ground"
 SOFT = "soft ground"
@@ -38,9 +32,10 @@ _STRAIGHT = {"rise": "high", "drop": "deep", "ridge": "high", "ditch": "deep"}
 SHAPES: dict[str, str | None] = {
     **_STRAIGHT,
     **{f"oblique {kind}": size for kind, size in _STRAIGHT.items()},
-    "ridge end": "high", "ditch end": "deep", "knob": "high", "hole": "deep",
-    "gentle hill": "high", "gentle hollow": "deep", "side slope": None, OFF_THE_WAY: None,
-}  # fmt: skip
+    **dict.fromkeys(("ridge end", "knob", "gentle hill"), "high"),
+    **dict.fromkeys(("ditch end", "hole", "gentle hollow"), "deep"),
+    **dict.fromkeys(("side slope", OFF_THE_WAY)),
+}
 """Causes that are shapes, by what their height is called; None where its sign says whether it is high or deep."""
 
 _BEHIND = 1.25  # how far before the place where robots end something may have stopped them [m]
@@ -57,7 +52,7 @@ class Shape:
     """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
     kind: str
-    """One of :func:`list_kinds`."""
+    """One of :data:`SHAPES`, :data:`SLIPPERY`, :data:`SOFT`, or the cause of a condition; docs/faults.md has limits."""
     height_m: float
     """Height under the robot where it is largest, negative of a hollow [m]."""
     slope_deg: float
@@ -97,7 +92,7 @@ class Effects:
     def changes(self, least: float) -> NDArray[np.bool_]:
         """Whether a part sets a condition, or changes the ground, or heights by over ``least`` [m]; (num_parts,)."""
         sets = np.array([kind != "" for kind in self.conditions], bool)
-        return sets | (np.abs(self.heights).max(axis=(1, 2)) > least) | (self.patches.sum(axis=(1, 2)) > 0)
+        return sets | (np.abs(self.heights).max(axis=(1, 2)) > least) | self.patches.any(axis=(1, 2))
 
     def way(self, part: int, half_width: float) -> tuple[float, bool]:
         """Largest height or depth [m] of a part under a robot on its way, and whether it changes the ground there."""
@@ -106,22 +101,17 @@ class Effects:
         first_row, last_row = patch_index((y - half_width, y + half_width), SPACING * (NUM_ROWS - 1), patches.shape[0])
         first, last = patch_index((x, CrossingCfg.goal[0]), SPACING * (NUM_COLS - 1), patches.shape[1])
         changed = patches[first_row : last_row + 1, first : last + 1].any()
-        return largest_height(self.heights[part], half_width), bool(changed)
+        return float(np.abs(_under(self.heights[part], half_width)).max()), bool(changed)
 
     def shape(self, part: int, half_width: float) -> Shape:
         """The shape of a part. A condition has only a kind, and so has a part that changes the ground alone."""
         name = self.conditions[part]
         kind = CONDITIONS[name].cause if name else None
-        if kind is None and self.patches[part].any() and self.way(part, half_width)[0] < LEAST_HEIGHT:
+        if kind is None and self.patches[part].any() and self.way(part, half_width)[0] < _LEAST_HEIGHT:
             kind = SLIPPERY if self.slippery[part].any() else SOFT
         if kind is None:
             return measure_shape(self.heights[part], half_width)
         return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
-
-
-def list_kinds() -> tuple[str, ...]:
-    """What the part of a terrain that stops the robot can be; docs/faults.md has the limits of the shapes."""
-    return (*SHAPES, SLIPPERY, SOFT, *(condition.cause for condition in CONDITIONS.values()))
 
 
 def describe_cause(cause: Mapping[str, Any] | None) -> str:
@@ -149,30 +139,24 @@ def find_effects(genes: NDArray[np.float32], parts: Sequence[int], space: Terrai
     rows = [genes[None], *(space.without(genes[None], [part]) for part in parts)]
     heights, ground = make_terrains(np.concatenate(rows), space)
     nothing = np.zeros((len(parts), *PATCHES), bool)
+    texts = condition_texts(space.condition_rows(genes[None])[0], space.conditions)
+    first = len(space.parts(genes)) - len(texts)
+    conditions = {first + k: name for k, name in enumerate(space.conditions) if texts[k]}
     return Effects(
         heights=heights[0] - heights[1:],
         slippery=nothing if ground is None else ground.friction[0] != ground.friction[1:],
         soft=nothing if ground is None else ground.time_constant_s[0] != ground.time_constant_s[1:],
-        conditions=_find_conditions(genes, parts, space),
+        conditions=tuple(conditions.get(part, "") for part in parts),
     )
-
-
-def _find_conditions(genes: NDArray[np.float32], parts: Sequence[int], space: TerrainSpace) -> tuple[str, ...]:
-    """The kind of condition that each part of a terrain sets, if it does."""
-    first = len(space.parts(genes)) - len(space.conditions)
-    (row,) = space.condition_rows(genes[None])
-    texts = condition_texts(row, space.conditions)
-    names = [name if text else "" for name, text in zip(space.conditions, texts, strict=True)]
-    return tuple(names[part - first] if part >= first else "" for part in parts)
 
 
 def find_causes(
     genes: NDArray[np.float32], ends: NDArray[np.floating], space: TerrainSpace, half_width: float
 ) -> list[str]:
-    """What stops robots that end at a place of each terrain: one of :func:`list_kinds`, or :data:`UNCLEAR`.
+    """What stops robots that end at a place of each terrain: the kind of a :class:`Shape`, or :data:`UNCLEAR`.
 
-    It is the part which, alone on flat ground, has the largest difference of heights near that place. Where none has
-    :data:`LEAST_HEIGHT` it is slippery or soft ground, or unclear. How near was chosen on half of the elites in
+    It is the part which, alone on flat ground, has the largest difference of heights near that place. Where that is
+    under 3 cm it is slippery or soft ground, or unclear. How near was chosen on half of the elites in
     results/ whose minimal terrain is known. On the other half it names the kind of the minimal terrain's cause in six
     of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
 
@@ -195,7 +179,7 @@ def _find_cause(genes: NDArray[np.float32], end: NDArray[np.floating], space: Te
     maps = make_heights(np.concatenate(alone), raised, every=every)
     differences = [np.ptp(heights[_around(end, every * SPACING, heights.shape)]) for heights in maps]
     part = int(np.argmax(differences))
-    if differences[part] < LEAST_HEIGHT:
+    if differences[part] < _LEAST_HEIGHT:
         return _find_ground(genes, end, space) if space.ground else UNCLEAR
     heights = maps[part] if every == 1 else make_heights(alone[part], raised)[0]
     at_end = np.roll(heights, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
@@ -203,13 +187,12 @@ def _find_cause(genes: NDArray[np.float32], end: NDArray[np.floating], space: Te
     return next((kind for kind in kinds if kind != OFF_THE_WAY), UNCLEAR)
 
 
-def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -> tuple[slice, ...]:
     """Rows and columns of the nodes near a place, or nearest to it at the edge."""
     x, y = end.tolist()
-    last_row, last_column = np.array(shape) - 1
-    rows = np.clip(np.rint(np.array([y - _BESIDE, y + _BESIDE]) / spacing), 0, last_row).astype(int)
-    columns = np.clip(np.rint(np.array([x - _BEHIND, x + _AHEAD]) / spacing), 0, last_column).astype(int)
-    return slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
+    limits = np.array([[y - _BESIDE, y + _BESIDE], [x - _BEHIND, x + _AHEAD]])
+    nodes = np.clip(np.rint(limits / spacing), 0, np.array(shape)[:, None] - 1).astype(int)
+    return tuple(slice(first, last + 1) for first, last in nodes.tolist())
 
 
 def _find_ground(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
@@ -251,52 +234,41 @@ def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
     return Shape(kind=_classify(numbers), **{name: round(value, 3) for name, value in numbers.items()})
 
 
-def largest_height(field: NDArray[np.float32], half_width: float) -> float:
-    """Largest height or depth [m] of a part under a robot on the straight way from start to goal."""
-    return float(np.abs(_under(field, half_width)).max())
-
-
 def _classify(shape: dict[str, float]) -> str:
     """The kind of a shape by the limits above; docs/faults.md has them as a table."""
     raised = shape["height_m"] > 0.0
-    if abs(shape["height_m"]) < LEAST_HEIGHT:
+    if abs(shape["height_m"]) < _LEAST_HEIGHT:
         return OFF_THE_WAY
-    if shape["slope_deg"] < GENTLE:
+    if shape["slope_deg"] < _GENTLE:
         return "gentle hill" if raised else "gentle hollow"
-    if shape["length_m"] <= SHORT:
+    if shape["length_m"] <= _SHORT:
         name = "ridge" if raised else "ditch"
-        ends = sum(shape[side] < NARROW for side in ("left_m", "right_m"))
+        ends = sum(shape[side] < _NARROW for side in ("left_m", "right_m"))
         if ends:
             return f"{name} end" if ends == 1 else "knob" if raised else "hole"
-    elif shape["oblique_deg"] > SIDEWAYS:
+    elif shape["oblique_deg"] > _SIDEWAYS:
         return "side slope"
     else:
         name = "rise" if shape["along_deg"] > 0.0 else "drop"
-    return name if shape["oblique_deg"] <= HEAD_ON else f"oblique {name}"
+    return name if shape["oblique_deg"] <= _HEAD_ON else f"oblique {name}"
 
 
 def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
     """Values of the nodes under the robot, shape (along the way, across it)."""
     first, last = (round(x / SPACING) for x, _ in (CrossingCfg.start, CrossingCfg.goal))
-    lowest = _first_row(half_width)
-    return values[lowest : 2 * _CENTRE - lowest + 1, first : last + 1].T
-
-
-def _first_row(half_width: float) -> int:
-    """The grid's first row that is under the robot."""
-    return _CENTRE - round(half_width / SPACING)
+    reach = round(half_width / SPACING)
+    return values[_CENTRE - reach : _CENTRE + reach + 1, first : last + 1].T
 
 
 def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width: float) -> tuple[float, float]:
     """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
-    middle = _first_row(half_width) + int(row)
+    middle = _CENTRE - round(half_width / SPACING) + int(row)
     first = round(CrossingCfg.start[0] / SPACING) + int(column)
     near = round(_NEAR / SPACING)
     highest = field[middle, first]
     window = field[:, max(first - near, 0) : first + near + 1]
     low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
-    above = np.flatnonzero(low[middle:])
-    below = np.flatnonzero(low[middle::-1])
-    left = middle + int(above[0]) if len(above) else len(low)
-    right = middle - int(below[0]) if len(below) else -1
+    low = np.pad(low, 1, constant_values=True)  # the grid's edge ends it
+    left = middle + int(low[middle + 1 :].argmax())
+    right = middle - int(low[middle + 1 :: -1].argmax())
     return SPACING * (left - _CENTRE), SPACING * (_CENTRE - right)

@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from kernels.episode import Outcome
 from qd.faults.causes import UNCLEAR, describe_commonest, find_causes
-from qd.faults.minimise.results import MinimalTerrains
-from qd.faults.numbers import TEMPLATES, count_faults
+from qd.faults.numbers import TEMPLATES, MinimalTerrains, count_faults
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg

@@ -1,4 +1,4 @@
-"""Faults in numbers and words: what is known of the elites on which a controller fails.
+"""Faults in numbers and words: what is known of the elites on which a controller fails, and their minimal terrains.
 
 An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
 controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
@@ -7,6 +7,7 @@ certificate is not known to be passable. A fault is robust if it is one under va
 """
 
 from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,10 @@ from numpy.typing import NDArray
 
 from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
-from sim.files.intervals import bootstrap_interval, format_rate, wilson_interval
+from sim.files.atomic import read_json
+from sim.files.command import choose_elites
+from sim.files.intervals import bootstrap_interval, format_rate, format_value, wilson_interval
+from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
 
 FRESH_EPISODES = 40
@@ -29,8 +33,12 @@ SPECIALIST = "specialist"
 TEMPLATES = open_templates(Path(__file__).parent / "templates")
 """Texts about elites."""
 _INVALID = OUTCOMES.index("invalid")
+_KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
 VARIED_NUMBERS = ("crossed_varied", "robust")
 """Numbers of :func:`fault_numbers` that an archive has only if it was judged under varied conditions."""
+MINIMAL_FILE = "minimal.npz"
+MINIMAL_NUMBERS_FILE = "minimal.json"
+_ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
 
 
 def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -135,16 +143,20 @@ def best_certifier(archive: Archive, number: int, among: Container[str] | None =
     return max(names, key=certifiers.__getitem__, default=None)
 
 
+def _certifier_outcomes(archive: Archive) -> dict[str, NDArray[np.int64]]:
+    """Outcomes of the certifiers by kind of episodes, shape (N, C, 4)."""
+    tables = (archive.certifier_outcomes, archive.certifier_resolved_outcomes, archive.certifier_varied_outcomes)
+    return {kind: table for kind, table in zip(_KINDS, tables, strict=True) if table is not None}
+
+
 def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
     """Further episodes on an elite that reached the goal, and valid ones, by controller and conditions."""
     counts = {"With contact resolved (steps of 1 ms)": archive.resolved_outcomes[number]}
     if archive.varied_outcomes is not None:
         counts["Under varied conditions"] = archive.varied_outcomes[number]
     for column, name in enumerate(archive.certifiers):
-        counts[name] = archive.certifier_outcomes[number, column]
-        counts[f"{name} with contact resolved"] = archive.certifier_resolved_outcomes[number, column]
-        if archive.certifier_varied_outcomes is not None:
-            counts[f"{name} under varied conditions"] = archive.certifier_varied_outcomes[number, column]
+        for kind, table in _certifier_outcomes(archive).items():
+            counts[name + _KINDS[kind]] = table[number, column]
     return {label: (int(ends[0]), int(ends.sum() - ends[_INVALID])) for label, ends in counts.items() if ends.any()}
 
 
@@ -153,12 +165,9 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     rates = {label: format_rate(*rate) for label, rate in further_rates(archive, number).items()}
     if not rates:
         return []
-    text = TEMPLATES.get_template("elite.txt").render(
-        rates=rates, failing=archive.failing[number], confirmed=archive.confirmed[number],
-        robust=archive.robust[number],
-        crossers=[*compress(archive.certifiers, archive.certificates[number].tolist())],
-    )  # fmt: skip
-    return text.splitlines()
+    crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
+    known = {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust")}
+    return TEMPLATES.get_template("elite.txt").render(rates=rates, crossers=crossers, **known).splitlines()
 
 
 def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:
@@ -187,16 +196,70 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """
     resolved = archive.resolved_outcomes[number]
     varied = archive.varied_outcomes
-    kinds = {"searched": archive.certifier_outcomes, "resolved": archive.certifier_resolved_outcomes}
-    if archive.certifier_varied_outcomes is not None:
-        kinds["varied"] = archive.certifier_varied_outcomes
     under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_numbers(varied[number])}
     return under_varied | {
         "resolved": rate_numbers(resolved) if resolved.any() else None,
         "certificates": [
             {"controller": name, "policy_sha256": digest}
-            | {kind: rate_numbers(counts[number, column]) for kind, counts in kinds.items()}
+            | {kind: rate_numbers(table[number, column]) for kind, table in _certifier_outcomes(archive).items()}
             for column, (name, digest) in enumerate(zip(archive.certifiers, archive.certifier_sha256, strict=True))
             if archive.certificates[number, column]
         ],
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinimalTerrains:
+    """Minimal terrains of elites of an archive."""
+
+    numbers: dict[str, Any]
+    """The content of ``minimal.json``."""
+    genes: dict[int, NDArray[np.float32]]
+    """By number of the elite, each of shape (num_genes,)."""
+
+    def choose(self, text: str, run: object) -> list[int]:
+        """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
+        return choose_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
+
+    def entry(self, number: int) -> dict[str, Any]:
+        """The entry of an elite in ``minimal.json``."""
+        return next(entry for entry in self.numbers["elites"] if entry["elite"] == number)
+
+    def describe(self, number: int) -> str:
+        """What is known of the minimal terrain of an elite, in a sentence."""
+        entry = self.entry(number)
+        rate = format_value(entry["goal_rate"], entry["goal_interval"], ".0%")
+        return TEMPLATES.get_template("minimal.txt").render(entry=entry, rate=rate)
+
+
+def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
+    """The minimal terrains in a run's folder that are of elites of the archive; None if there are none."""
+    file = folder / MINIMAL_NUMBERS_FILE
+    if not file.exists():
+        return None
+    try:
+        numbers = read_json(file)
+        arrays = read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
+        entries = numbers["elites"]
+        genes = arrays["genes"]
+        shape = (len(entries), archive.genes.shape[1])
+        if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
+            raise ValueError(f"{MINIMAL_NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
+        if not all(set(_ENTRY) <= set(entry) for entry in entries):
+            raise ValueError(f"expected {', '.join(_ENTRY)} of each")
+    except Exception as error:  # a damaged zip archive can fail with anything
+        files = f"{folder / MINIMAL_NUMBERS_FILE} and {MINIMAL_FILE}"
+        what = f"it lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(
+            f"{files} must be minimal terrains of the archive beside them: {what}: remove both, or run `faultline "
+            "minimise` again"
+        ) from None
+    # A search that went on may have found others of these numbers.
+    names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
+    rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
+    if not rows:
+        return None
+    return MinimalTerrains(
+        numbers=numbers | {"elites": [entries[row] for row in rows]},
+        genes={entries[row]["elite"]: genes[row] for row in rows},
+    )

@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from qd.faults.families import rank, summarise_search
-from qd.faults.minimise.results import read_minimal
-from qd.faults.numbers import fault_numbers, found_numbers
+from qd.faults.numbers import fault_numbers, found_numbers, read_minimal
 from qd.search.archive import Archive, Subject, no_outcomes, read_archive
 from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory
 from qd.search.fitness import Evaluation, join_evaluations

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import UNCLEAR
 from qd.faults.families import Ranking, rank
-from qd.faults.minimise.results import MinimalTerrains, read_minimal
-from qd.faults.numbers import best_certifier
+from qd.faults.numbers import MinimalTerrains, best_certifier, read_minimal
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.archive import Archive, read_archive
 from qd.search.directory import CONFIG_FILE, RunDirectory, check_config, check_space, find_directory, find_run

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Self, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -59,30 +59,19 @@ def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterat
             yield ProcessPipeline(processes, cfg.num_terrains)
 
 
-class Crosser:
+class Crosser(ExitStack):
     """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
 
     Crossings that are done are stored in the folder ``cache``, if there is one.
     """
 
     def __init__(self, robot: RobotCfg | str, compute: Compute, *, cache: Path | None = None) -> None:
+        super().__init__()
         self.robot = get_robot(robot)
         self.compute = compute
         self._cache = None if cache is None else Cache(cache)
         self._stored: dict[str, StoredCrossings] = {}
-        self._stack = ExitStack()
         self._opened: tuple[PipelineCfg, Pipeline] | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Closes the simulation that is open."""
-        self._opened = None
-        self._stack.close()
 
     def cross(
         self,
@@ -149,8 +138,8 @@ class Crosser:
         settings += [space_key(terrains.space.name, terrains.space.sha256)]
         settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
         settings += [repr(self.robot.training) if cfg.reward else None]  # whose terms the reward has
-        content = json.dumps([*settings, code_fingerprint(("kernels", "sim"))])
-        key = hashlib.sha256(content.encode()).hexdigest()[:32]
+        settings += [code_fingerprint(("kernels", "sim"))]
+        key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)
         return self._stored[key]
@@ -171,7 +160,8 @@ class Crosser:
             with Bar(label) as bar:
                 yield from pipeline.in_lots(terrains, lot, bar.move_to)
         except BaseException:
-            self.close()  # what failed is not used again
+            self._opened = None  # what failed is not used again
+            self.close()
             raise
 
     def _open(self, cfg: PipelineCfg) -> Pipeline:
@@ -181,7 +171,7 @@ class Crosser:
             if replace(opened, num_terrains=cfg.num_terrains) == cfg and opened.num_terrains >= cfg.num_terrains:
                 return pipeline
         self.close()
-        pipeline = self._stack.enter_context(open_pipeline(cfg))
+        pipeline = self.enter_context(open_pipeline(cfg))
         self._opened = (cfg, pipeline)
         return pipeline
 

@@ -79,11 +79,8 @@ class PipelineCfg:
     @property
     def in_process(self) -> bool:
         """Whether this process simulates: on a GPU without Ray, and where it may have no children of its own."""
-        return (
-            not self.on_ray
-            and not self.on_mujoco_c
-            and (self.compute.on_gpu or multiprocessing.current_process().daemon)
-        )
+        alone = self.compute.on_gpu or multiprocessing.current_process().daemon
+        return alone and not self.on_ray and not self.on_mujoco_c
 
     @property
     def num_workers(self) -> int:
@@ -211,11 +208,14 @@ class Pipeline:
             while behind and (behind[0].stop - num_crossed <= self.num_terrains or behind[0].start == num_crossed):
                 self.put(terrains[behind.popleft()])
 
+        def report(share: float) -> None:
+            if progress is not None:
+                progress(min(1.0, (lot.start + share * (lot.stop - lot.start)) / count))
+
         self.clear()
         for lot in lots:
             put_what_fits()
-            share = (lot.stop - lot.start) / count
-            result = self.take(None if progress is None else _scale(progress, lot.start / count, share))
+            result = self.take(report)
             num_crossed = lot.stop
             put_what_fits()  # before the result is looked at
             yield lot, result
@@ -265,7 +265,3 @@ class ProcessPipeline(Pipeline):
         """Waits for all pending lots and drops them."""
         while self._lots:
             self.take()
-
-
-def _scale(progress: Progress, start: float, share: float) -> Progress:
-    return lambda done: progress(min(1.0, start + share * done))

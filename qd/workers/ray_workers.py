@@ -181,8 +181,13 @@ class RayWorkers(Pipeline):
         self._waiting.clear()
 
     def _turn(self) -> None:
-        """Waits for some task to end, but not for long, and gives idle workers the next."""
-        self._start_missing()
+        """Waits for some task to end, but not for long, and gives idle workers the next; starts workers that lack."""
+        if time.monotonic() - self._grown_at >= _GROW_EVERY_S:
+            self._grown_at = time.monotonic()
+            for _ in range((self._count or max(1, num_devices(self._cfg.compute.device))) - len(self._workers)):
+                worker = RayWorker.options(**self._resources).remote()
+                self._workers.add(worker)
+                self._tasks[worker.prepare.remote(self._size, *self._arguments)] = worker, None
         if not self._tasks:
             time.sleep(_POLL_S)
         for task in ray.wait([*self._tasks], timeout=_POLL_S)[0] if self._tasks else []:
@@ -192,15 +197,6 @@ class RayWorkers(Pipeline):
         elif time.monotonic() - self._seen_at > _PATIENCE_S:
             raise EvaluatorError(f"no worker came within {_PATIENCE_S:g} s; the cluster has {resources()}")
         self._deal()
-
-    def _start_missing(self) -> None:
-        if time.monotonic() - self._grown_at < _GROW_EVERY_S:
-            return
-        self._grown_at = time.monotonic()
-        for _ in range((self._count or max(1, num_devices(self._cfg.compute.device))) - len(self._workers)):
-            worker = RayWorker.options(**self._resources).remote()
-            self._workers.add(worker)
-            self._tasks[worker.prepare.remote(self._size, *self._arguments)] = worker, None
 
     def _deal(self) -> None:
         while self._waiting and self._idle:

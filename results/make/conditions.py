@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.faults.minimise.minimise import minimise
+from qd.faults.minimise import minimise
 from qd.faults.numbers import EPISODES
 from qd.faults.stages import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates

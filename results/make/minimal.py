@@ -5,7 +5,7 @@ They lie beside the published archive, results/<robot>/archive, of whose elites 
 
 from collections.abc import Sequence
 
-from qd.faults.minimise.minimise import minimise
+from qd.faults.minimise import minimise
 from results.make.common import parse
 
 

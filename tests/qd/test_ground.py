@@ -7,7 +7,7 @@ import pytest
 
 from qd.commands import ArchiveCommand
 from qd.faults.causes import find_causes, find_effects
-from qd.faults.minimise.minimise import minimise
+from qd.faults.minimise import minimise
 from qd.search import settings
 from qd.search.archive import read_archive, write_archive
 from qd.show.commands import ExportCommand

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
-from qd.faults.minimise.results import MinimalTerrains
-from qd.faults.numbers import fault_numbers
+from qd.faults.numbers import MinimalTerrains, fault_numbers
 from qd.search.archive import Archive
 from qd.search.directory import METRICS_FILE, Metrics, RunDirectory
 from qd.show.crossed import Rate

@@ -21,7 +21,7 @@ from qd.evaluate.pack import (
     write_terrains,
 )
 from qd.faults.judge import judge
-from qd.faults.minimise.minimise import minimise
+from qd.faults.minimise import minimise
 from qd.faults.searches import find_search
 from qd.search.archive import read_archive
 from sim.controllers.spec import controller_identity

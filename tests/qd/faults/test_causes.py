@@ -9,12 +9,12 @@ import pytest
 from qd.faults.causes import (
     OFF_THE_WAY,
     SHAPES,
+    SLIPPERY,
+    SOFT,
     describe_cause,
     describe_commonest,
     find_causes,
     find_effects,
-    largest_height,
-    list_kinds,
     measure_shape,
 )
 from qd.faults.searches import Search
@@ -83,7 +83,7 @@ def test_kinds_and_whether_they_are_high_or_deep(field, kind, size):
 def test_every_kind_is_measured_described_and_documented():
     assert {kind for _, kind, _ in CASES} == {*SHAPES}
     page = (Path(__file__).parents[3] / "docs" / "faults.md").read_text()
-    for kind in list_kinds():
+    for kind in (*SHAPES, SLIPPERY, SOFT, *(condition.cause for condition in CONDITIONS.values())):
         assert kind.removeprefix("oblique ") in page or kind == CONDITIONS["wind"].cause  # of the tests alone
         commonest = describe_commonest(kind)
         is_shape = kind in SHAPES and kind != OFF_THE_WAY
@@ -104,10 +104,11 @@ def test_the_angle_to_the_way_and_the_reach_to_either_side():
 
 def test_effects_of_parts_add_up():
     genes = SUPER_GAUSSIAN.hard_random(1, 5)
-    fields = find_effects(genes[0], [0, 3, 7], SUPER_GAUSSIAN).heights
+    effects = find_effects(genes[0], [0, 3, 7], SUPER_GAUSSIAN)
+    fields = effects.heights
     rest = make_heights(SUPER_GAUSSIAN.without(genes, [1, 2, 4, 5, 6]))[0]
     np.testing.assert_allclose(fields.sum(axis=0), rest, atol=1e-6)
-    assert largest_height(fields[0], HALF_WIDTH) == np.abs(fields[0, 72:89, 40:281]).max()
+    assert effects.way(0, HALF_WIDTH) == (np.abs(fields[0, 72:89, 40:281]).max(), False)
 
 
 @pytest.mark.parametrize(("half_width", "cause"), [(0.1, "unclear"), (0.6, "ridge end")])

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise_search
-from qd.faults.minimise.minimise import MinimalTerrains
+from qd.faults.numbers import MinimalTerrains
 from qd.search.archive import no_outcomes
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN

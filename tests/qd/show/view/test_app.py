@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import Outcome
-from qd.faults.minimise.minimise import MinimalTerrains
+from qd.faults.numbers import MinimalTerrains
 from qd.show.crossed import find_failure_time, find_typical_episode
 from qd.show.recordings import Recordings, request_elite
 from qd.show.view.app import App

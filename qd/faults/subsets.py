@@ -107,10 +107,21 @@ Steps = Generator[list[Trial], None, Any]
 
 
 def find_minimal(case: Case) -> Steps:
-    """Finds the minimal terrain of a case, and the least scale of its heights."""
+    """Finds the minimal terrain of a case, and the least scale of its heights by halving."""
     case.minimal = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
-    if case.scalable and not set(case.minimal) <= set(case.flat):
-        case.scale, case.passing_scale = yield from _scaled(case, case.minimal)
+    if not case.scalable or set(case.minimal) <= set(case.flat):
+        return
+    passing = 0.0
+    failing = 1.0
+    for _ in range(SCALE_STEPS):
+        trial = Trial(case.minimal, scale=(passing + failing) / 2)
+        yield from _missing(case, trial)
+        if case.fails(trial):
+            failing = trial.scale
+        else:
+            passing = trial.scale
+    case.scale = failing
+    case.passing_scale = passing or None
 
 
 def _rest(parts: Parts, part: int) -> Parts:
@@ -160,20 +171,6 @@ def _greedy(case: Case) -> Steps:
             return parts
 
 
-def _scaled(case: Case, parts: Parts) -> Steps:
-    """The least scale that was crossed and fails, and the largest below it that does not; None if none was crossed."""
-    passing = 0.0
-    failing = 1.0
-    for _ in range(SCALE_STEPS):
-        trial = Trial(parts, scale=(passing + failing) / 2)
-        yield from _missing(case, trial)
-        if case.fails(trial):
-            failing = trial.scale
-        else:
-            passing = trial.scale
-    return failing, passing or None
-
-
 def cut_genes(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> NDArray[np.float32]:
     """Genes of the parts of a terrain that a trial crosses, shape (num_genes,)."""
     gone = [part for part in range(len(space.parts(genes))) if part not in trial.parts]
@@ -218,16 +215,12 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) ->
     subsets = [math.comb(len(case.parts), len(case.parts) // 2) for case in cases.values() if case.how == "exhaustive"]
     room = max(len(cases) * Trial((), fresh=True).rows, sum(subsets) * Trial(()).rows)
     steps = {number: find_minimal(case) for number, case in sorted(cases.items())}
-    while steps:
-        wanted = {number: next(step, None) for number, step in steps.items()}
-        steps = {number: step for number, step in steps.items() if wanted[number] is not None}
-        trials = [(number, trial) for number in steps for trial in wanted[number] or ()]
-        if not trials:
-            break
+    while wanted := {number: trials for number, step in steps.items() if (trials := next(step, None))}:
+        trials = [(number, trial) for number, missing in wanted.items() for trial in missing]
         genes = [[cut_genes(archive.genes[n], trial, search.space)] * trial.rows for n, trial in trials]
         rows = np.concatenate([seeds[trial.fresh][n] for n, trial in trials])
         terrains = Terrains(genes=np.concatenate(genes), seeds=rows, space=search.space)
-        label = f"{len(cases) - len(steps)} of {len(cases)} elites done"
+        label = f"{len(cases) - len(wanted)} of {len(cases)} elites done"
         outcomes = judging.count(search.policy, terrains, label, replicas=_ROW_EPISODES, room=room)
         ends = np.cumsum([trial.rows for _, trial in trials])
         for (number, trial), counts in zip(trials, np.split(outcomes, ends[:-1]), strict=True):

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.faults.minimise.minimise import minimise, read_minimal
+from qd.faults.minimise import minimise
+from qd.faults.numbers import read_minimal
 from qd.search.archive import read_archive
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
@@ -20,8 +21,8 @@ SPACE = "sim.terrains.spaces.super_gaussian.SuperGaussian"
 def minimal_undrawn(request, monkeypatch):
     """The figure takes longer to draw than the rest; one test draws it."""
     if "end_to_end" not in request.node.name:
-        monkeypatch.setattr("qd.faults.minimise.minimise.draw_minimal", lambda *_: None)
-        monkeypatch.setattr("qd.faults.minimise.minimise.save_figure", lambda *_: None)
+        monkeypatch.setattr("qd.faults.minimise.draw_minimal", lambda *_: None)
+        monkeypatch.setattr("qd.faults.minimise.save_figure", lambda *_: None)
 
 
 def minimised(path, elites, robots=None, **changes):
@@ -104,7 +105,7 @@ def test_what_cannot_be_minimised_is_refused_before_anything_is_crossed(path, ma
     with pytest.raises(ValueError, match="certifier same"):
         minimised(path, elites, nobody, judged=True, certifiers={"same": str(get_robot("anymal").policy_file)})
     with monkeypatch.context() as patch, pytest.raises(ValueError, match="how"):
-        patch.setattr("qd.faults.minimise.subsets.MAX_PARTS", 7)
+        patch.setattr("qd.faults.subsets.MAX_PARTS", 7)
         minimised(path, elites, nobody, how="exhaustive")
     monkeypatch.setattr(f"{SPACE}.parts", lambda self, genes: ())
     with pytest.raises(ValueError, match="parts"):

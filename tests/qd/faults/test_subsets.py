@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from qd.faults.causes import find_effects
-from qd.faults.minimise.subsets import Case, Trial, find_minimal, open_case, take_apart
 from qd.faults.searches import Search
 from qd.faults.stages import Judging
+from qd.faults.subsets import Case, Trial, find_minimal, open_case, take_apart
 from qd.workers.crosser import Crosser
 from sim.robots.find import get_robot
 from sim.terrains.conditions.base import condition_column

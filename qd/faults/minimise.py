@@ -11,11 +11,17 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
-from qd.faults.minimise.results import MINIMAL_FILE, NUMBERS_FILE, MinimalTerrains, read_minimal
-from qd.faults.minimise.subsets import Case, How, Trial, cut_genes, open_case, take_apart
-from qd.faults.numbers import judgement, rate_numbers
+from qd.faults.numbers import (
+    MINIMAL_FILE,
+    MINIMAL_NUMBERS_FILE,
+    MinimalTerrains,
+    judgement,
+    rate_numbers,
+    read_minimal,
+)
 from qd.faults.searches import Search, find_search
 from qd.faults.stages import STAGES, Judging, open_judging
+from qd.faults.subsets import Case, How, Trial, cut_genes, open_case, take_apart
 from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
 from qd.show.figures import draw_minimal, save_figure
 from qd.workers.compute import Compute
@@ -50,8 +56,7 @@ def minimise(
     search = find_search(run, robot=robot, policy=policy, space=space)
     with open_judging(search, compute, certifiers, ask=judged) as judging:
         archive = search.read_archive()
-        max_elites = 200 if compute.on_gpu else 3
-        numbers = sorted(_choose_failing(archive, elite, search, max_elites=max_elites))
+        numbers = sorted(_choose_failing(archive, elite, search, max_elites=200 if compute.on_gpu else 3))
         half_width = search.robot.half_width
         cases = {n: open_case(archive, n, search.space, half_width, how, on_gpu=compute.on_gpu) for n in numbers}
         take_apart(archive, cases, judging)
@@ -77,7 +82,7 @@ def minimise(
     for number in numbers:
         verdict = f"; {entries[number]['verdict']}" if judged else ""
         print(f"Elite {number}: {result.describe(number)}{verdict}.")
-    print(f"Numbers: {run / NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
+    print(f"Numbers: {run / MINIMAL_NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
     return result
 
 
@@ -93,7 +98,7 @@ def _write(
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}
     arrays |= {"elite": np.array(numbers), "genes": np.array([genes[number] for number in numbers])}
     write_atomically(search.run / MINIMAL_FILE, npz_bytes(arrays))
-    write_atomically(search.run / NUMBERS_FILE, to_json(content))
+    write_atomically(search.run / MINIMAL_NUMBERS_FILE, to_json(content))
     genes = {number: genes[number] for number in numbers}
     save_figure(search.run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, search.space))
     return MinimalTerrains(numbers=content, genes=genes)
@@ -124,16 +129,10 @@ def _as_elites(archive: Archive, cases: Mapping[int, Case], space: TerrainSpace)
     assert rows.fresh is not None
     counts = np.array([case.fresh for case in cases.values()], np.int64).reshape(-1, len(OUTCOMES))
     genes = [cut_genes(archive.genes[number], Trial(case.minimal), space) for number, case in cases.items()]
-    fresh = replace(
-        rows.fresh,
-        goal_rate=goal_rates(counts),
-        episodes=counts.sum(axis=1),
-        invalid_episodes=counts[:, OUTCOMES.index("invalid")],
-    )
-    unjudged: dict[str, Any] = {
-        **no_outcomes(len(rows)), "certifiers": (), "certifier_sha256": (), "varied_outcomes": None,
-        "certifier_varied_outcomes": None,
-    }  # fmt: skip
+    episodes = {"episodes": counts.sum(axis=1), "invalid_episodes": counts[:, OUTCOMES.index("invalid")]}
+    fresh = replace(rows.fresh, goal_rate=goal_rates(counts), **episodes)
+    unjudged: dict[str, Any] = no_outcomes(len(rows)) | dict.fromkeys(("certifiers", "certifier_sha256"), ())
+    unjudged |= dict.fromkeys(("varied_outcomes", "certifier_varied_outcomes"))
     return replace(rows, genes=np.array(genes, np.float32).reshape(rows.genes.shape), fresh=fresh, **unjudged)
 
 
@@ -141,8 +140,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
     """A minimal terrain as ``minimal.json`` has it, without its verdict."""
     space = search.space
     descriptions = space.parts(archive.genes[number])
-    scales = (1.0, case.scale or 1.0)
-    genes = [cut_genes(archive.genes[number], Trial(case.minimal, scale), space) for scale in scales]
+    genes = [cut_genes(archive.genes[number], Trial(case.minimal, scale), space) for scale in (1.0, case.scale or 1.0)]
     effects = find_effects(genes[0], case.minimal, space)
     half_width = search.robot.half_width
     shapes = {part: effects.shape(index, half_width) for index, part in enumerate(case.minimal)}

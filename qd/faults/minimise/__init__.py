@@ -1,1 +1,0 @@
-"""Minimal terrains: the smallest ones on which a controller still fails."""
