@@ -15,14 +15,13 @@ import pytest
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.search import loop
 from qd.workers import crosser
-from results.make import bare, common, docs, search, speed, tables, train_speed
+from results.make import bare, common, docs, speed, tables
 from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 from tests.qd.searches import without_figures
 from tests.qd.stand_in import Stub, make_result
-from train.ppo.learner import Ranks
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
@@ -76,22 +75,6 @@ def test_a_trial_writes_its_file(name, tmp_path, monkeypatch):
     assert report["robot"] == "anymal" and report["sources_sha256"] == sources_sha256()
 
 
-def test_a_search_goes_on_point_by_point_and_what_was_followed_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(crosser, "open_pipeline", open_made_up)
-    monkeypatch.setattr(loop, "open_pipeline", open_made_up)
-    without_figures(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    words = ["--small", "--device", "cpu", "--out", str(tmp_path / "anymal/search.json")]
-    script = common.parse(None, words, "search.json")
-    run, cfg = tmp_path / "run", script.search_cfg()
-    first = common.follow_search(script, run, cfg, [1, 2], ("episodes", "elites"))
-    assert [row["episodes"] for row in first] == [cfg.episodes_per_iteration, 2 * cfg.episodes_per_iteration]
-    again = common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites"))
-    assert again[:2] == first and again[2]["iterations"] == 3
-    monkeypatch.setattr(common, "search", None)  # nothing is left to do
-    assert common.follow_search(script, run, cfg, [1, 2, 3], ("episodes", "elites")) == again
-
-
 def test_doses_are_the_bases_by_todays_sources(tmp_path):
     script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/spaces.json")], "spaces.json")
     file, origin = tmp_path / "anymal/dose.json", {**script.origin, "sources_sha256": sources_sha256()}
@@ -133,28 +116,6 @@ def test_a_file_of_other_sources_or_of_a_trial_is_not_current(tmp_path):
         assert common.is_current(file) == (content == ours)
 
 
-def test_speeds_of_gpu_and_cpu_stand_beside_each_other_and_a_gpu_replaces_its_own(tmp_path, monkeypatch):
-    measured = []
-    for name in speed.ON_GPU:
-        monkeypatch.setitem(
-            speed.ON_GPU, name, lambda script, name=name: measured.append(name) or {name: len(measured)}
-        )
-    monkeypatch.setattr(speed, "time_cpu", lambda script: {"cpu": script.origin})
-    monkeypatch.setattr(common, "resolve_device", lambda name: name)
-    out = tmp_path / "speed.json"
-
-    def run(device, *flags):
-        assert speed.main(["--device", device, "--out", str(out), *flags]) == json.loads(out.read_text())
-        return json.loads(out.read_text())
-
-    assert (run("cpu").get("curve"), list(run("cpu")["measured"])) == (None, ["cpu"])
-    report = run("cuda:0")
-    assert (report["device"], report["curve"], report["cpu"]["device"][:3]) == ("cuda:0", 1, "CPU")
-    assert [*report["measured"]] == ["cpu", *speed.ON_GPU] == ["cpu", *measured]
-    assert run("cpu")["device"] == "cuda:0" and run("cuda:1")["curve"] == 1 + len(speed.ON_GPU)
-    assert run("cuda:1", "--seed", "3")["cpu"] is None  # of another seed
-
-
 def test_training_rates_are_of_the_same_device(tmp_path):
     script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "speed.json")], "speed.json")
     row = {"gpus": 1, "num_envs": 4096, "train_env_steps_per_s": 7.0, "device": "cuda:0"}
@@ -176,39 +137,6 @@ def test_a_file_is_not_written_if_the_sources_changed_or_it_cannot_be(tmp_path, 
     with pytest.raises(ValueError, match="directory"):
         common.parse(None, ["--device", "cpu", "--out", str(tmp_path)], "base.json")
     assert [*tmp_path.iterdir()] == []
-
-
-def test_rows_of_several_runs_say_which_they_are_of(tmp_path, monkeypatch):
-    def time_training(script, device, num_envs, steps, iterations):
-        return {"gpus": Ranks.from_environment().size, "num_envs": num_envs}
-
-    monkeypatch.setattr(train_speed, "time_training", time_training)
-    file = tmp_path / "train_speed.json"
-    for commit, gpus in (("first", "1"), ("second", "2")):
-        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
-        monkeypatch.setenv("WORLD_SIZE", gpus)
-        train_speed.main(["--small", "--device", "cpu", "--out", str(file)])
-    rows = json.loads(file.read_text())["rows"]
-    assert [(row["gpus"], row["num_envs"], row["commit"]) for row in rows] == [
-        (1, 8, "first"), (1, 16, "first"), (2, 16, "second"),
-    ]  # fmt: skip
-    assert rows[0]["command"].startswith("python -m ") and rows[0]["date"] <= rows[2]["date"]
-    assert rows[2]["command"].startswith("torchrun --nproc-per-node 2 -m ")
-
-
-def test_each_search_of_a_method_names_its_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(crosser, "open_pipeline", open_made_up)
-    monkeypatch.setattr(loop, "open_pipeline", open_made_up)
-    monkeypatch.chdir(tmp_path)
-    without_figures(monkeypatch)
-    out = tmp_path / "anymal/search.json"
-    for commit in ("first", "second"):
-        monkeypatch.setenv("FAULTLINE_COMMIT", commit)
-        report = search.main(["--small", "--device", "cpu", "--out", str(out)])
-        (row,) = report["searches"]
-        assert (report["commit"], row["commit"]) == (commit, "first")
-        assert (row["method"], row["search_seed"]) == ("surrogate", 10)
-        assert row["elites"] == report["methods"]["surrogate"]["elites"]
 
 
 def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
