@@ -7,43 +7,37 @@ controller cross terrains; docs/searching.md shows them in twenty lines.
 import difflib
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-
-class Command(NamedTuple):
-    """A word that may stand after ``faultline``."""
-
-    module: str
-    """Has the dataclass of its flags: ``ArchiveCommand`` for ``archive``."""
-    summary: str
-
-
-COMMANDS: dict[str, dict[str, Command]] = {
+COMMANDS: dict[str, dict[str, tuple[str, str]]] = {
     "First": {
-        "archive": Command("qd.commands", "search the terrains on which a controller fails"),
-        "view": Command("qd.show.commands", "look at them in the browser"),
-        "report": Command("qd.show.commands", "one page about them"),
-        "film": Command("qd.show.commands", "film how the robot fails on one, or on a map of your own"),
-        "judge": Command("qd.commands", "which of them are faults of the controller"),
-        "export": Command("qd.show.commands", "as files, faults as a pack, a controller as ONNX"),
+        "archive": ("qd.commands", "search the terrains on which a controller fails"),
+        "view": ("qd.show.commands", "look at them in the browser"),
+        "report": ("qd.show.commands", "one page about them"),
+        "film": ("qd.show.commands", "film how the robot fails on one, or on a map of your own"),
+        "judge": ("qd.commands", "which of them are faults of the controller"),
+        "export": ("qd.show.commands", "as files, faults as a pack, a controller as ONNX"),
     },
     "Find and measure more": {
-        "minimise": Command("qd.commands", "which parts of a failing terrain it takes to fail"),
-        "evaluate": Command("qd.commands", "rates of controllers, of one or compared"),
-        "dose": Command("qd.commands", "which real obstacle at which size stops a controller"),
-        "replay": Command("qd.show.commands", "one elite, or a map of your own, again: numbers and paths"),
+        "minimise": ("qd.commands", "which parts of a failing terrain it takes to fail"),
+        "evaluate": ("qd.commands", "rates of controllers, of one or compared"),
+        "dose": ("qd.commands", "which real obstacle at which size stops a controller"),
+        "replay": ("qd.show.commands", "one elite, or a map of your own, again: numbers and paths"),
     },
     "Train": {
-        "train": Command("train.commands", "train a base controller from scratch"),
-        "finetune": Command("train.commands", "train a controller further on terrains that broke it"),
-        "harden": Command("train.commands", "rounds of search and training, until little breaks it"),
+        "train": ("train.commands", "train a base controller from scratch"),
+        "finetune": ("train.commands", "train a controller further on terrains that broke it"),
+        "harden": ("train.commands", "rounds of search and training, until little breaks it"),
     },
     "Bring a robot or a controller": {
-        "import": Command("qd.commands", "describe a public controller and its robot from what came with it"),
-        "check": Command("qd.commands", "look at a robot and its controller: does it stand, and walk"),
+        "import": ("qd.commands", "describe a public controller and its robot from what came with it"),
+        "check": ("qd.commands", "look at a robot and its controller: does it stand, and walk"),
     },
 }
-"""What can be done, by what it is for; first the six that a newcomer needs."""
+"""Words that may stand after ``faultline``, by what they are for; first the six that a newcomer needs.
+
+Each has the module of its flags, where ``archive`` is the dataclass ``ArchiveCommand``, and a summary.
+"""
 
 if TYPE_CHECKING:
     from qd.evaluate.evaluate import evaluate as evaluate
@@ -87,7 +81,7 @@ _BY_NAME = {name: command for group in COMMANDS.values() for name, command in gr
 
 def load_command(name: str) -> Any:
     """The dataclass of the flags of a word; its ``execute`` does the work."""
-    return getattr(importlib.import_module(_BY_NAME[name].module), f"{name.capitalize()}Command")
+    return getattr(importlib.import_module(_BY_NAME[name][0]), f"{name.capitalize()}Command")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -99,8 +93,8 @@ def main(argv: list[str] | None = None) -> int:
         say("usage: faultline COMMAND [OPTIONS]\n\nFind the terrains that break a legged robot's controller.\n")
         for title, group in COMMANDS.items():
             say((f"{title}:", "bold"))
-            for name, command in group.items():
-                say((f"  {name:<12}", "cyan"), command.summary)
+            for name, (_, summary) in group.items():
+                say((f"  {name:<12}", "cyan"), summary)
             print()
         say("faultline COMMAND --help tells all of a command. FAULTLINE_DEBUG=1 shows tracebacks of errors.")
         return 0

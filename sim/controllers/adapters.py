@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import torch
 
-from kernels.observation import ANG_VEL_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, NUM_BASE_COLUMNS, SCAN_OFFSET, SCAN_SCALE
+from kernels.observation import ANG_VEL_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
 from sim.robots.robot import RobotCfg
 
 
@@ -42,10 +42,8 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
     """Splits a robot's observation rows, shape (num_envs, observation_size), into physical quantities."""
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
-    joints = robot.num_joints
-    sizes = (3, 3, 3, 2, 1, joints, joints, joints, robot.num_scan_points)
+    sizes = (3, 3, 3, 2, 1, *[robot.num_joints] * 3, robot.num_scan_points)
     lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan = row.split(sizes, dim=1)
-    assert sum(sizes[:5]) == NUM_BASE_COLUMNS
     return Sensed(
         lin_vel=lin_vel / LIN_VEL_SCALE,
         ang_vel=ang_vel / ANG_VEL_SCALE,

@@ -27,12 +27,9 @@ _SETTINGS_BY_FILE = {
 
 
 def import_controller(path: Path, model_file: Path, out: Path) -> None:
-    """Writes robot.toml and controller.toml, with the weights beside them, and prints both.
+    """Writes robot.toml and controller.toml, with the weights beside them, to the folder ``out``, and prints both.
 
-    Args:
-        path: A source of one of :data:`FORMATS`.
-        model_file: MJCF or URDF of the robot.
-        out: Folder to write to; the robot is called after it.
+    ``path`` is a source of one of :data:`FORMATS`, ``model_file`` MJCF or URDF; the robot is called after the folder.
     """
     if existing := [str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()]:
         files = " and ".join(existing)
@@ -41,9 +38,9 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         raise ValueError(f"--out must end in {NEW_NAME}, got {out}")
     if not path.exists():
         raise ValueError(f"{path} is not there: expected a folder, a YAML, or weights")
-    robot_file = read_robot_file(model_file)
-    model = robot_file.model
-    source = Source(file=path, model_file=model_file, model=model, joints=joint_names(model), home=robot_file.home)
+    robot = read_robot_file(model_file)
+    joints = joint_names(robot.model)
+    source = Source(file=path, model_file=model_file, model=robot.model, joints=joints, home=robot.home)
     source_format: Any = next((source_format for source_format in FORMATS if source_format.matches(path)), None)
     if source_format is None:
         raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
@@ -57,12 +54,11 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
     if not copy.exists():
         shutil.copyfile(weights_file, copy)
     for file, names in _SETTINGS_BY_FILE.items():
-        lines = [_format_setting(name, source) for name in names if name in source.settings]
-        text = "".join(f"{line}\n" for line in lines)
+        text = "".join(f"{_format_setting(name, source)}\n" for name in names if name in source.settings)
         (out / file).write_text(f"# Of {path.name}\n{text}", encoding="utf-8")
         print(f"\n{out / file}:\n{text}", end="")
     order = [name for names in _SETTINGS_BY_FILE.values() for name in names]
-    gaps = sorted((name for name, value in source.settings.items() if value is None), key=order.index)
+    gaps = [name for name in order if source.settings.get(name, "") is None]
     print(f"\nFill in {', '.join(gaps)}; then:" if gaps else "\nNext:")
     for name in ("check", "archive"):
         print(f"  {command_line(name, robot=out / 'robot.toml')}")

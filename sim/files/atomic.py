@@ -5,7 +5,6 @@ import fcntl
 import json
 import os
 import tempfile
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -80,22 +79,6 @@ def read_json(path: Path) -> dict[str, Any]:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} must be a JSON file of an object, got: {error}: put a copy of it back") from None
-
-
-def check_zip(path: Path) -> None:
-    """Raises a ValueError if a member of a zip, as torch and NumPy write it, does not have its checksum.
-
-    Torch does not compare them when it loads, so a flipped bit would be another weight. Other files pass.
-    """
-    if not zipfile.is_zipfile(path):
-        return
-    try:
-        with zipfile.ZipFile(path) as file:
-            damaged = file.testzip()
-    except Exception as error:  # zipfile and zlib answer damage with a dozen types
-        raise ValueError(f"{type(error).__name__}: {error}") from None
-    if damaged is not None:
-        raise ValueError(f"its member '{damaged}' does not have its checksum")
 
 
 @contextlib.contextmanager

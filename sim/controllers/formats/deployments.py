@@ -31,7 +31,7 @@ class RlSar:
         """Settings of both files, refused by name if they are not understood."""
         source.file = file = path / "config.yaml" if path.is_dir() else path
         bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
-        base = next((candidate for candidate in bases if candidate.is_file()), None)
+        base = next(filter(Path.is_file, bases), None)
         if base is None:
             raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
         content = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
@@ -43,8 +43,8 @@ class RlSar:
         optional = {key: name for key, name in _RL_SAR_OPTIONAL_KEYS.items() if key in content}
         source.move(content, dict(zip(_RL_SAR_KEYS, SETTINGS, strict=True)) | optional, joints)
         if "clip_actions_upper" in content:
-            limits = zip(content.pop("clip_actions_lower"), content.pop("clip_actions_upper"), strict=True)
-            pairs = [list(pair) for pair in limits]
+            limits = map(content.pop, ("clip_actions_lower", "clip_actions_upper"))
+            pairs = [list(pair) for pair in zip(*limits, strict=True)]
             high = pairs[0][1]
             source.set(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
         steps = content.pop("observations_history", None) or [0]

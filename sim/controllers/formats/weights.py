@@ -41,20 +41,17 @@ class Mjlab:
         source.move(values, dict(zip(_MJLAB_KEYS, SETTINGS, strict=False)), joints)
         source.set_joints(joints)
         source.set(physics_dt=0.005, decimation=4, reason="the metadata do not say it; mjlab's own tasks are like this")
-        scales, clips, lengths = (
-            content.pop(f"observation_terms_{name}", [""] * len(names)) for name in ("scale", "clip", "history_length")
-        )
+        columns = ("scale", "clip", "history_length")
+        scales, clips, lengths = (content.pop(f"observation_terms_{name}", [""] * len(names)) for name in columns)
         source.refuse_unknown(content, ("run_path", "command_names", "observation_terms_flatten_history_dim"))
         terms = []
-        reason = ""
         for name, scale, clip in zip(names, scales, clips, strict=True):
             imu = source.find_imu() if TERM_NAMES[name] == "lin_vel" else None
-            if imu is not None:
-                reason = "the velocity is that of the IMU's site"
             limits = [float(limit) for limit in (clip or "-inf;inf").split(";")]
             limits = np.clip(limits, -1e9, 1e9).tolist() if np.isfinite(limits).any() else None
             terms.append(make_term(TERM_NAMES[name], float(scale or 1.0), clip=limits, at=imu))
         source.set_history(terms, [max(1, round(float(length or 0))) for length in lengths])
+        reason = "the velocity is that of the IMU's site" * any("at" in term for term in terms)
         source.set(observation=terms, reason=reason)
         return path
 

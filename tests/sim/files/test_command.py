@@ -64,16 +64,15 @@ def test_errors_become_one_line_and_an_exit_status(capsys, how, monkeypatch):
 
 def test_a_command_returns_its_status_and_refuses_flags_out_of_their_range(capsys):
     assert (run(), run("--status", "1")) == (0, 1)
-    assert run("--status", "-1") == 2 and "status" in capsys.readouterr().err
-    assert run("--size", "3") == run("--status=z") == run("--nobody") == 2
-    errors = capsys.readouterr().err
-    assert all(flag in errors for flag in ("--size", "--status", "--nobody"))
+    for argv in (("--status", "-1"), ("--size", "3"), ("--status=z",), ("--nobody",)):
+        assert run(*argv) == 2 and argv[0].strip("-=z") in capsys.readouterr().err
 
 
-HELP_IN_ANY_WIDTH = """
+WIDTHS = (1, 2, 3, 5, 8, 13, 20, 39, 40, 41, 46, 80, 200, 399, 400)
+HELP_IN_ANY_WIDTH = f"""
 import os
 import faultline
-for columns in (1, 2, 3, 5, 8, 13, 20, 39, 40, 41, 80, 200, 399, 400):
+for columns in {WIDTHS}:
     os.environ["COLUMNS"] = str(columns)
     assert faultline.main(["archive", "--help"]) == 0
     assert faultline.main(["archive", "--nobody"]) == 2
@@ -81,7 +80,7 @@ for columns in (1, 2, 3, 5, 8, 13, 20, 39, 40, 41, 80, 200, 399, 400):
 
 
 def test_help_fits_a_terminal_of_any_width_and_says_no_none(capsys, monkeypatch):
-    for columns in range(1, 401):
+    for columns in WIDTHS:
         monkeypatch.setenv("COLUMNS", str(columns))
         assert run("--help") == 0
         text = capsys.readouterr().out

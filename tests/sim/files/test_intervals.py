@@ -36,7 +36,7 @@ def test_wilson_interval_by_hand():
             wilson_interval(hits, count)
 
 
-def test_rates_and_values_in_words():
+def test_rates_and_values_as_text():
     assert format_rate(3, 4) == "3 of 4 (75%, 30 to 95%)"
     assert format_rate(3, 4, short=True) == "75% (30 to 95%)"
     assert format_rate(0, 0) == "no valid episode"
@@ -68,7 +68,7 @@ def test_lines_have_few_colours_and_maps_all(colours):
     assert (len(image.getcolors(10**6)) <= 256) == (colours is None)
 
 
-@pytest.mark.parametrize(("share", "families"), [(0.003, 300), (0.01, 300), (0.1, 300), (0.5, 6), (0.5, 24)])
+@pytest.mark.parametrize(("share", "families"), [(0.003, 300), (0.1, 300), (0.5, 6)])
 def test_intervals_of_rates_cover_what_is_rare_and_what_few_families_say(share, families):
     # A share of the terrains stops half of the episodes, the others stop none.
     rng, covered, repetitions = np.random.default_rng(5), 0, 200
