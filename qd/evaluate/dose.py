@@ -29,7 +29,7 @@ from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
-from sim.terrains.conditions.base import CONDITIONS, Condition
+from sim.terrains.conditions.base import CONDITIONS
 from sim.terrains.elements.base import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.registry import load_space
@@ -45,16 +45,11 @@ _BEYOND = {"first": "before the first", "last": "beyond the last", None: "-"}
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
-_GROUNDS = {
-    "friction": (
-        Quantity(name="friction", low=MIN_FRICTION, high=1.0),
-        (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15),
-    ),
-    "softness": (
-        Quantity(name="softness", low=1.1 * MIN_TIME_CONSTANT_S, high=MAX_TIME_CONSTANT_S, unit="s"),
-        (0.015, 0.02, 0.03, 0.04, 0.05, 0.06),
-    ),
-}
+_SOFT = (0.015, 0.02, 0.03, 0.04, 0.05, 0.06)
+_GROUNDS = (
+    (Quantity(name="friction", low=MIN_FRICTION, high=1.0), (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)),
+    (Quantity(name="softness", low=1.1 * MIN_TIME_CONSTANT_S, high=MAX_TIME_CONSTANT_S, unit="s"), _SOFT),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +102,11 @@ class Dose(Sweep):
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
 
-def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[NDArray[Any]], NDArray[Any]]) -> Dose:
-    """Level ground, whose map or condition has ``to_genes`` of the values, shape (num_values, number of its genes)."""
+def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]]) -> Dose:
+    """Level ground, whose map or condition has ``to_genes`` of quantities, shape (num_values, number of its genes)."""
 
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-        genes = to_genes(quantities[name])
+        genes = to_genes({**sweep.others, sweep.parameter: quantities[name]})
         flat = np.zeros((len(genes), SUPER_GAUSSIAN.num_genes))  # bumps of no height
         return np.tile(np.concatenate([flat, genes], axis=1).astype(np.float32), (count, 1))
 
@@ -119,31 +114,22 @@ def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[
     return Dose(name, sweep.values, title=sweep.title, quantities={name: quantity}, make=make, space=space)
 
 
-def _dose_condition(condition: Condition, sweep: Sweep) -> Dose:
-    (gene,) = (gene for gene in condition.genes if gene.name == sweep.parameter)
-    quantity = replace(gene, low=max(0.0, gene.low))
-    return _dose_level(
-        condition.name, sweep, quantity, lambda values: condition.to_genes({**sweep.others, sweep.parameter: values})
-    )
-
-
 def all_doses() -> dict[str, Dose]:
     """Every dose by its name: obstacles, then grounds, then conditions."""
-    doses = {
-        name: Dose(
-            sweep.parameter, sweep.values, sweep.others, name.replace("_", " "), quantities=element.quantities,
-            make=partial(element.lay_alone, sweep.turn),
-        )
-        for element in ELEMENTS.values()
-        for name, sweep in element.doses.items()
-    }  # fmt: skip
-    for name, (quantity, values) in _GROUNDS.items():
-        doses[name] = _dose_level(
-            name, Sweep(name, values, title="level ground"), quantity, partial(ground_genes, name)
-        )
-    return doses | {
-        name: _dose_condition(condition, sweep) for name, condition in CONDITIONS.items() if (sweep := condition.dose)
-    }
+    doses = dict[str, Dose]()
+    for element in ELEMENTS.values():
+        for name, sweep in element.doses.items():
+            make = partial(element.lay_alone, sweep.turn)
+            titled: dict[str, Any] = {**vars(sweep), "title": name.replace("_", " ")}
+            doses[name] = Dose(**titled, quantities=element.quantities, make=make)
+    for quantity, values in _GROUNDS:
+        sweep = Sweep(quantity.name, values, title="level ground")
+        doses[quantity.name] = _dose_level(quantity.name, sweep, quantity, ground_genes)
+    for name, condition in CONDITIONS.items():
+        if sweep := condition.dose:
+            (gene,) = (gene for gene in condition.genes if gene.name == sweep.parameter)
+            doses[name] = _dose_level(name, sweep, replace(gene, low=max(0.0, gene.low)), condition.to_genes)
+    return doses
 
 
 def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
@@ -244,30 +230,17 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
 
     A value with more than a quarter of invalid episodes has no rates.
     """
-    num_values = len(dose.values)
-
-    def group(array: NDArray[Any]) -> NDArray[Any]:
-        """Episodes by value, shape (num_values, ...)."""
-        return array.reshape(-1, num_values, array.shape[1]).swapaxes(0, 1).reshape(num_values, -1)
-
-    outcome = group(result.outcome)
-    counted = counted_episodes(outcome == Outcome.INVALID)
-    hits = {"goal": outcome == Outcome.GOAL, "fallen": group(result.fallen)}
-    hits["success"] = outcome != Outcome.BASE_COLLISION
-    about = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "at": dict(dose.others)}
+    about: dict[str, Any] = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "at": dict(dose.others)}
     rows = []
     for number, value in enumerate(dose.values):
-        count = int(counted[number].sum())
-        left_out = outcome.shape[1] - count
-        row: dict[str, Any] = {
-            **about,
-            "value": value,
-            "controller": controller,
-            "episodes": count,
-            "left_out": left_out,
-        }
+        outcome, fallen = (array[number :: len(dose.values)].ravel() for array in (result.outcome, result.fallen))
+        counted = counted_episodes(outcome == Outcome.INVALID)
+        count = int(counted.sum())
+        left_out = len(counted) - count
+        row = {**about, "value": value, "controller": controller, "episodes": count, "left_out": left_out}
+        hits = {"goal": outcome == Outcome.GOAL, "fallen": fallen, "success": outcome != Outcome.BASE_COLLISION}
         for rate, is_hit in hits.items():
-            num_hits = int((is_hit & counted)[number].sum())
+            num_hits = int((is_hit & counted).sum())
             row[f"{rate}_rate"] = num_hits / count if count else None
             interval = "interval" if rate == "goal" else f"{rate}_interval"
             row[interval] = list(wilson_interval(num_hits, count)) if count else None

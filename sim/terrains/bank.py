@@ -45,80 +45,66 @@ class TerrainBank:
         self.terrain.heights = self.heights = wp.zeros(shape, dtype=float, device=device)
         self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
         self.terrain.spacing = SPACING
-        with_ground |= with_conditions
-        self.ground: Ground | None = make_ground(num_terrains, device) if with_ground else None
+        self.ground: Ground | None = make_ground(num_terrains, device) if with_ground or with_conditions else None
         nominal = np.tile(nominal_row(), (num_terrains, 1))
         self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None
         self.device = device
         self.num_terrains = num_terrains
 
     def set_heights(self, heights: np.ndarray, slots: slice = _ALL, *, ground: GroundMaps | None = None) -> None:
-        """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol).
+        """Replace the terrains of some slots by height grids [m], shape (number of slots, nrow, ncol)."""
+        self.set(Terrains(heights=heights, seeds=np.zeros(len(heights), np.uint32), ground=ground), slots)
 
-        Without ``ground`` their friction and softness change nothing.
-        """
-        replaced = self.heights[slots]
-        expected = tuple(replaced.shape)
-        if heights.shape != expected:
-            raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
-        if not np.isfinite(heights).all():
-            raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
-        if ground is not None and len(ground) != len(heights):
-            raise ValueError(f"ground must be of {len(heights)} terrains, got {len(ground)}")
-        self._check_room(ground=ground is not None, conditions=ground is not None and ground.conditions is not None)
-        ground = ground or GroundMaps.plain(len(heights))
-        replaced.assign(heights.astype(np.float32))
-        max_blocks(replaced, self.terrain.ceilings[slots])
-        if self.ground is not None:
-            self.ground.friction[slots].assign(np.float32(ground.friction))
-            self.ground.time_constant[slots].assign(np.float32(ground.time_constant_s))
-        self._set_conditions(ground.rows, slots)
-
-    def _check_room(self, *, ground: bool, conditions: bool) -> None:
-        if ground and self.ground is None:
+    def set(self, terrains: Terrains, slots: slice = _ALL) -> None:
+        """Replace the terrains of some slots; without ground their friction and softness change nothing."""
+        replaced, space, ground = self.heights[slots], terrains.space, terrains.ground
+        if (space.ground if terrains.heights is None else ground is not None) and self.ground is None:
             raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
+        conditions = (
+            space.conditions if terrains.heights is None else ground is not None and ground.conditions is not None
+        )
         if conditions and self.conditions is None:
             raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
-
-    def _set_conditions(self, rows: np.ndarray, slots: slice) -> None:
-        """Replace the conditions of some slots, (number of slots, number of values), if the bank has any."""
-        if self.conditions is not None:
-            self.conditions[slots].assign(np.float32(rows))
-
-    def set_genes(self, genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, slots: slice = _ALL) -> None:
-        """Replace the terrains of some slots by those of genes of a space, shape (number of slots, num_genes)."""
-        valid = space.validate(genes)
-        replaced = self.heights[slots]
-        if len(valid) != len(replaced):
-            raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
-        self._check_room(ground=bool(space.ground), conditions=bool(space.conditions))
-        on_device = wp.array(valid, dtype=float, device=self.device)
-        space.rasterise(on_device, SPACING, replaced)
+        genes: Any = None
+        if terrains.heights is None:
+            valid = space.validate(terrains.values)
+            if len(valid) != len(replaced):
+                raise ValueError(f"genes must be of {len(replaced)} terrains, one row each, got {len(valid)} rows")
+            genes = wp.array(valid, dtype=float, device=self.device)
+            rows = space.condition_rows(valid)
+            space.rasterise(genes, SPACING, replaced)
+        else:
+            heights, expected = terrains.heights, tuple(replaced.shape)
+            if heights.shape != expected:
+                raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
+            if not np.isfinite(heights).all():
+                raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
+            ground = ground or GroundMaps.plain(len(heights))
+            rows = ground.rows
+            replaced.assign(heights.astype(np.float32))
         max_blocks(replaced, self.terrain.ceilings[slots])
         if self.ground is not None:
             maps = Ground()
             maps.friction = self.ground.friction[slots]
             maps.time_constant = self.ground.time_constant[slots]
-            maps.friction.fill_(1.0)
-            maps.time_constant.fill_(FIRM)
-            space.lay_ground(on_device, maps)
-        self._set_conditions(space.condition_rows(valid), slots)
-
-    def set(self, terrains: Terrains, slots: slice = _ALL) -> None:
-        """Replace the terrains of some slots."""
-        if terrains.heights is not None:
-            self.set_heights(terrains.heights, slots, ground=terrains.ground)
-        else:
-            self.set_genes(terrains.values, terrains.space, slots)
+            if ground is None:
+                maps.friction.fill_(1.0)
+                maps.time_constant.fill_(FIRM)
+                space.lay_ground(genes, maps)
+            else:
+                maps.friction.assign(np.float32(ground.friction))
+                maps.time_constant.assign(np.float32(ground.time_constant_s))
+        if self.conditions is not None:
+            self.conditions[slots].assign(np.float32(rows))
 
     def ground_maps(self) -> GroundMaps | None:
         """The maps of all terrains on the host; None of a bank without any."""
         if self.ground is None:
             return None
-        friction = self.ground.friction.numpy()
-        time_constant_s = self.ground.time_constant.numpy()
+        friction = self.ground.friction.numpy().copy()
+        time_constant_s = self.ground.time_constant.numpy().copy()
         conditions = None if self.conditions is None else self.conditions.numpy().copy()
-        return GroundMaps(friction=friction.copy(), time_constant_s=time_constant_s.copy(), conditions=conditions)
+        return GroundMaps(friction=friction, time_constant_s=time_constant_s, conditions=conditions)
 
 
 def make_heights(genes: np.ndarray, space: TerrainSpace = SUPER_GAUSSIAN, *, every: int = 1) -> np.ndarray:
@@ -149,5 +135,5 @@ def make_terrains(
         len(genes), device=device, with_ground=bool(space.ground), with_conditions=bool(space.conditions)
     )
     with wp.ScopedDevice(device):
-        bank.set_genes(genes, space)
+        bank.set(Terrains(genes=genes, seeds=np.zeros(len(genes), np.uint32), space=space))
         return np.array(bank.heights.numpy()), bank.ground_maps()

@@ -25,7 +25,6 @@ def corridor_heights(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     """Heights [m] around the way of terrains, every 0.1 m; row 20 is the way, row 0 is to its right.
 
     A space that is made for 0.05 m gives the means of 3 x 3 nodes, so that nothing narrow falls between two nodes.
-
     Genes are float32 in [-1, 1], shape (num_terrains, num_genes), on the device that does the work; heights come on it,
     float32, shape (num_terrains, 41, 121).
     """
@@ -55,35 +54,25 @@ def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     everywhere, but where it is of a side: it then grows from minus itself on the right to itself on the left, so that
     mirrored maps are those of mirrored conditions.
     """
-    kinds = condition_genes(space.conditions)
-    across = torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)
-    profiles = [across if gene.mirrored else torch.ones_like(across) for gene in kinds]
-    conditions = genes[:, space.num_genes - len(kinds) :, None, None].expand(-1, -1, *SHAPE)
-    if kinds:
-        conditions = conditions * torch.stack(profiles)[:, :, None]
-    return torch.cat([_ground(genes, space), conditions], dim=1)
-
-
-def _ground(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
-    if not space.ground:
-        return genes.new_empty(len(genes), 0, *SHAPE)
     device = str(wp.device_from_torch(genes.device))
     ground = make_ground(len(genes), device)
     with wp.ScopedDevice(device):
         space.lay_ground(wp.from_torch(genes.contiguous()), ground)
-    maps = {
+    patches = {
         "friction": 1.0 - wp.to_torch(ground.friction),
         "softness": wp.to_torch(ground.time_constant) / float(MAX_TIME_CONSTANT_S),
     }
-    row = patch_index(_nodes(Y), NUM_ROWS - 1, ROWS)
-    col = patch_index(_nodes(X), NUM_COLS - 1, COLS)
-    return torch.stack([maps[kind][:, row][:, :, col] for kind in space.ground], dim=1)
-
-
-def _nodes(span: tuple[float, float]) -> np.ndarray:
-    """Which nodes of a simulation's grid a corridor has along an axis."""
-    first, last = (round(end / SPACING) for end in span)
-    return np.arange(first, last + 1, round(NODE_SPACING / SPACING))
+    row, col = (
+        patch_index(low / SPACING + np.arange(count) * (NODE_SPACING / SPACING), nodes - 1, num_patches)
+        for (low, _), count, nodes, num_patches in zip((Y, X), SHAPE, (NUM_ROWS, NUM_COLS), (ROWS, COLS), strict=True)
+    )
+    maps = [patches[kind][:, row][:, :, col] for kind in space.ground]
+    across = torch.linspace(-1.0, 1.0, SHAPE[0], device=genes.device)[:, None]
+    kinds = condition_genes(space.conditions)
+    for gene, values in zip(kinds, genes[:, space.num_genes - len(kinds) :].T, strict=True):
+        profile = across if gene.mirrored else torch.ones_like(across)
+        maps.append(values[:, None, None] * profile.expand(SHAPE))
+    return torch.stack(maps, dim=1) if maps else genes.new_empty(len(genes), 0, *SHAPE)
 
 
 def _rasterised(

@@ -45,12 +45,12 @@ _BOX_CELLS = (20, 40)  # 1 m to 2 m
 
 
 def _slope(inset_cm: np.ndarray, gradient: float) -> np.ndarray:
-    """Heights [m] of a flank of constant gradient up to the platform."""
+    """A flank of constant gradient up to the platform [m]."""
     return gradient * 0.01 * np.minimum(inset_cm, _FLANK_CM)
 
 
 def _stairs(inset_cm: np.ndarray, step_height: float) -> np.ndarray:
-    """Heights [m] of stairs up to the platform; the first riser stands one tread inside the edge."""
+    """Stairs up to the platform [m]; the first riser stands one tread inside the edge."""
     return step_height * np.minimum(inset_cm // _TREAD_CM, _FLANK_CM // _TREAD_CM)
 
 
@@ -66,8 +66,7 @@ def _roughness(rng: np.random.Generator) -> np.ndarray:
 def _noise(rng: np.random.Generator, amplitude: float) -> np.ndarray:
     """Uniform heights of +-``amplitude`` [m], constant on patches of 0.2 m."""
     patches = -(-_SIDE // _PATCH_NODES)
-    drawn = rng.uniform(-amplitude, amplitude, (patches, patches))
-    return drawn.repeat(_PATCH_NODES, axis=0).repeat(_PATCH_NODES, axis=1)[:_SIDE, :_SIDE]
+    return np.kron(rng.uniform(-amplitude, amplitude, (patches, patches)), np.ones((_PATCH_NODES,) * 2))[:_SIDE, :_SIDE]
 
 
 def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
@@ -78,17 +77,16 @@ def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
     heights = np.zeros((_SIDE, _SIDE))
     for _ in range(_NUM_BOXES):
         size_y, size_x = rng.integers(*_BOX_CELLS, size=2, endpoint=True)
-        row = rng.integers(1, _SIDE - 1 - size_y)
-        col = rng.integers(1, _SIDE - 1 - size_x)
+        row, col = (rng.integers(1, _SIDE - 1 - size) for size in (size_y, size_x))
         heights[row : row + size_y + 1, col : col + size_x + 1] = height * rng.choice([-1.0, -0.5, 0.5, 1.0])
     return heights
 
 
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
-    """One hand-crafted crossing: the feature over the full width, flat at height 0 for x <= 4 and x >= 12.
+    """One hand-crafted crossing of :data:`CROSSING_TYPES`: heights [m], float32, shape (NUM_ROWS, NUM_COLS).
 
-    ``kind`` is one of :data:`CROSSING_TYPES`; levels go from 0 (nearly flat) to 9. Heights [m], float32, shape
-    (NUM_ROWS, NUM_COLS).
+    The feature has the full width; for x <= 4 and x >= 12 the ground is flat at height 0. Levels go from 0 (nearly
+    flat) to 9.
     """
     d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
     feature = {
@@ -100,8 +98,8 @@ def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
         "noise": lambda: _noise(rng, 0.02 + 0.08 * d),
     }[kind]()
     heights = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
-    inside = slice(1, -1)  # the nodes at x = 4 and x = 12 belong to the run-in and run-out
-    heights[:, _FIRST_COL : _FIRST_COL + _SIDE][:, inside] = feature[:, inside]
+    # The nodes at x = 4 and x = 12 belong to the run-in and run-out.
+    heights[:, _FIRST_COL + 1 : _FIRST_COL + _SIDE - 1] = feature[:, 1:-1]
     return heights
 
 
@@ -126,10 +124,8 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     """One 8 m x 8 m tile of the training curriculum in the middle of the grid; beyond it the edge heights continue.
 
     The robot starts in the centre, on the platform: it walks down from a slope, up from ``stairs_up`` (a pit) and down
-    from ``stairs_down``. The pyramids' faces are planes, so the gradient is the same everywhere on a flank.
-
-    ``kind`` is one of :data:`TILE_TYPES`; levels go from 0 (nearly flat) to 9. ``inverted`` turns a slope into a pit,
-    and no other type. Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
+    from ``stairs_down``. ``kind`` is one of :data:`TILE_TYPES`; levels go from 0 (nearly flat) to 9. ``inverted`` turns
+    a slope into a pit, and no other type. Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
     d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
     tile = {

@@ -305,5 +305,6 @@ RUBBLE = CourseElement(
     draw_turns=lambda count, rng: rng.uniform(-0.5, 0.5, count),
 )
 
-_KINDS = (FLAT, RAMP, CROSS_SLOPE, SILL, RAIL, KERB, STEP, STAIRS, PALLET, DITCH, BRIDGE, STONES, RUBBLE)
-ELEMENTS.update((kind.name, kind) for kind in _KINDS)
+KINDS = (FLAT, RAMP, CROSS_SLOPE, SILL, RAIL, KERB, STEP, STAIRS, PALLET, DITCH, BRIDGE, STONES, RUBBLE)
+"""Neighbours are alike."""
+ELEMENTS.update((kind.name, kind) for kind in KINDS)

@@ -1,9 +1,9 @@
-"""Heightmaps of a user's own as terrains to cross: what a file must hold, and how it becomes the project's grid.
+"""Heightmaps of a user as terrains to cross: what a file must hold, and how it becomes the project's grid.
 
-A map is a grid of nodes over a rectangle of ``size_m`` (along x, along y): its first node stands on one edge, its last
-on the other. It is laid with its middle on the middle of the terrain, 16 m x 8 m, which robots cross from x = 2 m to
-14 m. What reaches beyond the terrain is cut off; where the map ends before it, the height of its edge continues.
-Heights stay as they are: the ground of the project's own terrains is at 0.
+A map is a grid of nodes over a rectangle of ``size_m`` (along x, along y), from edge to edge. It is laid with its
+middle on the middle of the terrain, 16 m x 8 m, which robots cross from x = 2 m to 14 m. What reaches beyond the
+terrain is cut off; where the map ends before it, the height of its edge continues. Heights stay as they are: the ground
+of the project's own terrains is at 0.
 
 A node of the terrain takes the mean of the map round it, weighted by a tent: half as wide as the map's own spacing or
 the terrain's, whichever is larger. Of a coarser map that is linear interpolation; of a finer one nothing aliases; a map
@@ -29,7 +29,6 @@ from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 
 _MAX_HEIGHT_M = 10.0  # above or below 0
 _MAX_NODES = 10_000  # along one side
-_GROUND = ("friction", "time_constant_s")
 _WHOLE = (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1))
 _GRAY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "I;16N")
 
@@ -46,14 +45,11 @@ class Heightmap:
     """Friction and softness, of a map that has the size of a terrain."""
 
 
-_Side = Annotated[float, Meta(ge=1, le=100)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Meaning:
     """What a file or the caller says of a map."""
 
-    size_m: tuple[_Side, _Side]
+    size_m: tuple[Annotated[float, Meta(ge=1, le=100)], Annotated[float, Meta(ge=1, le=100)]]
     scale_m: float = 1.0
     offset_m: float = 0.0
 
@@ -78,11 +74,10 @@ def read_heightmap(
     if not os.path.isfile(path):  # False too for a name that no file can have
         raise FileNotFoundError(f"no heightmap at {path}: expected an .npz or a .png file")
     beside = path.with_suffix(".json")
-    values, arrays = dict[str, Any](), dict[str, NDArray[Any]]()
+    values, maps = dict[str, Any](), dict[str, NDArray[Any]]()
     if path.suffix.lower() == ".npz":
-        arrays = _read_npz(path)
-        heights = arrays["heights"]
-        values = {"size_m": arrays["size_m"].ravel().tolist()} if "size_m" in arrays else {}
+        heights, maps = _read_npz(path)
+        values = {"size_m": maps.pop("size_m").ravel().tolist()} if "size_m" in maps else {}
     elif path.suffix.lower() == ".png":
         heights = _read_png(path)
         values = read_json(beside) if beside.exists() else {}
@@ -98,16 +93,24 @@ def read_heightmap(
     meaning = from_builtins(_Meaning, values, str(path))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is named below
         heights = heights * meaning.scale_m + meaning.offset_m
-    _check_heights(path, heights)
-    _refuse_turned(path, heights.shape, meaning.size_m)
-    return Heightmap(heights=heights, size_m=meaning.size_m, ground=_ground_in(path, arrays, meaning.size_m))
-
-
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        names = [name for name in array_names(path) if name in ("size_m", *_GROUND)]
+        _check_heights(heights, meaning.size_m)
+        if maps and not _is_whole(meaning.size_m):
+            whole = " x ".join(f"{side:g}" for side in _WHOLE)
+            raise ValueError(f"with friction or softness it must be {whole} m, got {meaning.size_m}")
+        arrays: Any = {name: np.asarray(values, np.float32)[None] for name, values in maps.items()}
+        ground = replace(GroundMaps.plain(1), **arrays) if maps else None
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    return Heightmap(heights=heights, size_m=meaning.size_m, ground=ground)
+
+
+def _read_npz(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
+    """Heights, and the other arrays."""
+    try:
+        names = [name for name in array_names(path) if name in ("size_m", "friction", "time_constant_s")]
         arrays = read_arrays(path, ["heights", *names], max_bytes=8 * _MAX_NODES**2 + 1024)
-        return {**arrays, "heights": arrays["heights"].astype(np.float64, casting="same_kind")}
+        return arrays.pop("heights").astype(np.float64, casting="same_kind"), arrays
     except Exception as error:  # zipfile, zlib and npy headers answer damage with a dozen types
         raise ValueError(f"{path} must be an .npz file with an array 'heights', got: {error}") from None
 
@@ -124,43 +127,27 @@ def _read_png(path: Path) -> NDArray[np.float64]:
     return gray[::-1].astype(np.float64)
 
 
-def _ground_in(path: Path, arrays: dict[str, NDArray[Any]], size_m: tuple[float, float]) -> GroundMaps | None:
-    maps = {name: arrays[name] for name in _GROUND if name in arrays}
-    if not maps:
-        return None
-    if not _is_whole(size_m):
-        raise ValueError(f"{path}: with friction or softness it must be {_WHOLE[0]:g} x {_WHOLE[1]:g} m, got {size_m}")
-    try:
-        each = {name: np.asarray(values, np.float32)[None] for name, values in maps.items()}
-        return replace(GroundMaps.plain(1), **each)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
 def _is_whole(size_m: tuple[float, float]) -> bool:
     return np.allclose(size_m, _WHOLE, rtol=0.0, atol=1e-6)
 
 
-def _check_heights(path: Path, heights: NDArray[np.float64]) -> None:
+def _check_heights(heights: NDArray[np.float64], size_m: tuple[float, float]) -> None:
+    """Refuses a map whose nodes would be as far apart along x as along y if the axes were swapped, and now are not."""
     if heights.ndim != 2 or min(heights.shape) < 2 or max(heights.shape) > _MAX_NODES:
-        raise ValueError(f"{path}: heights must have 2 axes of 2 to {_MAX_NODES} nodes, got {heights.shape}")
+        raise ValueError(f"heights must have 2 axes of 2 to {_MAX_NODES} nodes, got {heights.shape}")
     if count := np.count_nonzero(~np.isfinite(heights)):
-        raise ValueError(f"{path}: {count} of {heights.size} heights are NaN or infinite: fill them first")
+        raise ValueError(f"{count} of {heights.size} heights are NaN or infinite: fill them first")
     low, high = float(heights.min()), float(heights.max())
     if max(-low, high) > _MAX_HEIGHT_M:
         raise ValueError(
-            f"{path}: heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), "
-            "and is the ground about 0 (--offset)?"
+            f"heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), and is "
+            "the ground about 0 (--offset)?"
         )
-
-
-def _refuse_turned(path: Path, shape: tuple[int, ...], size_m: tuple[float, float]) -> None:
-    """Refuses a map whose nodes would be as far apart along x as along y if x and y were swapped, and now are not."""
-    (rows, columns), (size_x, size_y) = shape, size_m
+    (rows, columns), (size_x, size_y) = heights.shape, size_m
     now, turned = size_x / (columns - 1) * (rows - 1) / size_y, size_x / (rows - 1) * (columns - 1) / size_y
     if abs(np.log(turned)) < 0.01 and abs(np.log(now)) > np.log(2.0):
         raise ValueError(
-            f"{path}: heights must be (nrow, ncol) with rows along y, got {shape} over {size_x:g} m along x and "
+            f"heights must be (nrow, ncol) with rows along y, got {heights.shape} over {size_x:g} m along x and "
             f"{size_y:g} m along y: x and y are swapped; transpose them"
         )
 
@@ -185,11 +172,11 @@ def _weights(count: int, size: float, num_nodes: int) -> NDArray[np.float64]:
 
 
 def fitted(heightmap: Heightmap) -> str:
-    """What becomes of a map on the terrain, in words."""
+    """What becomes of a map on the terrain, as text."""
     rows, columns = heightmap.heights.shape
     (size_x, size_y), low, high = heightmap.size_m, heightmap.heights.min(), heightmap.heights.max()
-    words = f"{columns} x {rows} nodes over {size_x:g} x {size_y:g} m, heights {low:.2f} to {high:.2f} m"
+    text = f"{columns} x {rows} nodes over {size_x:g} x {size_y:g} m, heights {low:.2f} to {high:.2f} m"
     for axis, side, whole in zip("xy", heightmap.size_m, _WHOLE, strict=True):
         if abs(side - whole) > 1e-6:
-            words += f", {'cut to its middle' if side > whole else 'continued by its edge to'} {whole:g} m along {axis}"
-    return words if heightmap.ground is None else f"{words}, with friction or softness of its own"
+            text += f", {'cut to its middle' if side > whole else 'continued by its edge to'} {whole:g} m along {axis}"
+    return text if heightmap.ground is None else f"{text}, with friction or softness of its own"

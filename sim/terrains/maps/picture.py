@@ -7,15 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
+from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
 from sim.crossing import CrossingCfg
-from sim.terrains.ground import (
-    MAX_TIME_CONSTANT_S,
-    MIN_FRICTION,
-    MIN_TIME_CONSTANT_S,
-    PATCHES,
-    GroundMaps,
-    patch_index,
-)
+from sim.terrains.ground import GroundMaps, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 
 LENGTH, WIDTH = 16.0, 8.0

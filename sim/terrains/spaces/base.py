@@ -58,21 +58,18 @@ class TerrainSpace:
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
         """Genes of random terrains that are as hard as the space allows, shape (count, num_genes)."""
-        ...
+        raise NotImplementedError
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Texts of the parts of a terrain that can be taken away, of one row of genes (num_genes,)."""
-        ...
+        raise NotImplementedError
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes (num_terrains, num_genes) of the same terrains without the parts of these indices in :meth:`parts`."""
-        ...
+        raise NotImplementedError
 
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
-        """Genes (num_terrains, num_genes) of the same terrains with all heights times ``scale``, which is in (0, 1].
-
-        None where the space cannot scale heights together.
-        """
+        """Genes of the same terrains with all heights times ``scale``, which is in (0, 1]; None where none can be."""
         return None
 
     def describe(self, genes: ArrayLike) -> str:
@@ -93,9 +90,8 @@ class TerrainSpace:
         """Genes as float32, shape (num_terrains, num_genes), not clipped."""
         array = np.asarray(genes, dtype=np.float32)
         if array.ndim != 2 or array.shape[1] != self.num_genes:
-            raise ValueError(
-                f"genes must have shape (num_terrains, {self.num_genes}), got {array.shape}: the space is {self.name}"
-            )
+            expected = f"(num_terrains, {self.num_genes})"
+            raise ValueError(f"genes must have shape {expected}, got {array.shape}: the space is {self.name}")
         finite = np.isfinite(array).all(axis=1)
         if not finite.all():
             raise ValueError(f"genes must be finite, got NaN or infinity in row {int(np.argmin(finite))}")

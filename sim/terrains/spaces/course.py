@@ -12,11 +12,10 @@ from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, SPACING
 from sim.device import host_device
 from sim.terrains.elements.base import ELEMENTS, CourseElement, all_elements
+from sim.terrains.elements.kinds import KINDS
 from sim.terrains.spaces.base import Seed, ShippedSpace, clipped
 
-_KIND = GENES.index("kind")
-_SIZE = GENES.index("size")
-_LENGTH = GENES.index("length")
+_KIND, _SIZE, _LENGTH = map(GENES.index, ("kind", "size", "length"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,10 +27,7 @@ class Course(ShippedSpace):
     """
 
     base_name: ClassVar[str] = "course"
-    kinds: ClassVar[tuple[str, ...]] = (
-        "flat", "ramp", "cross_slope", "sill", "rail", "kerb", "step", "stairs", "pallet", "ditch", "bridge", "stones",
-        "rubble",
-    )  # fmt: skip
+    kinds: ClassVar[tuple[str, ...]] = tuple(kind.name for kind in KINDS)
     """Elements on equal shares of the gene; neighbours are alike, so a small change of the gene is a small change.
     The first is flat ground."""
     num_genes: ClassVar[int] = MAX_ELEMENTS * GENES_PER_ELEMENT
@@ -74,18 +70,15 @@ class Course(ShippedSpace):
             records: Any = course.lay_out(rows, all_elements(), self._kinds).numpy()
         return records.copy()
 
-    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
-        """Each element, six of them."""
-        return tuple(text for text, _, _ in self._texts(genes))
-
-    def _texts(self, genes: ArrayLike) -> list[tuple[str, float, float]]:
-        """Text, begin and end [m] of each element of one row of genes, with its heights as they are."""
+    def _laid(self, genes: ArrayLike) -> list[tuple[CourseElement, Any]]:
+        """Each element of one row of genes with its record, with its heights as they are."""
         (elements,) = self.elements(np.asarray(genes)[None])
         elements["size"] *= self.height_share  # of a ramp the slope
-        return [
-            (all_elements()[e["kind"]].text(e), SPACING * e["first"], SPACING * (e["first"] + e["cells"]))
-            for e in elements
-        ]
+        return [(all_elements()[record["kind"]], record) for record in elements]
+
+    def parts(self, genes: ArrayLike) -> tuple[str, ...]:
+        """Each element, six of them."""
+        return tuple(kind.text(record) for kind, record in self._laid(genes))
 
     def without(self, genes: ArrayLike, parts: Sequence[int]) -> NDArray[np.float32]:
         """Genes with flat ground as long as some elements in their place; the others stay where they are."""
@@ -116,8 +109,11 @@ class Course(ShippedSpace):
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Each element but flat ground, with where it begins and ends [m]."""
-        (elements,) = self.elements(np.asarray(genes)[None])
-        return tuple(span for span, kind in zip(self._texts(genes), elements["kind"], strict=True) if kind)
+        return tuple(
+            (kind.text(e), SPACING * e["first"], SPACING * (e["first"] + e["cells"]))
+            for kind, e in self._laid(genes)
+            if e["kind"]
+        )
 
 
 def _middle_gene(number: Any, count: float) -> Any:

@@ -19,14 +19,11 @@ from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 
 
 class UserSpace(TerrainSpace):
-    """A user's space; what its code returns is checked.
+    """A user's space, named ``file.py:Space`` or ``module:Space``; what its code returns is checked.
 
-    Args:
-        spec: What the command line calls it: ``file.py:Space`` or ``module:Space``.
-        code: The user's object (docs/terrains.md): ``num_genes`` and ``rasterise(genes, x, y)``; optionally
-            ``hard_random(count, rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``,
-            ``scaled(genes, scale)``, ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``,
-            ``sigma0``.
+    Its ``code`` has (docs/terrains.md) ``num_genes`` and ``rasterise(genes, x, y)``; optionally ``hard_random(count,
+    rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes, scale)``,
+    ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``, ``sigma0``.
     """
 
     def __init__(self, spec: str, code: Any) -> None:
@@ -67,8 +64,7 @@ class UserSpace(TerrainSpace):
 
     def _fill(self, method: str, genes: Any, step: float, first: float, values_out: Any) -> None:
         """Fills a Warp array (num_terrains, y, x) by a user's method, at x and y = ``step * (first + index)``."""
-        rows = wp.to_torch(genes).clamp(-1.0, 1.0)
-        out = wp.to_torch(values_out)
+        rows, out = wp.to_torch(genes).clamp(-1.0, 1.0), wp.to_torch(values_out)
         stream: Any = None if rows.device.type == "cpu" else wp.stream_to_torch(wp.get_stream(genes.device))
         with torch.no_grad(), torch.cuda.stream(stream):
             axes = (step * (torch.arange(count, device=rows.device) + first) for count in out.shape[1:])
@@ -79,9 +75,8 @@ class UserSpace(TerrainSpace):
             except (TypeError, ValueError, RuntimeError):
                 raise self._wrong(method, f"must return a tensor, got {type(returned).__name__}") from None
             if values.shape != out.shape:
-                raise self._wrong(
-                    method, f"must return shape {tuple(out.shape)} (terrains, y, x), got {tuple(values.shape)}"
-                )
+                expected = f"{tuple(out.shape)} (terrains, y, x)"
+                raise self._wrong(method, f"must return shape {expected}, got {tuple(values.shape)}")
             if not bool(torch.isfinite(values).all()):
                 raise self._wrong(method, "must return finite values, got NaN or infinity")
             if method in GROUND_KINDS:
@@ -152,7 +147,7 @@ def find_user_space(name: str, sha256: str | None) -> UserSpace:
     for space in LOADED:
         if space.name == name if sha256 is None else space.sha256 == sha256:
             return space
-    if any(space.name == name for space in LOADED):
+    if name in (space.name for space in LOADED):
         raise ValueError(f"the code of the space {name} has changed since: put it back, or search anew")
     raise ValueError(f"the space {name} is code, which runs only if named: give --space {shlex.quote(name)}")
 
@@ -163,9 +158,9 @@ def load_user_space(spec: str) -> UserSpace:
     Code that was loaded before, and has not changed, is not run again.
     """
     sha256 = controller_hash(spec)
-    for space in LOADED:
-        if sha256 is not None and (space.name, space.sha256) == (spec, sha256):
-            return space
+    same = (space for space in LOADED if sha256 is not None and (space.name, space.sha256) == (spec, sha256))
+    if space := next(same, None):
+        return space
     parsed = ControllerSpec.parse(spec)
     try:
         code: Any = import_object(str(parsed.module), str(parsed.name))
@@ -173,13 +168,12 @@ def load_user_space(spec: str) -> UserSpace:
     except Exception as error:  # a user's code can fail with anything
         raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}") from error
     space = UserSpace(spec, code)
-    device = host_device()
     hard = space.hard_random(2, 0)
     genes = np.concatenate([np.zeros((1, space.num_genes), np.float32), hard])
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice(host_device()):
         rows = wp.array(genes, dtype=float)
         space.rasterise(rows, SPACING, wp.zeros((len(genes), NUM_ROWS, NUM_COLS), dtype=float))
-        space.lay_ground(rows, make_ground(len(genes), device))
+        space.lay_ground(rows, make_ground(len(genes), host_device()))
     space.without(hard, range(len(space.parts(hard[0]))))
     space.scaled(hard, 0.5)
     space.describe(hard[0])

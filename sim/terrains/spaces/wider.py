@@ -1,6 +1,7 @@
 """Any terrain space with more genes: of its ground, 32 for friction and 32 for softness, and of conditions."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,10 +38,10 @@ class WiderSpace(TerrainSpace):
         self.conditions = tuple(kind for kind in kinds if kind in CONDITIONS)
         if self.maps and inner.genes_per_part and NUM_PATCHES % inner.genes_per_part:
             self.genes_per_part = None  # maps must divide by the parts of the space, too
-        absent = [np.array([_ABSENT[kind]]) for kind in self.maps for _ in range(NUM_PATCHES)]
-        self._absent = absent + [CONDITIONS[name].to_genes({}) for name in self.conditions]
+        self._absent = [np.array([_ABSENT[kind]]) for kind in self.maps for _ in range(NUM_PATCHES)]
+        self._absent += [CONDITIONS[name].to_genes({}) for name in self.conditions]
         ends = inner.num_genes + np.cumsum([0, *map(len, self._absent)])
-        self._columns = [slice(first, last) for first, last in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)]
+        self._columns = [slice(*pair) for pair in pairwise(ends.tolist())]  # of each part
         self.num_genes = int(ends[-1])
 
     def _map_columns(self, kind: str) -> slice:
@@ -161,12 +162,13 @@ def _patch_text(kind: str, patch: int, value: float) -> str:
     return f"soft ground of {value:.3f} s {where}" if value else f"firm ground {where}"
 
 
-def ground_genes(kind: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Genes of a map of one friction, or of one time constant [s] above the least; shape (num_values, 32)."""
-    if kind == "friction":
-        genes = 1.0 - 2.0 * (1.0 - values) / (1.0 - MIN_FRICTION)
+def ground_genes(values: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Genes of maps of one ``friction``, or of one ``softness`` [s] above the least; shape (num_values, 32)."""
+    if "friction" in values:
+        genes = 1.0 - 2.0 * (1.0 - values["friction"]) / (1.0 - MIN_FRICTION)
     else:
-        genes = 2.0 * np.log(values / MIN_TIME_CONSTANT_S) / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
+        share = np.log(values["softness"] / MIN_TIME_CONSTANT_S)
+        genes = 2.0 * share / np.log(MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) - 1.0
     return np.repeat(genes[:, None], NUM_PATCHES, axis=1)
 
 

@@ -6,6 +6,7 @@ import pytest
 from sim.terrains.bank import TerrainBank, make_heights
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.terrains import Terrains
 from tests.kernels import oracle
 from tests.sim.scenes import NODE_X, NODE_Y
 
@@ -21,7 +22,7 @@ def test_terrains_are_replaced_in_place(device):
     bank = TerrainBank(3, device=device)
     addresses = bank.heights.ptr, bank.terrain.ceilings.ptr  # captured graphs keep them
     genes = SUPER_GAUSSIAN.uniform_random(3, 0)
-    bank.set_genes(genes)
+    bank.set(Terrains(genes=genes, seeds=np.arange(3)))
     expected = np.stack([oracle.mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in genes])
     np.testing.assert_allclose(bank.heights.numpy(), expected, atol=1e-5)
     heights = np.array(bank.heights.numpy())
@@ -42,7 +43,7 @@ def test_every_second_node_is_that_of_the_whole_grid(space):
 def test_wrong_genes_and_heights_are_named(device):
     bank = TerrainBank(2, device=device)
     with pytest.raises(ValueError, match="genes"):
-        bank.set_genes(np.zeros((2, 63)))
+        bank.set(Terrains(genes=np.zeros((2, 63)), seeds=np.arange(2)))
     for heights in (np.zeros((2, 321, 161)), np.full((2, 161, 321), np.nan)):
         with pytest.raises(ValueError, match="heights"):
             bank.set_heights(heights)
