@@ -1,16 +1,21 @@
-"""One small task for all tests of the room: what is compiled for one serves the others."""
+"""One small task for all tests of the room, and controllers that a fine-tuning begins with."""
 
+import itertools
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
+from qd.evaluate.sets import TRAINED_ON, hash_elites
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from train.cfg import CurriculumCfg, FinetuneCfg, TaskCfg
+from train.cfg import CurriculumCfg, FinetuneCfg, PpoCfg, TaskCfg
 from train.finetune import begin_finetuning, find_training_elites
-from train.ppo.checkpoint import read_start
+from train.ppo.checkpoint import STD, read_start
 from train.ppo.training import Training
 from train.task.task import CommandTask
 
@@ -39,3 +44,31 @@ def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> Training:
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
     elites = find_training_elites(robot, cfg)
     return begin_finetuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)
+
+
+PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
+
+
+def write_actor(path, *, hidden=(16, 8), critic=False, critic_hidden=None, **extra):
+    """A controller of random layers, as rsl_rl writes it."""
+    torch.manual_seed(0)
+
+    def layers(*sizes):
+        state = {}
+        for k, (width, out) in enumerate(itertools.pairwise(sizes)):
+            state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
+        return state
+
+    actor = {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}
+    content = {"actor_state_dict": actor, "activation": "elu"}
+    if critic:
+        content["critic_state_dict"] = layers(235, *(critic_hidden or hidden), 1)
+    torch.save(content, path)
+    return path
+
+
+def write_trained(folder: Path, genes: np.ndarray) -> Path:
+    """A controller whose record says that it was trained on elites, genes of shape (num_elites, num_genes)."""
+    path = write_actor(folder / "tuned.pt")
+    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: hash_elites(genes)}))
+    return path

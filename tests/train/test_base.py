@@ -147,13 +147,3 @@ def test_errors_come_before_any_work(flags, field, tmp_path, monkeypatch, capsys
     assert run_command(TrainCommand, [*given, *([] if "--device" in flags else ["--device", "cpu"])], name="train") == 2
     error = capsys.readouterr().err
     assert field in error and error.count("\n") == 1
-
-
-def test_new_runs_have_places_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    places = []
-    monkeypatch.setattr("train.ppo.training.train", lambda robot, cfg, run_dir, run: places.append(run_dir))
-    for _ in range(3):
-        assert run_command(TrainCommand, ["--device", "cpu"], name="train") == 0
-        places[-1].mkdir(parents=True)
-    assert len(set(places)) == 3 and all(place.parent.name == "runs" for place in places)

@@ -13,8 +13,7 @@ from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.find import get_robot
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.sim.dogs import write_toml
-from tests.train.conftest import begun
-from tests.train.starts import PPO
+from tests.train.conftest import PPO, begun
 from train.cfg import FinetuneCfg, RunCfg
 from train.finetune import finetune
 from train.ppo.checkpoint import STD, read_checkpoint, read_start

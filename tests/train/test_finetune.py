@@ -18,8 +18,7 @@ from sim.terrains.spaces import registry as spaces
 from sim.terrains.spaces import user
 from tests.builders import fresh_values, make_archive, write_run
 from tests.sim.terrains.spaces.spaces import write_ridges
-from tests.train.conftest import begun
-from tests.train.starts import PPO, write_actor
+from tests.train.conftest import PPO, begun, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import FinetuneCommand
 from train.finetune import find_training_elites, finetune, train_specialist

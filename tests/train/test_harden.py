@@ -18,7 +18,7 @@ from sim.files.command import Interrupted, run_command
 from sim.robots.find import get_robot
 from tests.builders import fresh_values, make_archive
 from tests.qd.stand_in import Stub, compute_by, result_of
-from tests.train.starts import PPO, write_actor
+from tests.train.conftest import PPO, write_actor
 from train import harden as module
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RoundSearchCfg
 from train.commands import HardenCommand

@@ -20,7 +20,7 @@ from sim.files.command import run_command
 from tests.builders import make_archive
 from tests.qd.robots import Robots
 from tests.qd.stand_in import PENALTIES, compute_by
-from tests.train.starts import write_trained
+from tests.train.conftest import write_trained
 
 STAND, STRETCH = "tests.sim.policies:stand", "tests.sim.policies:stretch"
 CPU = Compute()

@@ -8,7 +8,7 @@ import torch
 
 from qd.evaluate.sets import TRAINED_ON, hash_elites, read_trained_on
 from tests.builders import make_archive
-from tests.train.starts import write_actor, write_trained
+from tests.train.conftest import write_actor, write_trained
 
 GENES = make_archive(20).genes
 
