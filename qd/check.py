@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.search.directory import RUNS
@@ -67,7 +66,13 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
         print(f"Without a controller, expected at {expected} or named by --policy, this is all.")
         return not standing.mistakes
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        if not _report_walk(robot, walk(crosser, policy)):
+        walks = walk(crosser, policy)
+        slow, fast = sorted(walk["speed"] for walk in walks.values())
+        reaches_goal = min(walk["goal"] for walk in walks.values()) >= FAILING_GOAL_RATE
+        agree = fast - slow <= _APART * fast
+        content = {"robot": robot, "walks": walks, "reaches_goal": reaches_goal, "agree": agree, "tolerance": _APART}
+        print(_TEMPLATES.get_template("walking.txt").render(content).rstrip(), flush=True)
+        if not (reaches_goal and agree):
             return False
         height, share = find_fitting_height(crosser, policy)
     doses = parse_doses([f"{name}={','.join(map(str, _RISES))}" for name in ("step_up", "stairs_up")], ())
@@ -142,16 +147,6 @@ def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, fl
     return walks
 
 
-def _report_walk(robot: RobotCfg, walks: dict[str, dict[str, float]]) -> bool:
-    """Prints how it walks in both simulators; returns whether it does, and at the same speed."""
-    slow, fast = sorted(walk["speed"] for walk in walks.values())
-    reaches_goal = min(walk["goal"] for walk in walks.values()) >= FAILING_GOAL_RATE
-    agree = fast - slow <= _APART * fast
-    content = {"robot": robot, "walks": walks, "reaches_goal": reaches_goal, "agree": agree, "tolerance": _APART}
-    print(_TEMPLATES.get_template("walking.txt").render(content).rstrip(), flush=True)
-    return reaches_goal and agree
-
-
 def _half_label(dose: dict[str, Any], element: str) -> str:
     """The rise up to which half of the robots get over an obstacle: ``of 6 cm``."""
     (half,) = (half["value"] for half in dose["half"] if half["element"] == element)
@@ -168,13 +163,11 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
     ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
     """
-    genes = SUPER_GAUSSIAN.hard_random(_TRIED, 0)
-    seeds = np.random.SeedSequence(0).generate_state(_TRIED, np.uint32)
     shares = dict[float, float]()
 
     def fails(height: float) -> bool:
-        terrains = Terrains(genes=genes, seeds=seeds, space=at_height(SUPER_GAUSSIAN, height))
-        result = crosser.cross(policy, terrains, replicas=1, label=f"hard-random terrains of height {height:g} m")
+        label = f"hard-random terrains of height {height:g} m"
+        result = crosser.cross(policy, _draw_terrains(_TRIED, height), replicas=1, label=label)
         refuse_all_invalid(result)
         shares[height] = float(result.reached_goal[~result.invalid].mean())
         print(f"Height {height:g} m: {shares[height]:.0%} of episodes reach the goal.", flush=True)
@@ -187,6 +180,13 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
     return height, shares[height]
 
 
+def _draw_terrains(count: int, height: float | None) -> Terrains:
+    """Hard-random terrains with their seeds, drawn row by row: the first ones of more are those of fewer."""
+    seeds = np.random.SeedSequence(0).generate_state(count, np.uint32)
+    space = SUPER_GAUSSIAN if height is None else at_height(SUPER_GAUSSIAN, height)
+    return Terrains(genes=SUPER_GAUSSIAN.hard_random(count, 0), seeds=seeds, space=space)
+
+
 def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, replicas: int) -> dict[str, Any]:
     """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
 
@@ -195,27 +195,23 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     give the scales. A penalty that never occurred is a ValueError, once the others' scales are written; but in a
     robot.toml, which names all that could occur, it has the scale 1. Returns the content of the file.
     """
-    space, out, count = SUPER_GAUSSIAN, robot.scales_file, _MAX_ROUNDS * terrains
+    out = robot.scales_file
     prepare_output(out)
-    # Both are drawn row by row, so the first 1,000 of 5,000 are those that a draw of 1,000 gives.
-    genes = space.hard_random(count, 0)
-    seeds = np.random.SeedSequence(0).generate_state(count, np.uint32)
     results: list[RolloutResult] = []
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        if robot.settings_file is not None:
-            space = at_height(space, find_fitting_height(crosser, policy)[0])
-        for first in range(0, count, terrains):
-            rows = slice(first, first + terrains)
-            drawn = Terrains(genes=genes[rows], seeds=seeds[rows], space=space)
+        height = None if robot.settings_file is None else find_fitting_height(crosser, policy)[0]
+        drawn = _draw_terrains(_MAX_ROUNDS * terrains, height)
+        for first in range(0, len(drawn), terrains):
             label = f"hard-random terrains from {first + 1:,}"
-            results.append(crosser.cross(policy, drawn, replicas=replicas, label=label))
-            result = RolloutResult.join(results)
-            if (num_failing := _failing(result).sum()) >= _ENOUGH:
+            lot = drawn[first : first + terrains]
+            results.append(crosser.cross(policy, lot, replicas=replicas, label=label))
+            scales = measure_scales(RolloutResult.join(results))
+            if scales["failing_episodes"] >= _ENOUGH:
                 break
-            print(f"{num_failing} of {result.invalid.size} episodes did not reach the goal.", flush=True)
-    origin = {**compute.origin(0), **controller_identity(robot, policy), "space": space.name}
+            print("{failing_episodes} of {episodes} episodes did not reach the goal.".format(**scales), flush=True)
+    origin = {**compute.origin(0), **controller_identity(robot, policy), "space": drawn.space.name}
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
-    report = {**origin, "crossing": crossing, **measure_scales(result)}
+    report = {**origin, "crossing": crossing, **scales}
     absent = [name for name in robot.penalties if name not in report["scales"]]
     if absent and robot.settings_file is not None and robot.settings_file.suffix == ".toml":
         print(f"{', '.join(absent)} never occurred: its scale is 1.")
@@ -234,14 +230,10 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     return report
 
 
-def _failing(result: RolloutResult) -> NDArray[np.bool_]:
-    """Episodes that are valid and did not reach the goal, shape (T, R)."""
-    return ~result.invalid & ~result.reached_goal
-
-
 def measure_scales(result: RolloutResult) -> dict[str, Any]:
     """The scales and what they are means over, as JSON values; a penalty that never occurs has no scale."""
-    failing, valid = _failing(result), ~result.invalid
+    valid = ~result.invalid
+    failing = valid & ~result.reached_goal
     by_failing = int(failing.sum()) >= _ENOUGH
     rows = np.asarray(result.penalties, np.float64)[failing if by_failing else valid]
     means = dict(zip(result.penalty_names, rows.mean(axis=0).tolist(), strict=True))

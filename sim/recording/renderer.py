@@ -6,6 +6,7 @@ it is simulated.
 
 import importlib
 import os
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +39,7 @@ GROUND = "faultline_ground"
 _PIXELS = 4  # of the paint a cell, along each side
 _SHADOWED = 2.0  # half side of the square about the robot that shadows fall in [m]
 _HIDDEN_GROUP = 5  # MuJoCo shows groups 0 to 2
+_GREEN = (0.0, 0.62, 0.45)  # of the goal
 _MAX_GEOMS = 20_000
 _GHOST_OPACITY = 0.4
 _NAME_HEIGHT = 0.55  # over the base, in standing heights of the robot
@@ -81,7 +83,12 @@ def scene_model(
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
-    _add_goal(spec, heights)
+    x, y = CrossingCfg.goal
+    z = float(heights[round(y / SPACING), round(x / SPACING)])
+    cylinder = {"type": mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
+    rim = [CrossingCfg.goal_radius, 0.02, 0.0]  # of the circle that counts as reaching the goal
+    spec.worldbody.add_geom(pos=[x, y, z + 0.5], size=[0.02, 0.5, 0.0], rgba=[*_GREEN, 1.0], **cylinder)
+    spec.worldbody.add_geom(pos=[x, y, z + 0.01], size=rim, rgba=[*_GREEN, 0.25], **cylinder)
     _add_light(spec)
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height
@@ -95,14 +102,9 @@ def scene_model(
 def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]) -> None:
     """A mesh, not a height field, whose facets MuJoCo shows."""
     vertices, faces = surface_of(heights, MARGIN_NODES)
-    places = vertices[:, :2] - vertices[0, :2]
-    spec.add_mesh(
-        name=GROUND,
-        uservert=vertices.ravel(),
-        userface=faces.ravel(),
-        usertexcoord=(places / places[-1]).ravel(),
-        inertia=mj.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-    )
+    steps = vertices[:, :2] - vertices[0, :2]
+    mesh = {"uservert": vertices.ravel(), "userface": faces.ravel(), "usertexcoord": (steps / steps[-1]).ravel()}
+    spec.add_mesh(name=GROUND, inertia=mj.mjtMeshInertia.mjMESH_INERTIA_SHELL, **mesh)
     flat = {"type": mj.mjtTexture.mjTEXTURE_2D, "builtin": mj.mjtBuiltin.mjBUILTIN_FLAT, "nchannel": 3}
     spec.add_texture(name=GROUND, width=paint[1], height=paint[0], **flat)
     material = spec.add_material(name=GROUND, specular=0.0, shininess=0.0, reflectance=0.0)
@@ -111,38 +113,16 @@ def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]
     spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
 
 
-def _add_goal(spec: Any, heights: NDArray[np.floating]) -> None:
-    """A post at the goal, and the rim of the circle that counts as reaching it."""
-    x, y = CrossingCfg.goal
-    ground = float(heights[round(y / SPACING), round(x / SPACING)])
-    green = [0.0, 0.62, 0.45, 1.0]
-    post = {"type": mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
-    spec.worldbody.add_geom(pos=[x, y, ground + 0.5], size=[0.02, 0.5, 0.0], rgba=green, **post)
-    disc = [*green[:3], 0.25]
-    spec.worldbody.add_geom(pos=[x, y, ground + 0.01], size=[CrossingCfg.goal_radius, 0.02, 0.0], rgba=disc, **post)
-
-
 def _add_light(spec: Any) -> None:
-    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT}
-    spec.add_texture(
-        name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], width=64, height=384, **sky
-    )
+    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64}
+    spec.add_texture(name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], height=384, **sky)
     for light in spec.lights:
         light.active = False
-    spec.worldbody.add_light(
-        name="faultline_sun",
-        type=mj.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=[8.0, 4.0, 20.0],
-        dir=[-0.25, 0.45, -1.0],
-        diffuse=[0.55, 0.55, 0.53],
-        ambient=[0.0, 0.0, 0.0],
-        specular=[0.1, 0.1, 0.1],
-        castshadow=True,
-    )
-    headlight = spec.visual.headlight
-    headlight.ambient = [0.42] * 3
-    headlight.diffuse = [0.22] * 3
-    headlight.specular = [0.0] * 3
+    sun = {"type": mj.mjtLightType.mjLIGHT_DIRECTIONAL, "pos": [8.0, 4.0, 20.0], "dir": [-0.25, 0.45, -1.0]}
+    colors = {"diffuse": [0.55, 0.55, 0.53], "ambient": [0.0] * 3, "specular": [0.1] * 3}
+    spec.worldbody.add_light(name="faultline_sun", castshadow=True, **sun, **colors)
+    for name, brightness in {"ambient": 0.42, "diffuse": 0.22, "specular": 0.0}.items():
+        setattr(spec.visual.headlight, name, [brightness] * 3)
     spec.visual.quality.shadowsize = 2048
     spec.visual.quality.offsamples = 0
 
@@ -178,7 +158,7 @@ def open_context(width: int, height: int) -> Any:
     return context
 
 
-class Renderer:
+class Renderer(AbstractContextManager):
     """Renders poses of one robot on one terrain; a context manager that frees what it took of the graphics driver."""
 
     def __init__(
@@ -214,9 +194,6 @@ class Renderer:
         self._rectangle = mj.MjrRect(0, 0, width, height)
         self._image = np.empty((height, width, 3), np.uint8)
 
-    def __enter__(self) -> "Renderer":
-        return self
-
     def __exit__(self, *exception: object) -> None:
         self._gpu.free()
         self._context.free()
@@ -240,20 +217,19 @@ class Renderer:
         """
         data = self._data
         self._pose(data, qpos)
-        self._camera.lookat[:] = camera.target
-        self._camera.distance = camera.distance
         # The sun goes with the camera, so that its shadows are sharp where one looks.
         data.light_xpos[-1] = np.array(camera.target) - _SUN_AWAY * data.light_xdir[-1]
-        self._camera.azimuth = camera.azimuth
-        self._camera.elevation = camera.elevation
+        self._camera.lookat[:] = camera.target
+        for name in ("distance", "azimuth", "elevation"):
+            setattr(self._camera, name, getattr(camera, name))
         everything = mj.mjtCatBit.mjCAT_ALL.value
         mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
         if ghost is not None:
             self._add_ghost(ghost)
         if foot_force is not None:
-            for place, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
-                self._add_arrow(place, force)
+            for foot, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
+                self._add_arrow(foot, force)
         mj.mjr_render(self._rectangle, self._scene, self._gpu)
         mj.mjr_readPixels(self._image, None, self._rectangle, self._gpu)
         picture = self._image[::-1]  # OpenGL's lowest row is first

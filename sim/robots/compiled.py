@@ -12,25 +12,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.files.command import with_traceback
-from sim.robots.drives import Drives, drive_problems, read_drives, set_drives
-from sim.robots.elements import joint_names, mj, touching_geoms
+from sim.robots.elements import (
+    drive_problems,
+    joint_names,
+    mj,
+    read_drives,
+    rotation_matrix,
+    set_drives,
+    touching_geoms,
+)
 from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
-from sim.robots.urdf import read_urdf
 
-PER_JOINT = (
-    "default_joint_pos",
-    "stiffness",
-    "damping",
-    "effort_limit",
-    "armature",
-    "saturation_effort",
-    "velocity_limit",
-)
+_GAINS = ("stiffness", "damping", "effort_limit", "armature")
+PER_JOINT = ("default_joint_pos", *_GAINS, "saturation_effort", "velocity_limit")
 """Settings with a value for each joint."""
 _SLACK = 1e-3  # files round [rad]
+_URDF_FRICTION = 1.0
+_URDF_TIME_CONSTANT_S = 0.01
+_SKEW = 0.01  # share by which a principal axis may miss a joint's
+_MATRIX = [[0, 3, 4], [3, 1, 5], [4, 5, 2]]  # of MuJoCo's xx, yy, zz, xy, xz, yz
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
 _CONSTRAINT_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "refsafe")
 _FORCE_FLAGS = ("spring", "damper", "gravity", "clampctrl", "actuation")
@@ -51,7 +55,6 @@ class RobotFile:
     spec: Any
     """The ``MjSpec``, stripped to what simulations use; every touching geom has a name."""
     model: Any
-    drives: Drives
     home: list[float] | None
     """Joint angles of its keyframe ``home`` [rad]; None without one."""
     is_urdf: bool
@@ -66,7 +69,7 @@ def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, robot_file):
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
-    set_drives(robot_file.spec, robot_file.drives, robot)
+    set_drives(robot_file.spec, read_drives(robot_file.model), robot)
     for geom in touching_geoms(*robot_file.spec.bodies):
         if robot.friction is not None:
             geom.friction[0] = robot.friction
@@ -79,24 +82,83 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
     """Reads a robot's file; an error says all that is wrong with it."""
     files = read_model_files(model_file, visuals=visuals)
     try:
-        spec = read_urdf(files.root) if files.is_urdf else mj.MjSpec.from_file(str(model_file))
+        spec = _read_urdf(files.root) if files.is_urdf else mj.MjSpec.from_file(str(model_file))
         home = next((list(key.qpos) for key in spec.keys if key.name == "home"), [])
         _name_geoms(spec)
-        refused = [*refused_elements(spec)]
+        refused = [*_refused_elements(spec)]
         _strip(spec)
         spec.fuse_static()
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
         reason = _quote_urdf(" ".join(str(error).split()), files)
         raise ValueError(with_traceback(error, f"{model_file} cannot be read by MuJoCo: {reason}")) from None
-    problems = [*structure_problems(model)]
+    problems = [*_structure_problems(model)]
     if refused := [*refused, *drive_problems(spec, model)]:
         problems.append(f"{', '.join(refused)} cannot be simulated: take it out, or write it otherwise")
     if len(home) not in (0, model.nq):
         problems.append(f"qpos of the keyframe home must be {model.nq} numbers, got {len(home)}")
     if problems:
         raise ValueError("; ".join(f"{model_file}: {_quote_urdf(problem, files)}" for problem in problems))
-    return RobotFile(spec=spec, model=model, drives=read_drives(model), home=home[7:] or None, is_urdf=files.is_urdf)
+    return RobotFile(spec=spec, model=model, home=home[7:] or None, is_urdf=files.is_urdf)
+
+
+def _read_urdf(root: ET.Element) -> Any:
+    """The ``MjSpec`` of a URDF: contact as in docs/robots.md, and what is fixed to a link adds its mass to it."""
+    compiler = root
+    for tag in ("mujoco", "compiler"):
+        element = compiler.find(tag)
+        compiler = ET.SubElement(compiler, tag) if element is None else element
+    compiler.attrib.setdefault("inertiafromgeom", "false")
+    compiler.attrib |= dict.fromkeys(("strippath", "fusestatic", "discardvisual"), "false")
+    ET.indent(root)  # every element on a line of its own
+    spec = mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    for body in spec.bodies:
+        geoms = touching_geoms(body)
+        for number, geom in enumerate(geoms):
+            geom.name = body.name if len(geoms) == 1 else f"{body.name}_{number}"
+            geom.friction[0] = _URDF_FRICTION
+            geom.solref = _URDF_TIME_CONSTANT_S, 1.0
+    for base in spec.worldbody.bodies:
+        if not base.joints:  # the world's joint may be floating already
+            base.add_freejoint()
+        _merge_masses(base)  # MuJoCo refuses inertias of fixed links that no body could have
+    return spec
+
+
+def _merge_masses(body: Any) -> list[Any]:
+    """Gives a body the masses that are fixed to it; returns them: mass [kg], centre [m], inertia [kg m^2]."""
+    axes = rotation_matrix(body.iquat)
+    inertia = np.diag(body.inertia) if np.isnan(body.fullinertia[0]) else body.fullinertia[_MATRIX]
+    masses = [(float(body.mass), np.array(body.ipos), axes @ inertia @ axes.T)] if body.mass > 0.0 else []
+    for child in body.bodies:
+        child_masses = _merge_masses(child)
+        if not child.joints:
+            turn = rotation_matrix(child.quat)
+            masses += [(m, child.pos + turn @ centre, turn @ inertia @ turn.T) for m, centre, inertia in child_masses]
+            child.mass, child.inertia, child.fullinertia = 0.0, np.zeros(3), np.full(6, np.nan)
+    if body.joints and masses:
+        mass = sum(m for m, _, _ in masses)
+        middle = sum(m * centre for m, centre, _ in masses) / mass
+        shifts = [(m, centre - middle, inertia) for m, centre, inertia in masses]
+        whole = np.sum([inertia + m * (d @ d * np.eye(3) - np.outer(d, d)) for m, d, inertia in shifts], axis=0)
+        if body.joints[0].type == mj.mjtJoint.mjJNT_HINGE:
+            whole = _move_rotor(whole, body.joints[0])
+        body.explicitinertial, body.mass, body.ipos, body.iquat = True, mass, middle, (1.0, 0.0, 0.0, 0.0)
+        body.fullinertia = whole[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    return masses
+
+
+def _move_rotor(inertia: NDArray[np.float64], joint: Any) -> NDArray[np.float64]:
+    """Moves the inertia about the joint's axis that no body can have to the joint's armature; returns the rest."""
+    # The largest principal inertia of a body is at most the sum of the others; some URDFs add that of the motor.
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    about_axis = float(axis @ inertia @ axis)
+    excess = 2.0 * about_axis - float(np.trace(inertia))
+    if excess <= 0.0 or np.linalg.norm(inertia @ axis - about_axis * axis) > _SKEW * about_axis:
+        return inertia
+    excess += _SKEW * (about_axis - excess)  # the axis is a principal one but for rounding
+    joint.armature += excess
+    return inertia - excess * np.outer(axis, axis)
 
 
 def _quote_urdf(text: str, files: ModelFiles) -> str:
@@ -128,7 +190,7 @@ def _strip(spec: Any) -> None:
     spec.option = usual.option
 
 
-def refused_elements(spec: Any) -> Iterator[str]:
+def _refused_elements(spec: Any) -> Iterator[str]:
     """Elements and attributes of a specification, with their line in the file."""
     option = spec.option
     for flag in (*_CONSTRAINT_FLAGS, *_FORCE_FLAGS):
@@ -181,7 +243,7 @@ def _refused_equalities(spec: Any) -> Iterator[str]:
             yield f"<equality> {kind} of {equality.name1} ({equality.info})"
 
 
-def structure_problems(model: Any) -> Iterator[str]:
+def _structure_problems(model: Any) -> Iterator[str]:
     """Complaints about a compiled model that is no robot of single joints on a free base."""
     if not model.njnt or model.jnt_type[0] != mj.mjtJoint.mjJNT_FREE or model.jnt_bodyid[0] != 1:
         yield "the first body must move freely: give it a <freejoint/>"
@@ -215,7 +277,7 @@ def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: Rob
 
 def _joint_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     """Complaints about the joints' names, and about settings with a value for each joint."""
-    model, drives, names = file.model, file.drives, robot.joint_names
+    model, drives, names = file.model, read_drives(file.model), robot.joint_names
     if names != joint_names(model):
         missing = _missing("joint is", names, joint_names(model), robot)
         return missing or [f"joint_names must follow the file's order {joint_names(model)}, got {names}"]

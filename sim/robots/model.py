@@ -55,22 +55,17 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     axes = rotation_matrix(model.body_iquat[body])
     inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
     pose = _transform(model.body_pos[body], model.body_quat[body])
-    link = builder.add_link(
-        xform=pose,
-        com=wp.vec3(*map(float, model.body_ipos[body])),
-        inertia=wp.mat33(*map(float, inertia.ravel())),
-        mass=float(model.body_mass[body]),
-        label=model.body(body).name,
-        lock_inertia=True,
-    )
+    centre = wp.vec3(*map(float, model.body_ipos[body]))
+    moments = wp.mat33(*map(float, inertia.ravel()))
+    inertial = {"mass": float(model.body_mass[body]), "com": centre, "inertia": moments, "lock_inertia": True}
+    link = builder.add_link(xform=pose, label=model.body(body).name, **inertial)
     joint = int(model.body_jntadr[body])
     dof = int(model.jnt_dofadr[joint])
     name = model.joint(joint).name
     if body == 1:
         base = builder.add_joint_free(child=link, label=name)
-        builder.joint_armature[:6] = map(float, model.dof_armature[:6])
-        builder.joint_damping[:6] = map(float, model.dof_damping[:6])
-        builder.joint_friction[:6] = map(float, model.dof_frictionloss[:6])
+        for ours, theirs in (("armature", "armature"), ("damping", "damping"), ("friction", "frictionloss")):
+            getattr(builder, f"joint_{ours}")[:6] = getattr(model, f"dof_{theirs}")[:6].tolist()
         return base
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
@@ -135,7 +130,7 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
     if kind == mj.mjtGeom.mjGEOM_MESH:
         vertices, faces = read_mesh(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)
-    sliding, torsional, rolling = map(float, model.geom_friction[geom])
+    friction = dict(zip(("mu", "mu_torsional", "mu_rolling"), map(float, model.geom_friction[geom]), strict=True))
     builder.add_shape(
         body=int(model.geom_bodyid[geom]) - 1,
         type=_TYPES[kind],
@@ -143,14 +138,8 @@ def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
         scale=wp.vec3(*map(float, scale)),
         src=source,
         label=model.geom(geom).name,
-        cfg=newton.ModelBuilder.ShapeConfig(
-            density=0.0,
-            gap=0.0,
-            collision_group=0,  # a robot does not touch itself
-            mu=sliding,
-            mu_torsional=torsional,
-            mu_rolling=rolling,
-        ),
+        # Of collision group 0: a robot does not touch itself.
+        cfg=newton.ModelBuilder.ShapeConfig(density=0.0, gap=0.0, collision_group=0, **friction),
         custom_attributes={
             "mujoco:condim": int(model.geom_condim[geom]),
             "mujoco:geom_priority": int(model.geom_priority[geom]),

@@ -3,6 +3,7 @@
 For showing a robot, not for simulating one: forward kinematics and geometry are those of MuJoCo C.
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,9 +41,9 @@ def shown_spec(robot: RobotCfg) -> Any:
     except ValueError:  # for example a visual mesh of too many faces
         spec = robot_spec(robot)
     look_file = robot.model_file.with_suffix(LOOK_SUFFIX)
-    looks = _read_look(look_file)
+    looks = _read_look(look_file) if look_file.is_file() else {}
     for body in spec.bodies[1:]:
-        _dress(body, touching_geoms(body), looks.pop(body.name, []), robot)
+        _dress(body, looks.pop(body.name, []), robot)
     if looks:
         names = ", ".join(body.name for body in spec.bodies[1:])
         raise ValueError(f"{look_file} has a body '{next(iter(looks))}': expected those of {robot.model_file}, {names}")
@@ -87,8 +88,9 @@ def _compiled(compile_model: Callable[[], Any], file: Path) -> Any:
         raise ValueError(f"{file} cannot be shown: {' '.join(str(error).split())}") from None
 
 
-def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: RobotCfg) -> None:
+def _dress(body: Any, look: list[dict[str, Any]], robot: RobotCfg) -> None:
     """Hides shapes of a body that others replace, and colours those without a colour by their role."""
+    touching = touching_geoms(body)
     visual = [geom for geom in body.geoms if geom not in touching and geom.group < _HIDDEN]
     for geom in visual:
         geom.group = _HIDDEN if look else _VISUAL
@@ -103,13 +105,11 @@ def _dress(body: Any, touching: list[Any], look: list[dict[str, Any]], robot: Ro
 
 def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
     """Shapes by the name of their body, as ``add_geom`` takes them."""
-    looks = dict[str, list[dict[str, Any]]]()
-    if not file.is_file():
-        return looks
+    looks = defaultdict[str, list[dict[str, Any]]](list)
     model = _compiled(lambda: mj.MjModel.from_xml_path(str(file)), file)
     for k in range(model.ngeom):
         shape = {name: getattr(model, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
-        looks.setdefault(model.body(model.geom_bodyid[k]).name, []).append(shape)
+        looks[model.body(model.geom_bodyid[k]).name].append(shape)
     return looks
 
 
@@ -119,12 +119,8 @@ class Skeleton:
     def __init__(self, robot: RobotCfg) -> None:
         self.model: Any = robot_model(shown_spec(robot), robot)
         """The ``MjModel``, whose body 0 is the world."""
+        self.num_bodies: int = self.model.nbody - 1
         self.touches = find_touches(self.model, robot)
-
-    @property
-    def num_bodies(self) -> int:
-        """Number of bodies without the world."""
-        return self.model.nbody - 1
 
     def shape(self, geom: int) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
         """A geom in its body's frame [m], and its colour, RGB 0 to 1."""

@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter
 
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.files.templates import open_templates
-from sim.robots.drives import read_drives
+from sim.robots.elements import read_drives
 from sim.robots.model import build_robot
 from sim.robots.probes import measure_extents, start_height
 from sim.robots.robot import RobotCfg
