@@ -29,9 +29,6 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.settings import PositiveInt, check_settings
 
-_MIN_COLUMNS = 40
-"""Help is written for a terminal of at least this width."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFlag:
@@ -182,8 +179,8 @@ def say(*parts: str | tuple[str, str], error: bool = False) -> None:
 
 def _parse(cls: Any, argv: Sequence[str], name: str) -> Any:
     """The command with its flags; SystemExit after help, or after a message about wrong flags."""
-    if get_terminal_size().columns < _MIN_COLUMNS:
-        os.environ["COLUMNS"] = str(_MIN_COLUMNS)  # tyro never ends in a narrower terminal
+    if get_terminal_size().columns < 40:
+        os.environ["COLUMNS"] = "40"  # tyro never ends in a narrower terminal
     if {"-h", "--help"} & {*argv}:
         for paragraph in (inspect.getdoc(cls) or "").split("\n\n"):
             print(textwrap.fill(paragraph, get_terminal_size().columns), end="\n\n")

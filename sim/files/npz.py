@@ -58,11 +58,8 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]], *, compression: int = zipfile.
     ``zipfile.ZIP_BZIP2`` packs whole numbers into half of the bytes, and takes longer.
     """
     whole = io.BytesIO()
-    with zipfile.ZipFile(whole, "w") as members:
+    with zipfile.ZipFile(whole, "w", compression) as members:
         for name, values in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, values, allow_pickle=False)
-            header = zipfile.ZipInfo(name + _ENDING)  # with the date that a zip file begins with
-            header.compress_type = compression
-            members.writestr(header, member.getvalue())
+            with members.open(name + _ENDING, "w") as member:  # without a date
+                np.lib.format.write_array(member, values, allow_pickle=False)
     return whole.getvalue()

@@ -48,7 +48,15 @@ class RlSar:
             high = pairs[0][1]
             source.set(action_clip=high if all(pair == [-high, high] for pair in pairs) else pairs)
         steps = content.pop("observations_history", None) or [0]
-        _set_history(source, steps, content.pop("observations_history_priority", "time"))
+        if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
+            raise ValueError(f"{file}: observations_history must be all steps from 0 on, got {steps}")
+        priority = content.pop("observations_history_priority", "time")
+        by = {"time": "row", "term": "term"}.get(priority)
+        if by is None:
+            raise ValueError(f"{file}: observations_history_priority must be time or term, got {priority}")
+        if len(steps) > 1:
+            history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
+            source.set(history=history, reason="steps before the start are zeros, as in rl_sar's own loop")
         terms = content.pop("observations")
         source.refuse_unknown(terms, _TERMS)
         scales = {_TERMS[name]: content.pop(f"{name}_scale") for name in _SCALED if f"{name}_scale" in content}
@@ -58,17 +66,6 @@ class RlSar:
         weights = _find_weights(file.parent, content.pop("model_name"))
         source.refuse_unknown(content, _WITHOUT_EFFECT)
         return weights
-
-
-def _set_history(source: Source, steps: list[int], priority: str) -> None:
-    if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
-        raise ValueError(f"{source.file}: observations_history must be all steps from 0 on, got {steps}")
-    by = {"time": "row", "term": "term"}.get(priority)
-    if by is None:
-        raise ValueError(f"{source.file}: observations_history_priority must be time or term, got {priority}")
-    if len(steps) > 1:
-        history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}
-        source.set(history=history, reason="steps before the start are zeros, as in rl_sar's own loop")
 
 
 class UnitreeRlGym:
