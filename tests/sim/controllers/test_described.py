@@ -166,18 +166,15 @@ def test_an_episode_depends_on_its_own_rows_alone(anymal, remembering, device):
             np.testing.assert_allclose(together[k][robot], alone(rows[robot : robot + 1])[0].numpy(), **near)
 
 
-@pytest.mark.parametrize(
-    ("width", "line", "weights", "named"),
-    [
+def test_weights_that_do_not_fit_a_description_are_named(tmp_path, anymal, describe):
+    for width, line, weights, named in (
         (3, 'activation = "elu"', "weights.pt", r"controller\.toml: activation .*weights\.pt"),
         (6, "", "weights.pt", r"weights\.pt' .*6 columns.*controller\.toml \(gravity 3\) .* 3"),
         (3, "", "gone.pt", r"controller\.toml: policy .*gone\.pt"),
-    ],
-)
-def test_weights_that_do_not_fit_a_description_are_named(tmp_path, anymal, describe, width, line, weights, named):
-    torch.jit.script(torch.nn.Linear(width, ACTIONS)).save(str(tmp_path / "weights.pt"))
-    with pytest.raises(ValueError, match=named):
-        load_policy(describe('{term = "gravity"}', line, policy=weights), anymal, "cpu")
+    ):
+        torch.jit.script(torch.nn.Linear(width, ACTIONS)).save(str(tmp_path / "weights.pt"))
+        with pytest.raises(ValueError, match=named):
+            load_policy(describe('{term = "gravity"}', line, policy=weights), anymal, "cpu")
 
 
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):

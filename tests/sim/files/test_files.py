@@ -37,23 +37,11 @@ class Outer:
 def test_values_within_their_ranges_pass_and_all_problems_are_named_at_once():
     inner, gains = Inner(share=1, span=(2.0, 2.0)), (0.0, np.float64(2.0))
     check_settings(Outer(count=3, length=np.float64(2), maybe=0.0, names=("a",), gains=gains, inner=inner))
-    with pytest.raises(ValueError, match=r"count = 0: .*; inner\.share = 2\.0: "):
-        check_settings(Outer(count=0, inner=Inner(share=2.0)))
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"length": math.inf}, "length"),
-        ({"gains": (1.0, math.nan)}, "gains"),
-        ({"inner": 3}, "inner"),
-        ({"inner": Inner(span=(1.0, 0.0))}, "inner.span"),
-    ],
-    ids=str,
-)
-def test_a_wrong_value_is_named(values, field):
-    (line,) = problems(Outer(**values))
-    assert line.startswith(f"{field} = ")
+    wrong = Outer(count=0, length=math.inf, gains=(1.0, math.nan), inner=Inner(share=2.0, span=(1.0, 0.0)))
+    named = [line.partition(" = ")[0] for line in problems(wrong)]
+    assert named == ["count", "length", "gains", "inner.share", "inner.span"]
+    with pytest.raises(ValueError, match=r"count = 0: .*; inner = 3: "):
+        check_settings(Outer(count=0, inner=3))
 
 
 def test_settings_come_back_from_json():
