@@ -63,19 +63,17 @@ class Dose(Sweep):
     """Terrain space of its genes; of heights any."""
 
     @property
-    def unit(self) -> str:
-        """Of the quantity that grows; empty of a number."""
-        return self.quantities[self.parameter].unit
-
-    @property
     def harder_up(self) -> bool:
         """Whether larger values are harder."""
         return self.values[-1] >= self.values[0]
 
     def describe(self) -> str:
         """The obstacle and its other quantities: ``stairs up, tread 0.30 m, flight 5 steps``."""
-        others = (f"{name} {self.quantities[name].format(value)}" for name, value in self.others.items())
-        return ", ".join([self.title, *others])
+        texts = [self.title]
+        for name, value in self.others.items():
+            unit = self.quantities[name].unit
+            texts.append(f"{name} {value:.0f} {unit}" if unit == "steps" else f"{name} {value:.2f} {unit}")
+        return ", ".join(texts)
 
     def changed(self, values: Iterable[float] | None, others: Mapping[str, float]) -> "Dose":
         """The same with other values, the easiest first, and other quantities where it has them."""
@@ -230,7 +228,8 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
 
     A value with more than a quarter of invalid episodes has no rates.
     """
-    about: dict[str, Any] = {"element": name, "parameter": dose.parameter, "unit": dose.unit, "at": dict(dose.others)}
+    unit = dose.quantities[dose.parameter].unit
+    about: dict[str, Any] = {"element": name, "parameter": dose.parameter, "unit": unit, "at": dict(dose.others)}
     rows = []
     for number, value in enumerate(dose.values):
         outcome, fallen = (array[number :: len(dose.values)].ravel() for array in (result.outcome, result.fallen))

@@ -44,16 +44,6 @@ _NUM_BOXES = 20
 _BOX_CELLS = (20, 40)  # 1 m to 2 m
 
 
-def _slope(inset_cm: np.ndarray, gradient: float) -> np.ndarray:
-    """A flank of constant gradient up to the platform [m]."""
-    return gradient * 0.01 * np.minimum(inset_cm, _FLANK_CM)
-
-
-def _stairs(inset_cm: np.ndarray, step_height: float) -> np.ndarray:
-    """Stairs up to the platform [m]; the first riser stands one tread inside the edge."""
-    return step_height * np.minimum(inset_cm // _TREAD_CM, _FLANK_CM // _TREAD_CM)
-
-
 def _roughness(rng: np.random.Generator) -> np.ndarray:
     """Uniform heights of +-0.05 m drawn every 0.2 m, bilinearly interpolated; 0 at x = 4 and x = 12."""
     coarse = np.arange(0, _SIDE, _PATCH_NODES)
@@ -82,22 +72,33 @@ def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
     return heights
 
 
+def _feature(kind: str, level: int, inset_cm: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Heights [m] of the square of a crossing or a tile, whose nodes lie ``inset_cm`` inside its edge."""
+    d = level / NUM_LEVELS
+    slope = 0.4 * d * 0.01 * np.minimum(inset_cm, _FLANK_CM)
+    # The first riser stands one tread inside the edge.
+    stairs = (0.05 + 0.18 * d) * np.minimum(inset_cm // _TREAD_CM, _FLANK_CM // _TREAD_CM)
+    return {
+        "slope": lambda: slope,
+        "rough_slope": lambda: slope + _roughness(rng),
+        "stairs_up_down": lambda: stairs,
+        "stairs_down_up": lambda: -stairs,
+        "stairs_up": lambda: -stairs,
+        "stairs_down": lambda: stairs,
+        "boxes": lambda: _boxes(rng, 0.05 + 0.2 * d),
+        "obstacles": lambda: np.where(inset_cm < _FLANK_CM, _boxes(rng, 0.05 + 0.2 * d), 0.0),
+        "noise": lambda: _noise(rng, 0.02 + 0.08 * d),
+    }[kind]()
+
+
 def crossing_terrain(kind: str, level: int, seed: Seed) -> np.ndarray:
     """One hand-crafted crossing of :data:`CROSSING_TYPES`: heights [m], float32, shape (NUM_ROWS, NUM_COLS).
 
     The feature has the full width; for x <= 4 and x >= 12 the ground is flat at height 0. Levels go from 0 (nearly
     flat) to 9.
     """
-    d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
-    feature = {
-        "slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d),
-        "rough_slope": lambda: _slope(_INSET_CROSSING_CM, 0.4 * d) + _roughness(rng),
-        "stairs_up_down": lambda: _stairs(_INSET_CROSSING_CM, 0.05 + 0.18 * d),
-        "stairs_down_up": lambda: _stairs(_INSET_CROSSING_CM, -0.05 - 0.18 * d),
-        "boxes": lambda: _boxes(rng, 0.05 + 0.2 * d),
-        "noise": lambda: _noise(rng, 0.02 + 0.08 * d),
-    }[kind]()
     heights = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    feature = _feature(kind, level, _INSET_CROSSING_CM, np.random.default_rng(seed))
     # The nodes at x = 4 and x = 12 belong to the run-in and run-out.
     heights[:, _FIRST_COL + 1 : _FIRST_COL + _SIDE - 1] = feature[:, 1:-1]
     return heights
@@ -127,14 +128,9 @@ def training_tile(kind: str, level: int, seed: Seed, *, inverted: bool = False) 
     from ``stairs_down``. ``kind`` is one of :data:`TILE_TYPES`; levels go from 0 (nearly flat) to 9. ``inverted`` turns
     a slope into a pit, and no other type. Heights [m], float32, shape (NUM_ROWS, NUM_COLS).
     """
-    d, rng = level / NUM_LEVELS, np.random.default_rng(seed)
-    tile = {
-        "slope": lambda: _slope(_INSET_TILE_CM, -0.4 * d if inverted else 0.4 * d),
-        "rough_slope": lambda: _slope(_INSET_TILE_CM, 0.4 * d) + _roughness(rng),
-        "stairs_up": lambda: _stairs(_INSET_TILE_CM, -0.05 - 0.18 * d),
-        "stairs_down": lambda: _stairs(_INSET_TILE_CM, 0.05 + 0.18 * d),
-        "obstacles": lambda: np.where(_INSET_TILE_CM < _FLANK_CM, _boxes(rng, 0.05 + 0.2 * d), 0.0),
-    }[kind]()
+    tile = _feature(kind, level, _INSET_TILE_CM, np.random.default_rng(seed))
+    if inverted and kind == "slope":
+        tile = -tile
     return np.pad(tile, ((0, 0), (_FIRST_COL, _FIRST_COL)), mode="edge").astype(np.float32)
 
 

@@ -16,11 +16,6 @@ class Quantity:
     step: float = 0.0
     """What values are multiples of; 0 if they may be any number."""
 
-    def format(self, value: float) -> str:
-        """A value with its unit: ``0.30 m``, ``5 steps``."""
-        digits = {"steps": 0, "s": 3}.get(self.unit, 2)
-        return f"{value:.{digits}f} {self.unit}".strip()
-
 
 @dataclass(frozen=True)
 class Sweep:

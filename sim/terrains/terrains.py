@@ -61,9 +61,7 @@ class Terrains:
 
     def __getitem__(self, rows: Rows) -> "Terrains":
         chosen: dict[str, Any] = {
-            name: value[rows]
-            for name in ("seeds", "genes", "heights", "ground")
-            if (value := getattr(self, name)) is not None
+            name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray | GroundMaps)
         }
         return replace(self, **chosen)
 

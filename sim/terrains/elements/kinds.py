@@ -38,11 +38,6 @@ def _metres(num_cells: float) -> str:
 
 
 @wp.func
-def _flat_relief(element: Element, s: int, row: int) -> float:
-    return 0.0
-
-
-@wp.func
 def _ramp_rise(element: Element) -> float:
     return direction_sign(element) * element.size * float(element.cells) * SPACING
 
@@ -67,7 +62,6 @@ def _slope_text(name: str, element: Any, direction: str) -> str:
 FLAT = CourseElement(
     name="flat",
     length=Range(0, 60, whole=True, hard="low"),
-    relief=_flat_relief,
     text=lambda e: f"flat ground of {_metres(e['cells'])}" if e["cells"] else "nothing",
 )
 RAMP = CourseElement(
