@@ -76,7 +76,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     @staticmethod
     def help_values() -> dict[str, str]:
         """Names of conditions."""
-        from sim.terrains.conditions.base import CONDITIONS
+        from sim.terrains.conditions.kinds import CONDITIONS
 
         return {"conditions": ", ".join(f"+{name}" for name in CONDITIONS)}
 
@@ -355,8 +355,8 @@ class DoseCommand(RobotFlag, WorkerFlags):
     @staticmethod
     def help_values() -> dict[str, str]:
         """Names of doses."""
-        from sim.terrains.conditions.base import CONDITIONS
-        from sim.terrains.elements.base import ELEMENTS
+        from sim.terrains.conditions.kinds import CONDITIONS
+        from sim.terrains.elements.kinds import ELEMENTS
 
         obstacles = (name for element in ELEMENTS.values() for name in element.doses)
         conditions = (name for name, condition in CONDITIONS.items() if condition.dose)

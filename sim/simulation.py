@@ -30,8 +30,7 @@ from sim.robots.robot import RobotCfg
 from sim.robots.training import NoiseCfg, TrainingCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.base import begin_effects, disturb_effects
-from sim.terrains.conditions.kinds import MAX_LATENCY_S
+from sim.terrains.conditions.kinds import MAX_LATENCY_S, begin_effects, disturb_effects
 
 
 class Simulation:

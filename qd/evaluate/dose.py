@@ -29,8 +29,8 @@ from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
-from sim.terrains.conditions.base import CONDITIONS
-from sim.terrains.elements.base import ELEMENTS
+from sim.terrains.conditions.kinds import CONDITIONS
+from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.registry import load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kernels.ground import FIRM
 from sim.crossing import CrossingCfg
 from sim.terrains.bank import make_heights, make_terrains
-from sim.terrains.conditions.base import CONDITIONS, condition_texts
+from sim.terrains.conditions.kinds import CONDITIONS, condition_texts
 from sim.terrains.ground import PATCHES, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace

@@ -18,7 +18,7 @@ from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.base import condition_column
+from sim.terrains.conditions.kinds import condition_column
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 

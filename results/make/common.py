@@ -33,7 +33,7 @@ from sim.files.provenance import provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.base import CONDITIONS
+from sim.terrains.conditions.kinds import CONDITIONS
 
 SEEDS = (0, 1, 2)
 """Seeds of repeated trainings and searches."""

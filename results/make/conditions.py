@@ -20,7 +20,7 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
 from results.make.spaces import search_space
-from sim.terrains.conditions.base import CONDITIONS
+from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from sim.terrains.terrains import Terrains
 

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from kernels.ground import COLS, MAX_TIME_CONSTANT_S, ROWS, make_ground
-from sim.terrains.conditions.base import condition_genes
+from sim.terrains.conditions.kinds import condition_genes
 from sim.terrains.ground import patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace

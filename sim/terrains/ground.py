@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
-from sim.terrains.conditions.base import condition_genes, nominal_row
+from sim.terrains.conditions.kinds import condition_genes, nominal_row
 
 GROUND_KINDS = ("friction", "softness")
 """What the ground may have maps of."""

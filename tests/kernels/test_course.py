@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.terrains.elements.base import all_elements
+from sim.terrains.elements.kinds import all_elements
 from sim.terrains.spaces.course import COURSE
 from tests.kernels import course_oracle as oracle
 

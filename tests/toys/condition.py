@@ -3,7 +3,7 @@
 import warp as wp
 
 from kernels.conditions import DisturbedStep
-from sim.terrains.conditions.base import CONDITIONS, Condition, Gene
+from sim.terrains.conditions.kinds import CONDITIONS, Condition, Gene
 from sim.terrains.quantities import Sweep
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import warp as wp
 
 from kernels.course import Element, Range
-from sim.terrains.elements.base import ELEMENTS, LENGTH, CourseElement
+from sim.terrains.elements.kinds import ELEMENTS, LENGTH, CourseElement
 from sim.terrains.quantities import Quantity, Sweep
 from sim.terrains.spaces.course import Course
 from sim.terrains.spaces.registry import SPACES

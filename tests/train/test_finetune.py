@@ -15,7 +15,6 @@ from sim.controllers.spec import controller_hash
 from sim.files.command import run_command
 from sim.robots.find import get_robot
 from sim.terrains.spaces import registry as spaces
-from sim.terrains.spaces import user
 from tests.builders import fresh_values, make_archive, write_run
 from tests.sim.terrains.spaces.spaces import write_ridges
 from tests.train.conftest import PPO, begun, write_actor
@@ -199,7 +198,7 @@ def test_a_space_of_ones_own_runs_only_where_it_is_named(places, tmp_path, monke
     ridges, run = write_ridges(tmp_path / "mine"), tmp_path / "run"
     cfg = cfg_of(places, mix="hard-random", archive=(), space=ridges, iterations=1)
     finetune(ROBOT, cfg, run, ON_CPU)
-    monkeypatch.setattr(user, "LOADED", [])  # as in a program that has just begun
+    monkeypatch.setattr(spaces, "LOADED", [])  # as in a program that has just begun
     assert FinetuneCommand.defaults(["--resume", str(run)]).space is None
     with pytest.raises(ValueError, match="spaces"):
         finetune(ROBOT, replace(cfg, space=None, iterations=2), run, ON_CPU)

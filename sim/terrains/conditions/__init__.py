@@ -1,3 +1,1 @@
 """Conditions under which robots cross, which belong to a terrain: payload, weak motors, delays, noise, a push."""
-
-from sim.terrains.conditions import kinds as kinds

@@ -1,14 +1,23 @@
-"""Elements by kind: slopes; what stands on the ground or lifts it; ditches, ways over them, and rubble."""
+"""What an element of a course is, and all of them: slopes, what lies on the ground or lifts it, ditches and rubble."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from kernels.course import CENTRE_ROW, DIRECTION, SPACING, Element, Range, direction_sign, fit_face, fit_top
-from sim.terrains.elements.base import ELEMENTS, LENGTH, CourseElement, cells
+from kernels import course
+from kernels.course import CENTRE_ROW, DIRECTION, SPACING, Element, ElementKind, Range, direction_sign
+from sim.device import host_device
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.quantities import Quantity, Sweep
 
+FIRST_COL = 100
+"""An element alone on flat ground begins at x = 5 m, or at one of the next nodes."""
+NUM_STARTS = 20
+"""Nodes at which it may begin: over 1 m, more than a stride."""
 SLOPE_ROWS = 40
 """Rows to each side of the way in which a cross slope is inclined: 2 m; beyond, it stays level."""
 _MAX_STEPS = 8
@@ -23,6 +32,65 @@ _WIDTHS = (0.10, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 1.00)
 _SLOPE = Quantity(name="size", low=0.01, high=2.0, unit="m/m")
 _HEIGHT = Quantity(name="size", low=0.01, high=1.0, unit="m")
 _DEPTH = Quantity(name="size", low=0.05, high=2.0, unit="m")
+
+
+def cells(name: str, low: float, high: float, every: int = 1) -> Quantity:
+    """A length [m] that is a multiple of ``every`` cells."""
+    return Quantity(name=name, low=low, high=high, unit="m", step=every * SPACING)
+
+
+LENGTH = cells("length", 0.20, 4.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CourseElement(ElementKind):
+    """A kind of element with its text and its doses."""
+
+    text: Callable[[Any], str]
+    """Of a record of :class:`kernels.course.Element`."""
+    quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    """What doses can set."""
+    doses: Mapping[str, Sweep] = field(default_factory=dict)
+    """Doses by name."""
+    draw_turns: Callable[[int, np.random.Generator], NDArray[Any]] | None = None
+    """Draws the turns of an element of a dose, one for each node where it begins."""
+
+    def lay_alone(
+        self, turn: float, quantities: Mapping[str, Any], count: int, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Elements alone on flat ground before x = 12 m, of quantities of which one has several values.
+
+        They begin at ``count`` nodes that are spread evenly over 1 m. Returns heights [m], shape (count * num_values,
+        NUM_ROWS, NUM_COLS): first one of each value, then the next of each.
+        """
+        record: Any = course.Element  # Warp makes its dtype
+        laid: Any = np.zeros((count, max(map(np.size, quantities.values()))), record.numpy_dtype())
+        laid["kind"] = all_elements().index(self)
+        laid["detail"] = 1.0  # pallets
+        laid["first"] = (FIRST_COL + np.arange(count) * NUM_STARTS // count)[:, None]
+        laid["turn"] = turn if self.draw_turns is None else self.draw_turns(count, rng)[:, None]
+        for name, values in quantities.items():
+            quantity = self.quantities[name]
+            in_cells = quantity.step and quantity.unit == "m"
+            laid[quantity.name] = np.rint(np.asarray(values) / SPACING) if in_cells else values
+        with wp.ScopedDevice(host_device()):
+            elements: Any = wp.array(laid.reshape(-1, 1), dtype=course.Element)
+            course.lay_elements(elements, all_elements())
+            heights: Any = wp.empty((len(elements), NUM_ROWS, NUM_COLS), dtype=float)
+            course.rasterise_elements(elements, all_elements(), heights)
+            return np.array(heights.numpy(), np.float32)
+
+
+ELEMENTS: dict[str, CourseElement] = {}
+"""All elements by name; flat ground is the first, and what is left where another is taken away.
+
+Courses of the shipped space have those that spaces/course.py names.
+"""
+
+
+def all_elements() -> tuple[CourseElement, ...]:
+    """All elements, in the order of their numbers in kernels."""
+    return tuple(ELEMENTS.values())
 
 
 def _both_ways(name: str, parameter: str, values: tuple[float, ...], **others: float) -> dict[str, Sweep]:
@@ -137,7 +205,7 @@ SILL = CourseElement(
     name="sill",
     size=Range(0.013, 0.15, hard="high"),
     length=Range(1, 3, whole=True),
-    fit=fit_top,
+    fit=course.fit_top,
     text=lambda e: f"sill {e['size']:.3f} m high and {_metres(e['length'])} wide",
     quantities={"height": _HEIGHT, "width": cells("length", 0.05, 0.50)},
     doses={"sill": Sweep("height", _LOW, {"width": 0.10})},
@@ -146,7 +214,7 @@ RAIL = CourseElement(
     name="rail",
     size=Range(0.02, 0.172, hard="high"),
     length=Range(0, 1, whole=True),
-    fit=fit_top,
+    fit=course.fit_top,
     text=lambda e: f"rail {e['size']:.3f} m high" + (f" and {_metres(e['length'])} wide" if e["length"] else ""),
     quantities={"height": _HEIGHT},
     doses={"rail": Sweep("height", _LOW)},
@@ -155,7 +223,7 @@ KERB = CourseElement(
     name="kerb",
     size=Range(0.03, 0.25, hard="high"),
     turn=DIRECTION,
-    fit=fit_face,
+    fit=course.fit_face,
     rise=_face_rise,
     text=lambda e: f"kerb {e['size']:.2f} m {_up_or_down(e)}",
 )
@@ -163,7 +231,7 @@ STEP = CourseElement(
     name="step",
     size=Range(0.10, 0.40, hard="high"),
     turn=DIRECTION,
-    fit=fit_face,
+    fit=course.fit_face,
     rise=_face_rise,
     text=lambda e: f"step {e['size']:.2f} m {_up_or_down(e)}",
     quantities={"height": _HEIGHT},
@@ -191,7 +259,7 @@ PALLET = CourseElement(
     size=Range(0.10, 0.16, hard="high"),
     length=Range(16, 24, whole=True),
     detail=Range(1, 2, whole=True, hard="high"),  # how many lie on each other
-    fit=fit_top,
+    fit=course.fit_top,
     relief=_pallet_relief,
     text=_pallet_text,
     quantities={"height": _HEIGHT, "length": LENGTH},

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import Ground
-from sim.terrains.conditions.base import nominal_row
+from sim.terrains.conditions.kinds import nominal_row
 from sim.terrains.hand_crafted import Seed
 
 MAX_HEIGHT = 0.25
@@ -34,7 +34,7 @@ class TerrainSpace:
     ground: tuple[str, ...] = ()
     """Maps that its terrains have beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
     conditions: tuple[str, ...] = ()
-    """Conditions that it has genes of, some of :data:`sim.terrains.conditions.base.CONDITIONS`."""
+    """Conditions that it has genes of, some of :data:`sim.terrains.conditions.kinds.CONDITIONS`."""
     height_share: float = 1.0
     """Its highest terrain over that of the shipped heights; 1 of a user's space."""
 

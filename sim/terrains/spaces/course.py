@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from kernels import course
 from kernels.course import GENES, GENES_PER_ELEMENT, MAX_ELEMENTS, SPACING
 from sim.device import host_device
-from sim.terrains.elements.base import ELEMENTS, CourseElement, all_elements
-from sim.terrains.elements.kinds import KINDS
+from sim.terrains.elements.kinds import ELEMENTS, KINDS, CourseElement, all_elements
 from sim.terrains.spaces.base import Seed, ShippedSpace, clipped
 
 _KIND, _SIZE, _LENGTH = map(GENES.index, ("kind", "size", "length"))
@@ -63,7 +62,7 @@ class Course(ShippedSpace):
     def elements(self, genes: ArrayLike) -> NDArray[Any]:
         """The elements of genes as they lie, records of :class:`kernels.course.Element`, shape (num_terrains, 6).
 
-        Their ``kind`` counts :func:`sim.terrains.elements.base.all_elements`.
+        Their ``kind`` counts :func:`sim.terrains.elements.kinds.all_elements`.
         """
         with wp.ScopedDevice(host_device()):
             rows: Any = wp.array(self.validate(genes), dtype=float)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, condition_texts
+from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_genes, condition_texts
 from sim.terrains.ground import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 

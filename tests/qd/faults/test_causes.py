@@ -21,7 +21,7 @@ from qd.faults.searches import Search
 from qd.faults.stages import with_families
 from sim.robots.shipped import ROBOTS
 from sim.terrains.bank import make_heights
-from sim.terrains.conditions.base import CONDITIONS
+from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import bump, fresh_values, small_archive

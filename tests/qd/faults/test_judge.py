@@ -19,7 +19,7 @@ from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
-from sim.terrains.conditions.base import condition_column
+from sim.terrains.conditions.kinds import condition_column
 from sim.terrains.spaces.registry import get_space
 from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in

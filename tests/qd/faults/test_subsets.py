@@ -12,7 +12,7 @@ from qd.faults.stages import Judging
 from qd.faults.subsets import Case, Trial, find_minimal, open_case, take_apart
 from qd.workers.crosser import Crosser
 from sim.robots.find import get_robot
-from sim.terrains.conditions.base import condition_column
+from sim.terrains.conditions.kinds import condition_column
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, small_archive

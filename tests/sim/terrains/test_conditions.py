@@ -14,8 +14,14 @@ from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrains.bank import make_terrains
-from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_genes, nominal_row
-from sim.terrains.conditions.kinds import noise_widths, round_steps
+from sim.terrains.conditions.kinds import (
+    CONDITIONS,
+    condition_column,
+    condition_genes,
+    noise_widths,
+    nominal_row,
+    round_steps,
+)
 from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.registry import get_space, load_space, space_key

@@ -7,8 +7,8 @@ import pytest
 
 from qd.evaluate.dose import all_doses, parse_doses
 from sim.terrains.bank import make_terrains
-from sim.terrains.conditions.base import CONDITIONS
-from sim.terrains.elements.base import FIRST_COL, NUM_STARTS
+from sim.terrains.conditions.kinds import CONDITIONS
+from sim.terrains.elements.kinds import FIRST_COL, NUM_STARTS
 from sim.terrains.spaces.registry import get_space
 from tests.kernels import course_oracle as oracle
 from tests.kernels.course_oracle import course, element

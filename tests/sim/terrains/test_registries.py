@@ -11,9 +11,9 @@ from qd.evaluate.dose import all_doses, parse_doses
 from qd.faults.causes import find_effects
 from sim.rollout import Rollout
 from sim.terrains.bank import make_heights, make_terrains
-from sim.terrains.conditions.base import CONDITIONS, condition_column, condition_texts, nominal_row
+from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_texts, nominal_row
 from sim.terrains.corridor import corridor_maps, num_maps
-from sim.terrains.elements.base import ELEMENTS
+from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.spaces.registry import SPACES, get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import varied_space

@@ -4,7 +4,7 @@ import numpy as np
 
 from kernels.course import GENES_PER_ELEMENT
 from sim.terrains.bank import make_heights
-from sim.terrains.elements.base import ELEMENTS
+from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.spaces.course import COURSE
 from tests.kernels.course_oracle import course, element
 

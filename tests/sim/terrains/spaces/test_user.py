@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim.terrains.bank import make_heights
-from sim.terrains.spaces import user
+from sim.terrains.spaces import registry
 from sim.terrains.spaces.registry import get_space, is_user_space, load_space
 from tests.sim.terrains.spaces.spaces import write_ridges
 
@@ -22,7 +22,7 @@ class Space:
 @pytest.fixture(autouse=True)
 def none_named(monkeypatch):
     """As in a program that has just begun."""
-    monkeypatch.setattr(user, "LOADED", [])
+    monkeypatch.setattr(registry, "LOADED", [])
 
 
 @pytest.fixture
