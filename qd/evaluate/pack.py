@@ -1,7 +1,10 @@
 """Packs: terrains on which any controller can be tested, as two files of a folder.
 
 ``pack.npz`` has the terrains, ``pack.json`` what is known of each, and the rates of the controllers that the pack was
-made with. :mod:`qd.evaluate.make_pack` makes one.
+made with. A pack is made of a judged search: its terrains are spread over the causes on which the controller fails.
+Every terrain is a fault or a *near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh
+episodes, and it is known to be passable, since another controller is certified on it or the searched one crosses it in
+at least half of its episodes. A terrain that nobody is known to cross is in no pack.
 """
 
 import hashlib
@@ -18,14 +21,17 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.labels import MEASURES, RATES
 from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
-from qd.evaluate.sets import TerrainSet, draw_seeds, set_rng
+from qd.evaluate.sets import TerrainSet, draw_seeds, hash_elites, read_trained_on, set_rng
 from qd.evaluate.tables import rate_cells, show_table
-from qd.faults.numbers import EPISODES
+from qd.faults.families import VERDICTS, find_families, find_verdicts, rank
+from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
+from qd.faults.searches import Search, find_certifiers
+from qd.search.archive import Archive
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
-from sim.controllers.spec import controller_identity, crosser_name
-from sim.files.atomic import read_json, write_atomically
+from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, is_same_controller
+from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
 from sim.files.intervals import RATES as RATE_BOUNDS
 from sim.files.intervals import wilson_interval
@@ -34,6 +40,7 @@ from sim.rates import counted_episodes
 from sim.robots.robot import RobotCfg
 from sim.robots.shipped import ROBOTS
 from sim.rollout import RolloutResult
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 
@@ -41,6 +48,9 @@ PACK_FILE = "pack.json"
 TERRAINS_FILE = "pack.npz"
 HEIGHT_UNIT_M = 1e-3
 """Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
+NEAR_GOAL_RATE = 0.75
+"""Goal rate of the searched controller from which on a terrain is no near-fault."""
+_SPREAD_OVER = ("family", "cause", "kind")
 _GROUPS = ("verdict", "cause", "kind")
 _MAX_BYTES = 1e9  # of an array that is read
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
@@ -222,11 +232,10 @@ def summarise_rates(entries: Sequence[Entry], controller: str, seed: int) -> dic
 
 def count_failing(entries: Sequence[Entry], controller: str, group: str) -> dict[str, dict[str, int]]:
     """How many ``terrains`` there are and ``failing``, by verdict, cause or kind, the most frequent value first."""
-    values = [str(entry[group] or "unclear") for entry in entries]
+    values = np.array([str(entry[group] or "unclear") for entry in entries])
     fails = _read_rates(entries, controller, "goal") < FAILING_GOAL_RATE
-    failing = Counter(value for value, fail in zip(values, fails, strict=True) if fail)
-    by_frequency = sorted(Counter(values).items(), key=lambda item: (-item[1], item[0]))
-    return {value: {"terrains": count, "failing": failing[value]} for value, count in by_frequency}
+    by_frequency = sorted(Counter(values.tolist()).items(), key=lambda item: (-item[1], item[0]))
+    return {value: {"terrains": count, "failing": int(fails[values == value].sum())} for value, count in by_frequency}
 
 
 def show_pack_test(report: dict[str, Any]) -> None:
@@ -245,3 +254,161 @@ def show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
         families = f"{row['failing_families']} of {row['families']}"
         rows.append((name, *rate_cells(row), f"{row['failing']} of {row['terrains']}", families))
     show_table(title, ("", *map(MEASURES.__getitem__, RATES), "fails", "families"), rows)
+
+
+def make_pack(
+    search: Search,
+    controllers: Mapping[str, str],
+    *,
+    compute: Compute,
+    size: int = 100,
+    episodes: int = EPISODES,
+    seed: int = 0,
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Chooses terrains of a judged search, lets controllers cross them, and writes the pack; returns its JSON values.
+
+    Without ``controllers`` (policies by name) these are the shipped one and the run's certifiers. The searched one is
+    always among them. There are ``size`` terrains, fewer if the run has fewer, and ``episodes`` on each, which ``seed``
+    draws. Without ``out`` the folder lies under runs/.
+    """
+    archive = _read_judged(search)
+    robot = search.robot
+    controllers = {**(controllers or {"base": str(robot.policy_file), **find_certifiers(search)})}
+    if not any(is_same_controller(search.policy, policy) for policy in controllers.values()):
+        controllers = {"searched": search.policy, **controllers}
+    for policy in controllers.values():
+        check_policy(policy, robot, compute.device)
+    candidates, not_passable = find_candidates(archive, search)
+    trained_on = set[str]().union(*(read_trained_on(file) for name, file in controllers.items() if name != SPECIALIST))
+    hashes = hash_elites(archive.genes)
+    untrained = [candidate for candidate in candidates if hashes[candidate[0]["elite"]] not in trained_on]
+    chosen = [untrained[index] for index in choose_terrains([entry for entry, _ in untrained], size)]
+    if not chosen:
+        raise ValueError(
+            f"{search.run} must have faults or near-faults that no controller but a specialist was trained on, "
+            f"got none and {not_passable} that nobody crosses"
+        )
+    print(f"{len(chosen)} of {len(untrained)} faults and near-faults; {not_passable} more that nobody crosses.")
+    chosen_genes = np.array([genes for _, genes in chosen], np.float32)
+    heights = round_heights(make_heights(chosen_genes, search.space))
+    out = out or RUNS / f"{robot.name}-pack"
+    prepare_output(out / TERRAINS_FILE)
+
+    def make_report() -> dict[str, Any]:
+        terrains = {"pack": pack_set(heights, len(heights), seed)}
+        results = cross_sets(controllers, terrains, robot, compute, episodes, cache=crossings_folder(robot))
+        crossed = add_rates([entry for entry, _ in chosen], results["pack"])
+        return {
+            **compute.origin(seed),
+            **controller_identity(robot, search.policy),
+            "space": search.cfg.space,
+            "space_sha256": search.cfg.space_sha256,
+            "episodes": episodes,
+            "searched": next(name for name, policy in controllers.items() if is_same_controller(policy, search.policy)),
+            "iterations": archive.iterations,
+            "certifiers": list(archive.certifiers),
+            "candidates": len(untrained),
+            "not_known_to_be_passable": not_passable,
+            "controllers": describe_controllers(controllers, robot),
+            "rates": {name: summarise_rates(crossed, name, seed) for name in controllers},
+            "terrains_sha256": write_terrains(out, heights, chosen_genes),
+            "terrains": crossed,
+        }
+
+    return publish(out / PACK_FILE, make_report, _show_pack)
+
+
+def _read_judged(search: Search) -> Archive:
+    """The archive of a search of heights alone; refuses one that is not judged by all stages that a pack needs."""
+    if search.space.ground or search.space.conditions:
+        raise ValueError(
+            f"a pack holds heights alone, got terrains of {search.space.name}, which have ground or conditions of "
+            "their own"
+        )
+    archive = search.read_archive()
+    crossed = archive.resolved_outcomes.any(axis=1) & archive.certifier_outcomes.any(axis=(1, 2))
+    if archive.fresh is None or (archive.failing & ~crossed).any():
+        raise ValueError(
+            f"{search.run} must have its failing elites crossed with contact resolved and by other controllers, got "
+            f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}: run `faultline judge` on it first"
+        )
+    return archive
+
+
+def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry, NDArray[np.float32]]], int]:
+    """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
+
+    Returns an entry and the genes of each, and how many more terrains fail that nobody is known to cross.
+    """
+    assert archive.fresh is not None
+    minima = read_minimal(search.run, archive)
+    rate = archive.fresh.goal_rate
+    near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
+    families = dict(zip(near.tolist(), find_families(archive.genes[near], search.space).tolist(), strict=True))
+    causes = rank(archive, search.space, minima, half_width=search.robot.half_width).causes if len(near) else ()
+    candidates: list[tuple[Entry, NDArray[np.float32]]] = []
+    not_passable = 0
+
+    def add(number: int, parts: list[int] | None, row: NDArray[np.float32], verdict: str, **numbers: Any) -> None:
+        entry = {
+            "name": f"elite-{number}{'' if parts is None else '-minimal'}",
+            "kind": "elite" if parts is None else "minimal",
+            "elite": number,
+            "cell": int(archive.cell[number]),
+            "iteration": int(archive.iteration[number]),
+            "parts": parts,
+            "verdict": "fault" if verdict == "fault" else "near-fault",
+            "cause": causes[number] or None,
+            "family": families[number],
+        }
+        candidates.append((entry | numbers, row))
+
+    verdicts = find_verdicts(archive)
+    for number in near.tolist():
+        if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
+            numbers = {"searched": rate_numbers(fresh_counts(archive, number)), **judgement(archive, number)}
+            add(number, None, archive.genes[number], VERDICTS[verdicts[number]], **numbers)
+        else:
+            not_passable += 1
+    for minimal in minima.numbers["elites"] if minima else ():
+        number = minimal["elite"]
+        if not archive.failing[number] or len(minimal["bumps"]) == minimal["of"]:
+            continue  # with all its parts it is the elite itself
+        if minima and minimal["certificates"]:
+            numbers = {"searched": {key: minimal[key] for key in ("goal_rate", "goal_interval", "valid_episodes")}}
+            numbers |= {key: minimal[key] for key in ("resolved", "certificates")}
+            add(number, minimal["bumps"], minima.genes[number], minimal["verdict"], **numbers)
+        else:
+            not_passable += 1
+    return candidates, not_passable
+
+
+def choose_terrains(entries: Sequence[Entry], size: int) -> list[int]:
+    """Indices of some candidates, so that each beginning of the list is spread as well as can be.
+
+    Next comes a fault before a near-fault, then one of the family that was chosen least often, of the cause that was,
+    of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
+    """
+    left = list(range(len(entries)))
+    chosen: list[int] = []
+    counts = Counter[Any]()
+
+    def priority(index: int) -> tuple[Any, ...]:
+        entry = entries[index]
+        alike = (counts[name, entry[name]] for name in _SPREAD_OVER)
+        return entry["verdict"] != "fault", *alike, entry["searched"]["goal_rate"], entry["elite"], entry["kind"]
+
+    while left and len(chosen) < size:
+        best = min(left, key=priority)
+        left.remove(best)
+        chosen.append(best)
+        counts.update((name, entries[best][name]) for name in _SPREAD_OVER)
+    return chosen
+
+
+def _show_pack(report: dict[str, Any]) -> None:
+    """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
+    verdicts = Counter(entry["verdict"] for entry in report["terrains"])
+    title = ", ".join(f"{verdict}: {count} terrains" for verdict, count in verdicts.items())
+    show_pack_rates(title, report["rates"])

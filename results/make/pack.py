@@ -5,7 +5,7 @@ They are of the independent search, which no published controller has trained on
 
 from collections.abc import Sequence
 
-from qd.evaluate.make_pack import make_pack
+from qd.evaluate.pack import make_pack
 from qd.faults.judge import judge
 from qd.faults.searches import find_search
 from results.make.common import parse, published_controllers

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from qd.commands import EvaluateCommand
-from qd.evaluate.make_pack import choose_terrains, make_pack
 from qd.evaluate.pack import (
     HEIGHT_UNIT_M,
     add_rates,
+    choose_terrains,
     count_failing,
     evaluate_pack,
     find_pack,
+    make_pack,
     passes,
     read_pack,
     round_heights,
