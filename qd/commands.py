@@ -282,16 +282,25 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         """Evaluates; returns 1 if a controller is too bad."""
         from qd.check import ensure_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
+        from qd.evaluate.pack import PACK_FILE, evaluate_pack, find_pack, passes, read_pack
         from qd.evaluate.tables import is_regression
 
+        makes_tables = bool(self.policies or self.sets or self.archive or self.independent)
+        size: dict[str, Any] = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
         if self.pack is not None:
-            return self._evaluate_pack(self.pack)
+            if makes_tables or self.space is not None:
+                raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
+            pack = read_pack(find_pack(self.pack))
+            robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
+            policy = self.policy or str(robot.policy_file)
+            report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **size)
+            return int(self.fail_under is not None and not passes(report, self.fail_under))
         if self.fail_under is not None:
             raise ValueError("--fail-under goes with --pack: give the pack too")
         robot, compute = get_robot(self.robot), _compute(self)
-        if not self._makes_tables():
+        if not makes_tables:
             policy = self.policy or str(robot.policy_file)
-            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **self._size())
+            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
             return 0
         if self.policy is not None:
             raise ValueError(
@@ -301,23 +310,6 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         robot = ensure_ready(robot, next(iter(controllers.values())), compute)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
-
-    def _makes_tables(self) -> bool:
-        return bool(self.policies or self.sets or self.archive or self.independent)
-
-    def _size(self) -> dict[str, Any]:
-        return {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
-
-    def _evaluate_pack(self, name: str) -> int:
-        from qd.evaluate.pack import PACK_FILE, evaluate_pack, find_pack, passes, read_pack
-
-        if self._makes_tables() or self.space is not None:
-            raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
-        pack = read_pack(find_pack(name))
-        robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
-        policy = self.policy or str(robot.policy_file)
-        report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **self._size())
-        return int(self.fail_under is not None and not passes(report, self.fail_under))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -367,11 +359,11 @@ class DoseCommand(RobotFlag, WorkerFlags):
         from qd.evaluate.dose import measure_dose, parse_doses
 
         robot = get_robot(self.robot)
-        measure_dose(
-            robot, parse_controllers(self.policies, robot), parse_doses(self.elements, self.at),
-            compute=_compute(self), resolved=self.resolved,
-            terrains=self.terrains, episodes=self.episodes, seed=self.seed, out=self.out,
-        )  # fmt: skip
+        controllers = parse_controllers(self.policies, robot)
+        doses = parse_doses(self.elements, self.at)
+        size: dict[str, Any] = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
+        compute = _compute(self)
+        measure_dose(robot, controllers, doses, compute=compute, resolved=self.resolved, out=self.out, **size)
 
 
 def default_preset(argv: Sequence[str]) -> str:

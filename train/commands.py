@@ -1,18 +1,16 @@
 """The flags of train, finetune and harden."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, Self
 
 from sim.files.command import WorkerFlags, peek
 from sim.files.settings import from_builtins, select_settings
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from train.cfg import FinetuneCfg, HardenCfg, RunCfg, TrainCfg
-
-_Cfg = TypeVar("_Cfg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +37,7 @@ class TrainCommand(_TrainingFlags, TrainCfg):
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:
         """The settings of the robot, or of the training to go on with, that a command line names."""
-        robot, resume = _peek(argv)
-        cfg = TrainCfg.of(robot) if resume is None else _resumed(TrainCfg, resume, robot)
-        return cls(robot=robot.spec, resume=resume, **vars(cfg))
+        return cls(**_read_defaults(TrainCfg, TrainCfg.of, argv))
 
     def execute(self) -> None:
         """Trains."""
@@ -68,12 +64,8 @@ class FinetuneCommand(_TrainingFlags, FinetuneCfg):
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:
         """The settings of the robot, or of the training to go on with, that a command line names."""
-        robot, resume = _peek(argv)
-        if resume is not None:
-            cfg = _resumed(FinetuneCfg, resume, robot)
-        else:
-            cfg = FinetuneCfg.of(robot) if peek(argv, "--specialist") is None else FinetuneCfg.specialist(robot)
-        return cls(robot=robot.spec, resume=resume, **vars(cfg))
+        make = FinetuneCfg.of if peek(argv, "--specialist") is None else FinetuneCfg.specialist
+        return cls(**_read_defaults(FinetuneCfg, make, argv))
 
     def execute(self) -> None:
         """Fine-tunes."""
@@ -122,22 +114,20 @@ class HardenCommand(HardenCfg, WorkerFlags):
         harden(robot, select_settings(HardenCfg, self), run_dir, compute)
 
 
-def _peek(argv: Sequence[str]) -> tuple[RobotCfg, Path | None]:
-    """The robot and the training to go on with that a command line names."""
+def _read_defaults(kind: type[TrainCfg], make: Callable[[RobotCfg], TrainCfg], argv: Sequence[str]) -> dict[str, Any]:
+    """The settings of a new training of the robot that a command line names, or of the one that it goes on with."""
+    robot = get_robot(peek(argv, "--robot") or "anymal")
     resume = peek(argv, "--resume")
-    return get_robot(peek(argv, "--robot") or "anymal"), None if resume is None else Path(resume)
-
-
-def _resumed(kind: type[_Cfg], run_dir: Path, robot: RobotCfg) -> _Cfg:
-    """The settings of a training; code of a space of one's own is named again."""
+    if resume is None:
+        return {"robot": robot.spec, **vars(make(robot))}
     from train.ppo.training import read_saved
 
-    settings = read_saved(run_dir, "train" if kind is TrainCfg else "finetune", robot.name)["settings"]
-    known = {setting.name for setting in fields(kind)}  # pyright: ignore[reportArgumentType]
+    settings = read_saved(Path(resume), "train" if kind is TrainCfg else "finetune", robot.name)["settings"]
+    known = {setting.name for setting in fields(kind)}
     values = {name: value for name, value in settings.items() if name in known}
     if ":" in str(values.get("space")):
-        del values["space"]
-    return from_builtins(kind, values, str(run_dir))
+        del values["space"]  # code of a user's space is named again
+    return {"robot": robot.spec, "resume": Path(resume), **vars(from_builtins(kind, values, resume))}
 
 
 def _run_dir(flags: _TrainingFlags, name: str) -> Path:

@@ -148,11 +148,11 @@ def evaluate_tables(
         archive = read_robot_archive(robot, cfg.archive, cfg.space)
         sizes = {name: len(rows) for name, rows in vars(split_elites(archive)).items()}
         origin["archive"] = _describe_archive(cfg.archive, archive) | sizes
-        origin["archive_sha256"] = _hash_archive(cfg.archive)
+        origin["archive_sha256"] = origin["archive"].pop("sha256")
     if cfg.independent is not None:
         independent = read_independent(cfg.independent, cfg.archive, robot, cfg.space)
-        search = {"search_seed": search_seed(cfg.independent), "sha256": _hash_archive(cfg.independent)}
-        origin["independent"] = _describe_archive(cfg.independent, independent) | search
+        origin["independent"] = _describe_archive(cfg.independent, independent)
+        origin["independent"]["search_seed"] = search_seed(cfg.independent)
     space = space_at(load_space(cfg.space), None, robot)
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
@@ -190,11 +190,8 @@ def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: i
 
 
 def _describe_archive(path: Path, archive: Archive) -> dict[str, Any]:
-    return {"path": str(path), "elites": len(archive), "iterations": archive.iterations}
-
-
-def _hash_archive(run: Path) -> str:
-    return hashlib.sha256((run / ARCHIVE_FILE if run.is_dir() else run).read_bytes()).hexdigest()
+    digest = hashlib.sha256((path / ARCHIVE_FILE if path.is_dir() else path).read_bytes()).hexdigest()
+    return {"path": str(path), "elites": len(archive), "iterations": archive.iterations, "sha256": digest}
 
 
 def evaluate_rates(
