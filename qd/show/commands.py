@@ -57,16 +57,14 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
         from qd.show.elites import open_run
         from qd.show.replay import source_from_map, source_from_run
 
-        crossing = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
+        crossing: Any = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
             opened_run = open_run(self.robot, self.run, space=self.space)
             return source_from_run(opened_run, self.elite, self.minimal, **crossing)
         if self.run is not None:
             raise ValueError("give one of --run and --terrain")
-        return source_from_map(
-            self.terrain, get_robot(self.robot or "anymal"), size_m=self.size, scale_m=self.scale,
-            offset_m=self.offset, **crossing,
-        )  # fmt: skip
+        crossing |= {"size_m": self.size, "scale_m": self.scale, "offset_m": self.offset}
+        return source_from_map(self.terrain, get_robot(self.robot or "anymal"), **crossing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +94,8 @@ class FilmCommand(ReplayCommand):
         from qd.show.film import film_source
         from qd.workers.compute import choose_device
 
-        film_source(
-            self._source(), episode=self.episode, gif=self.gif, beside=self.beside, device=choose_device(self.device),
-            out=self.out, whole=self.whole, shadows=self.shadows,
-        )  # fmt: skip
+        look: Any = {"gif": self.gif, "beside": self.beside, "whole": self.whole, "shadows": self.shadows}
+        film_source(self._source(), device=choose_device(self.device), out=self.out, episode=self.episode, **look)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,10 +211,8 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
         """Writes the page."""
         from qd.show.report.report import write_report
 
-        write_report(
-            self.run, robot=self.robot, policy=self.policy, space=self.space, out=self.out, num_elites=self.elites,
-            tables=self.tables, device=self.device,
-        )  # fmt: skip
+        named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}
+        write_report(self.run, out=self.out, num_elites=self.elites, tables=self.tables, **named)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,10 +258,8 @@ class ViewCommand(RobotFlag, EliteFlags):
             from qd.show.view.app import serve
             from qd.show.view.viewed import open_viewed_run
 
-            show = open_viewed_run(
-                self.run, robot=self.robot, elite=self.elite, minimal=self.minimal, policies=self.policies,
-                space=self.space,
-            )  # fmt: skip
+            elite: Any = {"elite": self.elite, "minimal": self.minimal}
+            show = open_viewed_run(self.run, robot=self.robot, policies=self.policies, space=self.space, **elite)
             gc.enable()
             serve(show, recorder, host=self.host, port=self.port, cache=self.cache)
         finally:

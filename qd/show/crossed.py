@@ -148,7 +148,13 @@ def draw_crossing(recording: Recording, title: str) -> Figure:
         handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
     if ground is not None and ground.time_constant_s.any():
         handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
-    _draw_profile(profile, recording.heights[0])
+    row = recording.heights[0, recording.heights.shape[1] // 2]  # along the straight line from start to goal
+    x = np.linspace(0.0, LENGTH, len(row))
+    profile.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
+    profile.plot(x, row, color="0.2", linewidth=1.0)
+    profile.set_xlabel("x [m]")
+    profile.set_ylabel("height at\ny = 4 m [m]", fontsize=9)
+    profile.grid(alpha=0.3)
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, handlelength=3)
     return figure
 
@@ -171,14 +177,3 @@ def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
         xs += ends[0].tolist()
     axes.set_xlim(min(xs), max(xs))  # robots may leave the terrain
     return handles
-
-
-def _draw_profile(axes: Axes, heights: NDArray[np.float32]) -> None:
-    """Heights along the straight line from start to goal."""
-    row = heights[heights.shape[0] // 2]
-    x = np.linspace(0.0, LENGTH, len(row))
-    axes.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")
-    axes.plot(x, row, color="0.2", linewidth=1.0)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("height at\ny = 4 m [m]", fontsize=9)
-    axes.grid(alpha=0.3)

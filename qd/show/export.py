@@ -49,8 +49,8 @@ def export_elites(
     def build(name: str) -> ExportedTerrain:
         genes = terrains[name].genes
         (heights,), ground = make_terrains(genes[None], space)
-        timestep = opened_run.robot.physics_dt
-        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=timestep, ground=ground)
+        shape: Any = {"heights": heights, "genes": genes, "ground": ground}
+        return ExportedTerrain(name=name, timestep=opened_run.robot.physics_dt, **shape)
 
     about = {
         name: _describe_elite(ranking, row, archive)
@@ -58,12 +58,8 @@ def export_elites(
         | {"terrain": space.describe(terrain.genes)}
         for row, (name, terrain) in enumerate(terrains.items())
     }
-    origin = {
-        "run": str(opened_run.path),
-        "space": archive.space,
-        "space_sha256": archive.space_sha256,
-        **archive.named(),
-    }
+    origin = {"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256}
+    origin |= archive.named()
     name = _FOLDER if minimal is None else f"minimal-{_FOLDER}"
     folder = output_folder(opened_run.path, opened_run.robot.name) / name
     return _export(about, build, origin, out or folder, **options)
@@ -86,9 +82,9 @@ def export_pack(
     rows = {pack.terrains[index]["name"]: index for index in indices}
 
     def build(name: str) -> ExportedTerrain:
-        row = rows[name]
-        timestep = pack_robot.physics_dt
-        return ExportedTerrain(heights=pack.heights[row], name=name, genes=pack.genes[row], timestep=timestep)
+        heights = pack.heights[rows[name]]
+        genes = pack.genes[rows[name]]
+        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=pack_robot.physics_dt)
 
     about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
     keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")

@@ -4,6 +4,7 @@ import io
 import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -138,9 +139,10 @@ def render_pictures(
     Small ones are rendered twice as fine. ``progress`` is called with the share that is done.
     """
     recording = shot.recording
+    ghost_name, ghost = shot.beside or ("", None)
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
     poses = recording.qpos(0, shot.episode)
-    ghost_poses = None if shot.beside is None else shot.beside[1].qpos(0, shot.episode)
+    ghost_poses = None if ghost is None else ghost.qpos(0, shot.episode)
     chart = draw_map(shot, size[0] // 5)
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
@@ -151,14 +153,9 @@ def render_pictures(
             frame = min(time_s / recording.dt, float(len(poses) - 1))
             pose = interpolate_pose(poses, frame)
             row = (0, shot.episode, int(frame + 0.5))
-            pixels = renderer.render(
-                pose,
-                camera,
-                ghost=None if ghost_poses is None else interpolate_pose(ghost_poses, time_s / recording.dt),
-                ghost_name="" if shot.beside is None else shot.beside[0],
-                touching=recording.touching[row],
-                foot_force=recording.foot_force[row],
-            )
+            touch: Any = {"touching": recording.touching[row], "foot_force": recording.foot_force[row]}
+            beside = None if ghost_poses is None else interpolate_pose(ghost_poses, time_s / recording.dt)
+            pixels = renderer.render(pose, camera, ghost=beside, ghost_name=ghost_name, **touch)
             picture = Image.fromarray(pixels).resize(size, Image.Resampling.BOX)
             _write_captions(picture, shot, time_s, slowness[number])
             inset = chart.copy()
@@ -181,7 +178,7 @@ def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: i
 
     write(10, 32, shot.title, 28, "black")
     if shot.beside is None:
-        write(10, 62, f"reached the goal: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
+        write(10, 62, f"{ARRIVED}: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
     else:
         write(10, 62, f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
     speed = f"  1/{slowness} speed" if slowness > 1 else ""
@@ -246,13 +243,10 @@ def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> byte
     options: Any = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "film.mp4"
-        writer = imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **options)
-        writer.send(None)
-        try:
+        with closing(imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **options)) as writer:
+            writer.send(None)
             for picture in pictures:
                 writer.send(np.ascontiguousarray(picture))
-        finally:
-            writer.close()
         return draft.read_bytes()
 
 
@@ -288,19 +282,18 @@ def film_source(
     if not gif and out is not None and out.suffix == ".gif":
         raise ValueError(f"{out} is a GIF by its name: give --gif too")
     files = source.files(".gif" if gif else ".mp4", out)
-    replicas = source.requests[0].replicas
+    replicas = source.terrains[0].request.replicas
     if episode is not None and episode >= replicas:
         raise ValueError(f"episode must be one of 0..{replicas - 1}, got {episode}")
     open_context(64, 64).free()
     ghost_policy = None if beside is None else find_ghost(source, beside, device)
     recordings = source.record(device)
-    ghosts: list[tuple[str, Recording] | None] = [None] * len(files)
-    if beside is not None:
-        ghosts = [(label_suffix(beside)[1:], ghost) for ghost in source.record(device, ghost_policy)]
-    for recording, ghost, file in zip(recordings, ghosts, files, strict=True):
+    look |= {"episode": episode, "by": source.by}
+    ghosts = source.record(device, ghost_policy) if beside is not None else []
+    for recording, ghost, file in itertools.zip_longest(recordings, ghosts, files):
         with Bar(f"filming {recording.labels[0]}") as bar:
-            options: Any = {"episode": episode, "by": source.by, "beside": ghost, "progress": bar.move_to, **look}
-            film(recording, source.robot, source.scales, file, **options)
+            other = None if beside is None else (label_suffix(beside)[1:], ghost)
+            film(recording, source.robot, source.scales, file, beside=other, progress=bar.move_to, **look)
     return files
 
 

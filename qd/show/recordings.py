@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -86,45 +87,35 @@ def request_map(
     return CrossingRequest(terrain=terrain, seed=seed, **crossing)
 
 
-Cross = Callable[[Sequence[CrossingRequest], Callable[[float], None]], list[Recording]]
-"""Crosses terrains of one :attr:`CrossingRequest.lot_key`, and calls back with the share that is done."""
-
-
 class RecordingCrosser:
     """Crosses terrains and records the crossings; the simulation of each controller stays open."""
 
     def __init__(self, robot: RobotCfg, device: str) -> None:
         self._robot = robot
         self._device = device
-        self._crossers: dict[str, Crosser] = {}
+        self._crossers = defaultdict[str, Crosser](lambda: Crosser(robot, Compute(device, workers="1")))
 
     def __call__(self, requests: Sequence[CrossingRequest], progress: Callable[[float], None]) -> list[Recording]:
-        """Recordings of all, in their order."""
+        """Recordings of terrains of one :attr:`CrossingRequest.lot_key`; ``progress`` gets the share that is done."""
         policy = requests[0].policy
-        if policy not in self._crossers:
-            self._crossers[policy] = Crosser(self._robot, Compute(self._device, workers="1"))
         terrains = Terrains.join([request.terrain for request in requests])
         result = self._crossers[policy].cross(
             policy, terrains, replicas=requests[0].replicas, record=True, progress=progress, invalid_ok=True
         )
-        recording = make_recording(
-            self._robot, policy, terrains, result, device=self._device,
-            labels=[request.label for request in requests], seed=requests[0].seed,
-        )  # fmt: skip
+        origin: Any = {"device": self._device, "seed": requests[0].seed, "labels": [r.label for r in requests]}
+        recording = make_recording(self._robot, policy, terrains, result, **origin)
         return [recording.select_terrain(k) for k in range(len(requests))]
 
 
 class Recordings:
-    """The stored recordings of a robot; ``cross`` makes what is missing, by default a :class:`RecordingCrosser`."""
+    """The stored recordings of a robot."""
 
-    def __init__(
-        self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER, cross: Cross | None = None
-    ) -> None:
+    def __init__(self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER) -> None:
         on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
         self._settings = [robot_identity(robot), robot.penalties, on_gpu, code_fingerprint(("kernels", "sim"))]
         self._cache = Cache(folder)
         self._lot = _LOT if on_gpu else 1  # on the CPU each is stored as soon as it is done
-        self._cross = cross or RecordingCrosser(robot, device)
+        self._cross = RecordingCrosser(robot, device)
 
     def read(self, request: CrossingRequest) -> Recording | None:
         """The stored recording; None if there is none, or it is damaged."""

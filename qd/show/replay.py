@@ -34,26 +34,34 @@ _MAX_NAME = 120  # characters of a map's path; with robot, controller and ending
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplayTerrain:
+    """A terrain to cross, and what is written about it."""
+
+    request: CrossingRequest
+    stem: str
+    """Name of its files, without their ending."""
+    about: dict[str, Any]
+    """Facts for the file of its numbers."""
+    elite: EliteTerrain | None = None
+    """None of a map."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplaySource:
-    """Terrains to cross, and the controller that crosses them. Sequences have an entry a terrain."""
+    """Terrains to cross, and the controller that crosses them."""
 
     robot: RobotCfg
     fitness: FitnessCfg
     """Penalties, and the scales that make them comparable."""
     folder: Path
     """Default folder of files about the terrains."""
-    stems: Sequence[str]
-    """Names of files, without their ending."""
-    about: Sequence[dict[str, Any]]
-    """Facts for the file of its numbers."""
-    requests: Sequence[CrossingRequest]
+    terrains: Sequence[ReplayTerrain]
     inputs: tuple[Path, ...] = ()
     """Files of the user, which are never overwritten."""
     by: str = ""
     """Name of the controller, where it is not the usual one."""
     opened_run: OpenedRun | None = None
-    """The run of elites, which are ``terrains``."""
-    terrains: Sequence[EliteTerrain] = ()
+    """The run of elites."""
 
     @property
     def scales(self) -> dict[str, float]:
@@ -62,12 +70,14 @@ class ReplaySource:
 
     def record(self, device: str, policy: str | None = None) -> list[Recording]:
         """The recording of each terrain, by another controller if one is named. Only missing ones are crossed."""
-        requests = [replace(request, policy=policy or request.policy) for request in self.requests]
+        requests = [terrain.request for terrain in self.terrains]
+        if policy is not None:
+            requests = [replace(request, policy=policy) for request in requests]
         return Recordings(self.robot, device=device).record(requests)
 
     def files(self, ending: str, out: Path | None) -> list[Path]:
         """The file of each terrain: in its folder, in a folder ``out``, or ``out``; bad ones are refused at once."""
-        files = [self.folder / f"{stem}{ending}" for stem in self.stems]
+        files = [self.folder / f"{terrain.stem}{ending}" for terrain in self.terrains]
         if out is not None:
             files = [out / file.name for file in files] if len(files) > 1 or out.is_dir() else [out]
         if files[0].suffix != ending:
@@ -87,24 +97,22 @@ def source_from_run(
     ``crossing`` may have ``replicas`` and ``seed``.
     """
     controller = opened_run.policy(policy)
+    crossing["policy"] = controller
     suffix = opened_run.suffix(controller)
-    terrains = opened_run.terrains(elite, minimal)
-    requests = [
-        request_elite(
-            opened_run.archive, terrain.number, label=terrain.label, minimal=terrain.genes if minimal else None,
-            policy=controller, **crossing,
-        ) for terrain in terrains
-    ]  # fmt: skip
+
+    def describe_terrain(elite: EliteTerrain) -> ReplayTerrain:
+        genes = elite.genes if elite.minimal else None
+        request = request_elite(opened_run.archive, elite.number, label=elite.label, minimal=genes, **crossing)
+        about = {"run": str(opened_run.path), "elite": elite.number, "minimal": elite.minimal}
+        return ReplayTerrain(request=request, stem=f"{elite.stem}{suffix}", about=about, elite=elite)
+
     return ReplaySource(
         robot=opened_run.robot,
         fitness=opened_run.as_searched()[1],
         folder=output_folder(opened_run.path, opened_run.robot.name),
-        stems=[f"{terrain.stem}{suffix}" for terrain in terrains],
+        terrains=[*map(describe_terrain, opened_run.terrains(elite, minimal))],
         by=suffix[1:],
-        about=[{"run": str(opened_run.path), "elite": t.number, "minimal": t.minimal} for t in terrains],
-        requests=requests,
         opened_run=opened_run,
-        terrains=terrains,
     )
 
 
@@ -133,37 +141,31 @@ def source_from_map(
         "map": fitted(heightmap),
         "heights_m": [float(heights.min()), float(heights.max())],
     }
-    return ReplaySource(
-        robot=robot,
-        fitness=read_fitness(robot, policy),
-        folder=USER_FOLDER,
-        stems=[f"{stem}-{label}"],
-        by=label.removeprefix(robot.name)[1:],
-        about=[about],
-        requests=[request_map(heights, label=file.name, policy=controller, ground=heightmap.ground, **crossing)],
-        inputs=(file, file.with_suffix(".json")),
-    )
-
-
-def read_fitness(robot: RobotCfg, policy: str | None) -> FitnessCfg:
-    """The robot's penalties with their scales; 1 each, and so raw sums, where they were never measured."""
     try:
         scales = read_penalty_scales(robot, policy)
-    except ValueError as error:
+    except ValueError as error:  # they were never measured
         print(f"{error}; penalties are compared as they are, unscaled", flush=True)
         scales = (1.0,) * len(robot.penalties)
-    return FitnessCfg(penalties=robot.penalties, scales=scales)
+    request = request_map(heights, label=file.name, policy=controller, ground=heightmap.ground, **crossing)
+    return ReplaySource(
+        robot=robot,
+        fitness=FitnessCfg(penalties=robot.penalties, scales=scales),
+        folder=USER_FOLDER,
+        terrains=[ReplayTerrain(request=request, stem=f"{stem}-{label}", about=about)],
+        by=label.removeprefix(robot.name)[1:],
+        inputs=(file, file.with_suffix(".json")),
+    )
 
 
 def replay(source: ReplaySource, *, device: str = "cpu", out: Path | None = None) -> list[dict[str, Any]]:
     """Crosses terrains again, prints numbers, writes them and a figure of each; returns the numbers."""
     figures = source.files(".png", out)
     reports = []
-    for k, (recording, figure) in enumerate(zip(source.record(device), figures, strict=True)):
+    for terrain, recording, figure in zip(source.terrains, source.record(device), figures, strict=True):
         refuse_all_invalid(recording.result())
         policy = ControllerSpec.parse(str(recording.origin["policy"])).label
-        reports.append({**recording.origin, "policy": policy, **source.about[k], **compute_numbers(recording)})
-        print(describe(source, k, recording))
+        reports.append({**recording.origin, "policy": policy, **terrain.about, **compute_numbers(recording)})
+        print(describe(source, terrain, recording))
         save(figure.with_suffix(".json"), to_json(reports[-1]), "Numbers")
         save(figure, as_png(draw_crossing(recording, make_title(recording, source.by))), "Figure")
     return reports
@@ -205,24 +207,27 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     }
 
 
-def describe(source: ReplaySource, k: int, recording: Recording) -> str:
+def describe(source: ReplaySource, terrain: ReplayTerrain, recording: Recording) -> str:
     """How robots crossed a terrain and what it cost them; an elite's numbers as found and as corrected beside."""
     run = source.opened_run
+    elite = terrain.elite
     cells = Cells(len(source.fitness.penalties)) if run is None else run.archive.cells
     now = evaluate_rollout(recording.result(), cells, source.fitness)
-    columns: list[tuple[str, Evaluation, int]] = [("now", now, 0)]
-    if run is not None:
-        whole = "whole, " if source.terrains[k].minimal else ""
+    columns: list[tuple[str, Evaluation, int]] = []
+    about: dict[str, Any] = {"run": None}
+    if run is not None and elite is not None:
+        about = _describe_elite(run, elite, now)
+        whole = "whole, " if elite.minimal else ""
         stored = {"as found": run.archive, "fresh": run.archive.fresh}
-        number = source.terrains[k].number
-        columns[:0] = [(f"{whole}{label}", values, number) for label, values in stored.items() if values is not None]
+        columns = [(f"{whole}{label}", values, elite.number) for label, values in stored.items() if values is not None]
+    columns.append(("now", now, 0))
     reasons = invalid_reasons(recording.result())
     units = [f"{PENALTIES[name].label} [{PENALTIES[name].unit}]" for name in source.fitness.penalties]
     lines = _TEMPLATES.get_template("replay.txt").render(
         units=", ".join(units),
         invalid=sum(reasons.values()),
         reasons=format_reasons(reasons),
-        **({"run": None} if run is None else _describe_elite(run, source.terrains[k], now)),
+        **about,
         controller=source.by,
     )
     indent: Any = {"initial_indent": "  ", "subsequent_indent": "    ", "break_on_hyphens": False}

@@ -4,25 +4,33 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from qd.evaluate.tables import read_tables
-from qd.faults.families import VERDICTS, Ranking
-from qd.faults.numbers import further_rates
+from qd.faults.causes import describe_cause
+from qd.faults.families import VERDICTS, Ranking, summarise_search
+from qd.faults.numbers import MinimalTerrains, fault_numbers, further_rates
 from qd.search.archive import Archive
-from qd.search.directory import ROUNDS_FILE, output_folder
+from qd.search.directory import METRICS_FILE, ROUNDS_FILE, Metrics, RunDirectory, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
-from qd.show.recordings import Cross, Recordings, request_elite
+from qd.show.figures import draw_archive, draw_curves
+from qd.show.recordings import Recordings, request_elite
+from qd.show.report import page
 from qd.show.report.evaluation import compare_controllers, write_rounds
-from qd.show.report.page import Table, check_page, encode_figure, publish_page
-from qd.show.report.pictures import explain_missing_pictures, find_failure, find_same_moment, render_close_pictures
-from qd.show.report.search import collect_content
 from qd.workers.compute import check_policy, choose_device
-from sim.controllers.spec import resolve_policy
+from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
+from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
 
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
+_MAX_BARS = 10
+_FAULT = VERDICTS.index("fault")
+_MEANS = ("goal", "collision", "fallen")
+_MIN_TERRAINS = 10  # fewer have no interval of their mean
 
 
 def write_report(
@@ -34,9 +42,7 @@ def write_report(
     out: Path | None = None,
     num_elites: int = 3,
     tables: Path | None = None,
-    episodes: int = 20,
     device: str | None = None,
-    cross: Cross | None = None,
 ) -> Path:
     """Writes the page about a search, or about the rounds of a hardening; returns its file, *.html.
 
@@ -54,7 +60,7 @@ def write_report(
     controller = resolve_policy(policy or opened_run.as_searched()[0], opened_run.robot)
     suffix = "" if policy is None else opened_run.suffix(controller)
     out = out or output_folder(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
-    check_page(out)
+    page.check_page(out)
     compared = None
     if tables is not None:
         file = without_machine(str(tables))
@@ -64,21 +70,17 @@ def write_report(
     cases: dict[int, dict[str, Any]] = {}
     missing = [_explain_no_crossings(opened_run, policy, device)]
     if not missing[0]:
-        missing = [explain_missing_pictures()]
-        recordings = Recordings(opened_run.robot, device=choose_device(device), cross=cross)
-        cases = cross_cases(
-            opened_run, ranking, controller, heads, others, recordings, episodes=episodes, pictured=not missing[0]
-        )
-        for number in (*heads, *others):
-            if number in cases:
-                cases[number]["film"] = opened_run.command("film", elite=number, policy=policy)
-            else:
-                missing.append(f"All crossings of elite {number} were invalid this time.")
-    return publish_page(
-        out, "search.html", **content, missing=[*filter(None, missing)], compared=compared,
-        heads=[cases[number] for number in heads if number in cases],
-        others=[cases[number] for number in others if number in cases],
-    )  # fmt: skip
+        missing = [page.explain_missing_pictures()]
+        recordings = Recordings(opened_run.robot, device=choose_device(device))
+        cases = cross_cases(opened_run, ranking, controller, heads, others, recordings, pictured=not missing[0])
+        lost = [number for number in (*heads, *others) if number not in cases]
+        missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
+    content |= {"policy": policy, "compared": compared, "missing": [*filter(None, missing)]}
+    content |= {
+        name: [cases[number] for number in numbers if number in cases]
+        for name, numbers in {"heads": heads, "others": others}.items()
+    }
+    return page.publish_page(out, "search.html", **content)
 
 
 def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[int]]:
@@ -111,31 +113,31 @@ def cross_cases(
     others: Sequence[int],
     recordings: Recordings,
     *,
-    episodes: int,
     pictured: bool,
 ) -> dict[int, dict[str, Any]]:
     """Lets a controller cross elites and takes their pictures, by number; one without a valid episode is left out.
 
     ``heads`` are crossed by their best certifier too, if they have one; ``others`` are shown in short.
     """
+    archive = opened_run.archive
     files = opened_run.certifiers()
     certifiers = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
     crossings += [(number, files[name]) for number, name in certifiers.items()]
-    requests = [request_elite(opened_run.archive, number, policy=who, replicas=episodes) for number, who in crossings]
+    requests = [request_elite(archive, number, policy=controller) for number, controller in crossings]
     recorded = dict(zip(crossings, recordings.record(requests), strict=True))
     cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):
+            recording = recorded[number, policy]
             name = certifiers.get(number)
             ghost = None if name is None else (name, recorded[number, files[name]])
-            case = _make_case(opened_run, ranking, number, recorded[number, policy], ghost, pictured)
+            case = _make_case(opened_run, ranking, number, recording, ghost, pictured)
             if case is not None:
                 cases[number] = case
                 if number in heads:
-                    title = f"{opened_run.archive.robot}, elite {number} of {len(opened_run.archive):,}"
-                    figure = draw_crossing(recorded[number, policy], f"{title}: {case['rate'].count} crossings")
-                    case["figure"] = encode_figure(figure)
+                    title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} crossings"
+                    case["figure"] = page.encode_picture(draw_crossing(recording, title))
             bar.move_to(done)
     return cases
 
@@ -149,12 +151,11 @@ def _make_case(
     pictured: bool,
 ) -> dict[str, Any] | None:
     """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
-    archive = opened_run.archive
-    failure = find_failure(recording, opened_run.scales)
+    failure = page.find_failure(recording, opened_run.scales)
     if failure is None:
         return None
-    moments = [failure] if ghost is None else [failure, find_same_moment(failure, ghost[1], opened_run.scales)]
-    sources = render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
+    moments = [failure] if ghost is None else [failure, page.find_same_moment(failure, ghost[1], opened_run.scales)]
+    sources = page.render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if ghost is not None:
         rate = count_rates(ghost[1])[ARRIVED]
@@ -167,18 +168,138 @@ def _make_case(
         "verdict": VERDICTS[int(ranking.verdict[row])],
         "source": sources[0],
         "time_s": failure.time_s,
-        "conditions": opened_run.space.condition_text(archive.genes[number]),
+        "conditions": opened_run.space.condition_text(opened_run.archive.genes[number]),
         "beside": beside,
         "figure": "",
         "rate": rate,
-        "rates": _list_rates(ranking, archive, row, rate),
+        "rates": _list_rates(ranking, opened_run.archive, row, rate),
     }
 
 
-def _list_rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> Table:
+def _list_rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> page.Table:
     """How often controllers reach the goal: now, when the elite was found or judged, and under other conditions."""
     tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
     rates = {"for this page": arrived, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
     rates |= {label: Rate(*rate) for label, rate in further_rates(archive, int(ranking.numbers[row])).items()}
     rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
-    return Table(head=["goal reached", "", "95 % interval"], rows=rows)
+    return page.Table(head=["goal reached", "", "95 % interval"], rows=rows)
+
+
+def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_searched: bool) -> dict[str, Any]:
+    """Values of the template, without the terrains that a controller crossed for the page."""
+    archive = opened_run.archive
+    minima = opened_run.minima
+    search = opened_run.search()
+    run = RunDirectory(opened_run.folder)
+    space = opened_run.space
+    searched, _ = opened_run.as_searched()
+    metrics = _read_metrics(run, archive)
+    controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
+    if search is None and opened_run.suffix(resolve_policy(SHIPPED, opened_run.robot)):
+        controller = "a controller that is not at hand"
+    return {
+        "archive": archive,
+        "run": opened_run.command,
+        "search": search,
+        "metrics": metrics,
+        "gpus": run.read_summary().get("gpus"),
+        "controller": controller,
+        "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
+        "place": without_machine(str(opened_run.path)),
+        "summary": summarise_search(ranking, archive),
+        "failing": int(ranking.failing.sum()),
+        "certifiers": " or ".join(archive.certifiers),
+        "numbers": fault_numbers(archive),
+        "fault_families": len(np.unique(ranking.families[ranking.verdict == _FAULT])),
+        "means": {name: format_mean(getattr(ranking, f"{name}_rate"), ranking.families) for name in _MEANS},
+        "causes": count_causes(ranking),
+        "tiles": page.draw_sheet(archive.genes[ranking.numbers], space),
+        "elites": _list_elites(ranking),
+        "minimal_tiles": None if minima is None else page.draw_sheet(np.array([*minima.genes.values()]), space),
+        "minimal": None if minima is None else _list_minima(minima),
+        "curves": page.encode_picture(draw_curves(archive, metrics)) if metrics else "",
+        "parallel": page.encode_picture(draw_archive(archive)),
+        "origin": page.origin_rows({} if search is None else run.read_config()),
+    }
+
+
+def _read_metrics(run: RunDirectory, archive: Archive) -> Metrics:
+    """The rows up to the archive's iteration, if there are some; a run that goes on meanwhile may have some more."""
+    if not (run.path / METRICS_FILE).exists():
+        return []
+    rows = run.read_metrics()[: archive.iterations]
+    if len(rows) < archive.iterations:
+        raise ValueError(
+            f"{run.path / METRICS_FILE} must have a row for each of {archive.iterations} iterations, got {len(rows)}: "
+            "resume the search, which writes it again"
+        )
+    return rows
+
+
+def format_mean(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
+    """Mean over terrains, with its interval over families where there are enough terrains."""
+    limits = bootstrap_interval(rates, 0, families=families, bounds=RATES) if len(rates) >= _MIN_TERRAINS else None
+    return page.percent(float(rates.mean())) + (
+        f" ({page.percent(limits[0])} to {page.percent(limits[1])})" if limits else ""
+    )
+
+
+def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
+    """The bars, the longest first; the rarest causes share one.
+
+    Each has a name, its failing elites and faults, percent of the longest bar an elite, and the row of its worst elite.
+    """
+    groups: list[tuple[str, NDArray[np.int64], int | None]] = [
+        (cause, rows, int(rows[0])) for cause, rows in ranking.by_cause().items()
+    ]
+    if len(groups) > _MAX_BARS:
+        rest = groups[_MAX_BARS - 1 :]
+        groups = groups[: _MAX_BARS - 1]
+        groups.append((f"{len(rest)} other causes", np.concatenate([rows for _, rows, _ in rest]), None))
+    longest = max((len(rows) for _, rows, _ in groups), default=1)
+    return [
+        {
+            "name": name,
+            "failing": len(rows),
+            "faults": int((ranking.verdict[rows] == _FAULT).sum()),
+            "share": 100.0 / longest,
+            "tile": tile,
+        }
+        for name, rows, tile in groups
+    ]
+
+
+def _list_elites(ranking: Ranking) -> dict[str, Any]:
+    """Every elite, faults first, then what fails most: rows of pictures with cells, and columns not for a phone."""
+    rows = {
+        row: {
+            "elite": f"{ranking.numbers[row]}",
+            "what happens": ranking.name(row),
+            "verdict": VERDICTS[int(ranking.verdict[row])],
+            "goal [%]": f"{100 * ranking.goal_rate[row]:.0f}",
+            "95 % interval": Rate(ranking.hits("goal_rate", row), int(ranking.counted[row])).limits,
+            "base collision [%]": f"{100 * ranking.collision_rate[row]:.0f}",
+            "fallen [%]": f"{100 * ranking.fallen_rate[row]:.0f}",
+            "family": f"{ranking.families[row]}",
+            "fitness": f"{ranking.fitness[row]:.1f}",
+        }
+        for row in ranking.by_severity().tolist()
+    }
+    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9)}
+
+
+def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
+    """Every minimal terrain, as the elites."""
+    rows = [
+        {
+            "elite": f"{entry['elite']}",
+            "cause": describe_cause(entry["cause"]),
+            "parts left": f"{len(entry['bumps'])} of {entry['of']}",
+            "goal [%]": "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
+            "95 % interval": "{:.0f} to {:.0f} %".format(*(100 * limit for limit in entry["goal_interval"])),
+            "margin [cm]": "-" if entry["margin_m"] is None else f"{100 * entry['margin_m']:.1f}",
+            "verdict": str(entry.get("verdict", "")),
+        }
+        for entry in minima.numbers["elites"]
+    ]
+    return {"rows": [*enumerate(rows)], "wide": (3, 5, 6)}

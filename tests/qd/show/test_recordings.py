@@ -56,7 +56,7 @@ def test_a_damaged_file_counts_as_none_and_is_written_again(anymal, request_4, r
     assert recordings.read(request_4) is not None
 
 
-def test_missing_recordings_are_crossed_in_lots_of_one_controller(anymal, tmp_path):
+def test_missing_recordings_are_crossed_in_lots_of_one_controller(anymal, tmp_path, monkeypatch):
     archive = small_archive(5)
     policies = (str(anymal.policy_file), __file__)
     requests = [request_elite(archive, k, policy=policies[k % 2], replicas=4) for k in range(5)]
@@ -67,9 +67,10 @@ def test_missing_recordings_are_crossed_in_lots_of_one_controller(anymal, tmp_pa
         return stand_in_cross([])(lot, progress)
 
     def record(device, requests):
-        recordings = Recordings(anymal, device=device, folder=tmp_path, cross=cross).record(requests)
+        recordings = Recordings(anymal, device=device, folder=tmp_path).record(requests)
         return [recording.labels[0] for recording in recordings]
 
+    monkeypatch.setattr("qd.show.recordings.RecordingCrosser", lambda robot, device: cross)
     labels = [f"elite {k} of anymal" for k in range(5)]
     assert record("cuda:0", requests) == labels and lots == [labels[::2], labels[1::2]]
     more = [*requests[3:], request_elite(archive, 0, policy=policies[0], replicas=4, seed=1)]

@@ -66,7 +66,8 @@ def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_pa
 
 
 def lines_of(opened_run, recording, policy=None):
-    lines = describe(source_from_run(opened_run, policy=policy), 0, recording).splitlines()
+    source = source_from_run(opened_run, policy=policy)
+    lines = describe(source, source.terrains[0], recording).splitlines()
     assert max(map(len, lines)) <= 80
     return [" ".join(line.split()) for line in lines]
 
@@ -145,9 +146,8 @@ def test_a_map_is_never_overwritten(anymal):
         np.savez(f"{folder}/hill.npz", heights=np.zeros((3, 5)))
         with pytest.raises(ValueError, match="size"):
             source_from_map(Path(folder) / "hill.npz", anymal)
-        assert source_from_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).stems == [
-            f"{folder}-hill.npz-anymal"
-        ]
+        (terrain,) = source_from_map(Path(folder) / "hill.npz", anymal, size_m=(16.0, 8.0)).terrains
+        assert terrain.stem == f"{folder}-hill.npz-anymal"
     Image.fromarray(np.zeros((3, 5), np.uint8)).save("hill.png")
     Path("hill.json").write_text('{"scale_m": 0.01, "size_m": [16, 8]}')
     before = {path.name: path.read_bytes() for path in Path().glob("hill.*")}
