@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageColor
+from scipy.spatial.transform import Rotation
 
 from kernels.episode import Outcome
 from qd.show.crossed import find_failure_time, get_ending, leans
@@ -35,7 +36,7 @@ class Crossing:
     forces: NDArray[np.float64]
     """Arrows of the feet's contact forces, begin and end [m], shape (F, num_feet, 2, 3); small forces have length 0."""
     command: NDArray[np.float64]
-    """Arrow of the velocity command, begin and end [m], shape (F, 2, 3)."""
+    """Arrow of the velocity command from above the base, 1 m is 1 m/s, begin and end [m], shape (F, 2, 3)."""
     penalties: NDArray[np.float64]
     """Scaled sums so far, in the archive's order, shape (F, P)."""
     touching: NDArray[np.bool_]
@@ -69,8 +70,11 @@ def trace_crossing(
     arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
     shapes = [skeleton.model.geom(name) for name in recording.foot_names]
     bodies = [foot.bodyid[0] - 1 for foot in shapes]
-    feet = positions[:, bodies] + rotated(quaternions[:, bodies], np.stack([foot.pos for foot in shapes]))
-    command = recording.command[0, replica, :frames].astype(np.float64)
+    offsets = [_rotation(quaternions[:, body]).apply(foot.pos) for body, foot in zip(bodies, shapes, strict=True)]
+    feet = positions[:, bodies] + np.stack(offsets, axis=1)
+    yaw = _rotation(qpos[:, 3:7]).as_euler("ZYX")[:, :1]  # commands are in its frame
+    command = recording.command[0, replica, :frames].astype(np.float64) * [1.0, 1.0, 0.0]
+    begin = qpos[:, :3] + [0.0, 0.0, _COMMAND_HEIGHT]
     sums = recording.penalties[0, replica, :frames].astype(np.float64)
     columns = [recording.penalty_names.index(name) for name in scales]
     return Crossing(
@@ -80,7 +84,7 @@ def trace_crossing(
         positions=positions,
         quaternions=quaternions,
         forces=np.stack([feet, feet + arrows], axis=2),
-        command=_command_arrows(qpos, command),
+        command=np.stack([begin, begin + Rotation.from_euler("Z", yaw).apply(command)], axis=1),
         penalties=sums[:, columns] / np.array([*scales.values()]),
         touching=recording.touching[0, replica, :frames],
         marks=find_marks(recording, replica),
@@ -146,21 +150,9 @@ def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]
     ]
 
 
-def rotated(quaternions: NDArray[np.floating], vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Vectors turned by unit quaternions w x y z; leading axes broadcast."""
-    axis = quaternions[..., 1:]
-    twice = 2.0 * np.cross(axis, vectors)
-    return vectors + quaternions[..., :1] * twice + np.cross(axis, twice)
-
-
-def _command_arrows(qpos: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Arrows of the commanded velocity, 1 m is 1 m/s, from above the base; commands are in the frame of its yaw."""
-    forward = rotated(qpos[:, 3:7], np.array([1.0, 0.0, 0.0]))
-    yaw = np.arctan2(forward[:, 1], forward[:, 0])
-    x = np.cos(yaw) * command[:, 0] - np.sin(yaw) * command[:, 1]
-    y = np.sin(yaw) * command[:, 0] + np.cos(yaw) * command[:, 1]
-    begin = qpos[:, :3] + np.array([0.0, 0.0, _COMMAND_HEIGHT])
-    return np.stack([begin, begin + np.stack([x, y, np.zeros_like(x)], axis=1)], axis=1)
+def _rotation(quaternions: NDArray[np.floating]) -> Rotation:
+    """Rotations by unit quaternions w x y z."""
+    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
 
 
 def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:

@@ -3,6 +3,7 @@
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -193,17 +194,10 @@ class Scene:
             middle, top = ((*goal, high + share * _POST_HEIGHT) for share in (0.5, 1.0))
             scene.add_cylinder("/goal/post", _POST_RADIUS, _POST_HEIGHT, _GOAL_COLOR, position=middle)
             scene.add_label("/goal/label", "goal", position=top, anchor="bottom-center")
-            self._draw_way(heights)
-
-    def _draw_way(self, heights: Points) -> None:
-        """A dashed line from start to goal along the ground."""
-        start = np.array(CrossingCfg.start)
-        way = np.array(CrossingCfg.goal) - start
-        share = np.linspace(0.0, 1.0, round(float(np.linalg.norm(way)) / SPACING) + 1)
-        positions = start + share[:, None] * way
-        points = np.column_stack([positions, surface_heights(heights, *positions.T) + _WAY_LIFT])
-        segments = np.stack([points[:-1], points[1:]], axis=1)[::2]
-        self._client.scene.add_line_segments("/way/line", segments, colors=_WAY_COLOR, thickness=0.02)
+            way = np.linspace(start, goal, round(math.dist(start, goal) / SPACING) + 1)  # along the ground
+            points = np.column_stack([way, surface_heights(heights, *way.T) + _WAY_LIFT])
+            dashes = np.stack([points[:-1], points[1:]], axis=1)[::2]
+            scene.add_line_segments("/way/line", dashes, colors=_WAY_COLOR, thickness=0.02)
 
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
@@ -245,7 +239,13 @@ class Scene:
             _set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
                 _set_arrow(handle, arrow)
-        self._go_along(crossing.positions[frame, 0])
+        before = self._followed
+        self._followed = base = crossing.positions[frame, 0].copy()
+        if self.follow and before is None:
+            self._go_near(base)
+        elif self.follow:
+            camera = self._client.camera
+            camera.position = camera.position + (base - before)  # what it looks at goes with it
 
     def show_ghost(self, crossing: Crossing, frame: int, label: str = "") -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""
@@ -267,18 +267,6 @@ class Scene:
         return self._client.scene.add_mesh_simple(
             name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, **look
         )
-
-    def _go_along(self, base: Points) -> None:
-        """Move the camera as the base has moved, if it follows."""
-        before = self._followed
-        self._followed = base.copy()
-        if not self.follow:
-            return
-        if before is None:
-            self._go_near(base)
-        else:
-            camera = self._client.camera
-            camera.position = camera.position + (base - before)  # what it looks at goes with it
 
     def _go_near(self, base: Points) -> None:
         self.go_to((tuple(base + _BEHIND), tuple(base)))

@@ -1,6 +1,6 @@
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from qd.show.view.playing import rotated
 from qd.show.view.scene import arrow_mesh, arrow_pose, robot_parts
 from sim.robots.skeleton import Skeleton
 
@@ -19,4 +19,5 @@ def test_an_arrow_points_from_its_beginning_to_its_end():
     begin, way = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.4, 1.2])
     quaternion, length = arrow_pose(begin, begin + way)
     np.testing.assert_allclose(arrow_mesh().bounds[:, 2], [0.0, 1.0], atol=1e-6)
-    np.testing.assert_allclose(rotated(quaternion, np.array([0.0, 0.0, length])), way, atol=1e-5)
+    turn = Rotation.from_quat(np.roll(quaternion, -1))
+    np.testing.assert_allclose(turn.apply([0.0, 0.0, length]), way, atol=1e-5)
