@@ -53,10 +53,10 @@ def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> N
 
 def write_figures(folder: Path, archive: Archive, metrics: Sequence[dict[str, Any]]) -> list[Path]:
     """Draws the figures of a search: its curves, and its archive on parallel axes."""
-    figures = {"curves.png": draw_curves(archive, metrics), "archive.png": draw_archive(archive)}
-    for name, figure in figures.items():
-        save_figure(folder / name, figure)
-    return [folder / name for name in figures]
+    figures = {folder / "curves.png": draw_curves(archive, metrics), folder / "archive.png": draw_archive(archive)}
+    for path, figure in figures.items():
+        save_figure(path, figure)
+    return [*figures]
 
 
 def save_figure(path: Path, figure: Figure) -> None:
@@ -78,12 +78,11 @@ def draw_curves(archive: Archive, metrics: Sequence[dict[str, Any]]) -> Figure:
     as_share = (lambda count: percent * count, lambda share: share / percent)
     for axes, (key, label) in zip(figure.subplots(1, len(panels), sharex=True), panels, strict=True):
         axes.plot(iterations, [row[key] for row in metrics], color=_BLUE, marker="." if len(metrics) < 30 else "")
-        axes.set_ylabel(label)
+        axes.set(xlabel="iteration", ylabel=label)
         if key != "mean_fitness":
             axes.set_ylim(bottom=0)
         if key == "elites":
             axes.secondary_yaxis("right", functions=as_share).set_ylabel("reachable coverage [%]")
-        axes.set_xlabel("iteration")
         axes.grid(alpha=0.3)
         axes.xaxis.get_major_locator().set_params(integer=True)
     return figure
@@ -115,9 +114,7 @@ def draw_archive(archive: Archive) -> Figure:
         axes.axvline(x, color="0.25", linewidth=1.0)
     axes.set_xticks(range(count), [textwrap.fill(PENALTIES[name].label, 14) for name in archive.penalties])
     axes.set_yticks(np.linspace(0, 1, 11))
-    axes.set_xlim(-0.15, count - 0.85)
-    axes.set_ylim(-0.02, 1.02)
-    axes.set_ylabel("share of the penalties")
+    axes.set(xlim=(-0.15, count - 0.85), ylim=(-0.02, 1.02), ylabel="share of the penalties")
     axes.grid(axis="y", alpha=0.25)
     axes.spines[:].set_visible(False)
     figure.colorbar(lines, ax=axes, label="fitness", pad=0.02, extend="both")
@@ -145,9 +142,8 @@ def draw_minimal(
     axes = subfigures[0].subplots()
     axes.bar_label(axes.barh([*counts], [*counts.values()], color="#d55e00"), padding=3)
     axes.invert_yaxis()
-    axes.margins(x=0.08)
+    axes.set(xlabel="terrains by their cause", xmargin=0.08)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("terrains by their cause")
     panels = subfigures[1].subplots(rows, _COLUMNS, squeeze=False).ravel()
     grids, grounds = make_terrains(np.array([genes[entries[index]["elite"]] for index in shown]), space)
     for panel in panels[len(shown) :]:

@@ -22,7 +22,6 @@ from sim.controllers.spec import controller_hash
 from sim.files.provenance import code_fingerprint
 from sim.recording.recorder import Recording, make_recording, read_recording, write_recording
 from sim.robots.robot import RobotCfg, robot_identity
-from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space, space_key
 from sim.terrains.terrains import Terrains
 
@@ -76,15 +75,6 @@ def request_elite(
     terrain = Terrains(genes=genes[None], seeds=seeds, space=get_space(archive.space, archive.space_sha256))
     label = label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}"
     return CrossingRequest(label=label, terrain=terrain, seed=seed, **crossing)
-
-
-def request_map(
-    heights: NDArray[np.float32], *, ground: GroundMaps | None = None, seed: int = 0, **crossing: Any
-) -> CrossingRequest:
-    """Crossings of a user's height map; further arguments as of :class:`CrossingRequest`."""
-    seeds = episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)
-    terrain = Terrains(heights=heights[None], seeds=seeds, ground=ground)
-    return CrossingRequest(terrain=terrain, seed=seed, **crossing)
 
 
 class RecordingCrosser:

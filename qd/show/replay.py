@@ -15,8 +15,9 @@ from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.show.crossed import draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
-from qd.show.recordings import CrossingRequest, Recordings, request_elite, request_map
+from qd.show.recordings import CrossingRequest, Recordings, request_elite
 from qd.workers.invalid import format_reasons, invalid_reasons, refuse_all_invalid
+from qd.workers.seeds import Stream, episode_seeds
 from sim.controllers.spec import ControllerSpec, crosser_name
 from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.figures import as_png
@@ -26,6 +27,7 @@ from sim.recording.recorder import Recording
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.terrains.maps.heightmap import as_terrain, fitted, read_heightmap
+from sim.terrains.terrains import Terrains
 
 USER_FOLDER = RUNS / "terrains"
 """Where files about a user's terrains go."""
@@ -124,6 +126,7 @@ def source_from_map(
     scale_m: float | None = None,
     offset_m: float | None = None,
     policy: str | None = None,
+    seed: int = 0,
     **crossing: Any,
 ) -> ReplaySource:
     """A user's height map, as :func:`sim.terrains.maps.heightmap.read_heightmap` takes it."""
@@ -146,7 +149,9 @@ def source_from_map(
     except ValueError as error:  # they were never measured
         print(f"{error}; penalties are compared as they are, unscaled", flush=True)
         scales = (1.0,) * len(robot.penalties)
-    request = request_map(heights, label=file.name, policy=controller, ground=heightmap.ground, **crossing)
+    seeds = episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)
+    terrain = Terrains(heights=heights[None], seeds=seeds, ground=heightmap.ground)
+    request = CrossingRequest(label=file.name, terrain=terrain, policy=controller, seed=seed, **crossing)
     return ReplaySource(
         robot=robot,
         fitness=FitnessCfg(penalties=robot.penalties, scales=scales),
@@ -240,28 +245,23 @@ def _format_numbers(columns: Sequence[tuple[str, Evaluation, int]], fitness: Fit
     rows = {"": [label for label, _, _ in columns]}
     rows["episodes"] = [str(values.episodes[n]) for _, values, n in columns]
     for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
-        texts = []
+        texts = rows[label] = []
         for _, values, n in columns:
             count = int(values.counted[n]) if values.valid[n] else 0
             hits = round(getattr(values, rate)[n] * count) if count else 0
             texts.append(format_rate(hits, count, short=True).replace("% to ", "-").replace(" to ", "-"))
-        rows[label] = texts
     for p, (name, scale) in enumerate(zip(fitness.penalties, fitness.scales, strict=True)):
-        rows[PENALTIES[name].label] = [
-            f"{_format_spread(scale * values.penalty_mean[n, p], scale * values.penalty_std[n, p])}, "
-            f"{values.ratios[n, p]:.0%}"
-            for _, values, n in columns
-        ]
+        texts = rows[PENALTIES[name].label] = []
+        for _, values, n in columns:
+            mean = scale * values.penalty_mean[n, p]
+            std = scale * values.penalty_std[n, p]
+            digits = 2 if max(mean, std) < 100 else 0
+            texts.append(f"{mean:.{digits}f}±{std:.{digits}f}, {values.ratios[n, p]:.0%}")
     if len(columns) > 1:
         rows["fitness"] = [f"{values.fitness[n]:.2f}" for _, values, n in columns]
     label_width = max(map(len, rows))
     width = max(len(text) for row in rows.values() for text in row)
     return [f"{label:{label_width}}" + "".join(f"  {text:>{width}}" for text in row) for label, row in rows.items()]
-
-
-def _format_spread(mean: float, std: float) -> str:
-    digits = 2 if max(mean, std) < 100 else 0
-    return f"{mean:.{digits}f}±{std:.{digits}f}"
 
 
 def _describe_elite(run: OpenedRun, terrain: EliteTerrain, now: Evaluation) -> dict[str, Any]:

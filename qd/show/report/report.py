@@ -162,6 +162,10 @@ def _make_case(
         beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
     row = ranking.find_row(number)
     rate = count_rates(recording)[ARRIVED]
+    tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
+    rates = {"for this page": rate, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
+    rates |= {label: Rate(*counts) for label, counts in further_rates(opened_run.archive, number).items()}
+    rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
     return {
         "number": number,
         "name": ranking.name(row),
@@ -172,17 +176,8 @@ def _make_case(
         "beside": beside,
         "figure": "",
         "rate": rate,
-        "rates": _list_rates(ranking, opened_run.archive, row, rate),
+        "rates": page.Table(head=["goal reached", "", "95 % interval"], rows=rows),
     }
-
-
-def _list_rates(ranking: Ranking, archive: Archive, row: int, arrived: Rate) -> page.Table:
-    """How often controllers reach the goal: now, when the elite was found or judged, and under other conditions."""
-    tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
-    rates = {"for this page": arrived, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
-    rates |= {label: Rate(*rate) for label, rate in further_rates(archive, int(ranking.numbers[row])).items()}
-    rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
-    return page.Table(head=["goal reached", "", "95 % interval"], rows=rows)
 
 
 def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_searched: bool) -> dict[str, Any]:

@@ -30,7 +30,8 @@ _SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 _WIDTH = 360  # of a panel [pixels]
 _NARROW_WIDTH = 300
 _WIDE = 1300  # a narrower window has no room for two wide panels, and the archive is folded [pixels]
-_TERRAINS = ("whole", "minimal")
+TERRAINS = ("whole", "minimal")
+"""Terrains of an elite to choose from."""
 _CURVE_POINTS = 300
 _HOLD_S = 1.5  # real time from the end of a crossing that plays to its next begin
 _KEYS = """- **Space** play or pause
@@ -149,7 +150,7 @@ class CrossingPanel:
         ghosts = {name: name for name in tab.ghost_choices}
         self.ghost = _add_choice(gui, "Ghost", ghosts, partial(post, tab.choose_ghost))
         self.controller.disabled = self.ghost.disabled = not controllers
-        whole = {label: bool(k) for k, label in enumerate(_TERRAINS)}
+        whole = {label: bool(k) for k, label in enumerate(TERRAINS)}
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
         names = tab.shared.show.archive.penalties
@@ -167,12 +168,6 @@ class CrossingPanel:
             gui.add_html(_render_legend())
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
-
-    def show_elite(self, head: str, *, has_minimal: bool, minimal: bool) -> None:
-        """Show an elite's head, in HTML, and which of its terrains is shown."""
-        self.head.content = f'<div style="padding:0 0.6em 0.4em">{head}</div>'
-        self.terrain.visible = has_minimal
-        self.terrain.value = _TERRAINS[minimal]
 
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""

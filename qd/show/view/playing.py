@@ -105,9 +105,13 @@ def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], .
     at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
     """
     frames = int(recording.num_frames[0, replica])
-    events = {
-        "first stumble": _grows(recording, replica, "stumble"),
-        "first collision": _collides(recording, replica),
+    sums = recording.penalties[0, replica, :frames]
+    grows = dict(zip(recording.penalty_names, (np.diff(sums, axis=0, prepend=sums[:1]) > 0.0).T, strict=True))
+    bodies = [k for k, name in enumerate(recording.geom_names) if name not in recording.foot_names]
+    touches = recording.touching[0, replica, :frames][:, bodies].any(axis=1)
+    events: dict[str, NDArray[np.bool_]] = {
+        "first stumble": grows.get("stumble", np.zeros(frames, bool)),
+        "first collision": grows.get("collision", touches),
         "fall": leans(recording, replica),
     }
     marks = [(recording.dt * int(np.argmax(when)), label) for label, when in events.items() if when.any()]
@@ -115,23 +119,6 @@ def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], .
         marks.append((find_failure_time(recording, replica), "stuck"))
     marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording.outcome[0, replica]).label}"))
     return tuple(sorted(marks, key=lambda mark: mark[0]))
-
-
-def _grows(recording: Recording, replica: int, penalty: str) -> NDArray[np.bool_]:
-    """Frames at which a penalty is larger than at the one before; none if it is not recorded."""
-    frames = int(recording.num_frames[0, replica])
-    if penalty not in recording.penalty_names:
-        return np.zeros(frames, dtype=bool)
-    sums = recording.penalties[0, replica, :frames, recording.penalty_names.index(penalty)]
-    return np.asarray(np.diff(sums, prepend=sums[:1]) > 0.0)
-
-
-def _collides(recording: Recording, replica: int) -> NDArray[np.bool_]:
-    if "collision" in recording.penalty_names:
-        return _grows(recording, replica, "collision")
-    bodies = [k for k, name in enumerate(recording.geom_names) if name not in recording.foot_names]
-    touching = recording.touching[0, replica, : int(recording.num_frames[0, replica]), bodies]  # geoms come first
-    return np.asarray(touching.any(axis=0))
 
 
 def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:

@@ -16,7 +16,7 @@ from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
 from qd.show.recordings import CrossingRequest, Recordings
 from qd.show.view.address import MINIMAL, Address, read_address
-from qd.show.view.panels import ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
+from qd.show.view.panels import TERRAINS, ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
 from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
 from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.scene import Part, Scene, View, compute_first_view, compute_overview
@@ -384,9 +384,10 @@ class Tab:
         conditions = show.space.condition_text(genes)
         facts = filter(None, (f"elite {elite} of {len(self.show.archive):,}", show.verdict(elite), conditions))
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
-        self.panel.show_elite(
-            f"<b>{escape(name)}</b><br>{' · '.join(facts)}", has_minimal=minimal_genes is not None, minimal=self.minimal
-        )
+        text = f"<b>{escape(name)}</b><br>{' · '.join(facts)}"
+        self.panel.head.content = f'<div style="padding:0 0.6em 0.4em">{text}</div>'
+        self.panel.terrain.visible = minimal_genes is not None
+        self.panel.terrain.value = TERRAINS[self.minimal]
         heights, ground = make_terrains(genes[None], show.space)
         self.scene.set_terrain(heights[0], ground)
         self._show_crossings()

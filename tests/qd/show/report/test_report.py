@@ -14,15 +14,31 @@ from kernels.episode import Outcome
 from qd.faults.families import VERDICTS, rank, summarise_search
 from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
+from qd.show.report.evaluation import compare_controllers
 from qd.show.report.page import TILE, draw_sheet, find_failure, find_same_moment, percent
-from qd.show.report.report import count_causes
+from qd.show.report.report import count_causes, write_report
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
+from sim.robots.robot import robot_identity
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.qd.evaluate.made import make_report
 from tests.qd.recordings import recording_of
 from tests.qd.show.report.pages import grouped_archive, make_run, minimal_of, reporter, text_of
 
 SOURCE = r"data:image/webp;base64,([A-Za-z0-9+/=]+)"
+
+
+@pytest.fixture
+def run(tmp_path):
+    return make_run(tmp_path)
+
+
+@pytest.fixture
+def reported(run, monkeypatch):
+    """Makes reports whose figures are a dot, without close pictures: drawing takes most of the time."""
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
+    monkeypatch.setattr("qd.show.report.page.as_image", lambda figure: Image.new("RGB", (1, 1)))
+    return reporter(run, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -175,3 +191,94 @@ def test_bad_input_is_refused_and_the_page_stays_as_it_was(reported, run, tmp_pa
 def test_a_share_is_none_or_all_only_if_it_is():
     texts = [percent(share) for share in (0.0, 1.0, 0.051, 0.9996, 0.0002, 0.998)]
     assert texts == ["0 %", "100 %", "5.1 %", "over 99.9 %", "less than 0.1 %", "99.8 %"]
+
+
+MEASURES = ("success", "goal", "reward")
+
+
+def tables():
+    """Two controllers on four elites, of which the second mends one and breaks another."""
+    made = make_report({"generated": {"base": [4, 4, 0, 0], "C-G": [4, 0, 4, 0]}})
+    values, limits = {"base": 0.5, "C-G": None}, {"base": [0.1, 0.9], "C-G": None}
+    made |= {measure: {"generated": values} for measure in (*MEASURES, "certified_goal")}
+    made["intervals"] |= {measure: {"generated": limits} for measure in (*MEASURES, "certified_goal")}
+    about = {"terrains": 2, "certifiers": {"C-G": 2}, "chosen_by": {"base": "searched"}}
+    return made | {"certified": {"generated": about}}
+
+
+def test_tables_are_shown_where_they_are_asked_for(reported, run, anymal):
+    assert "Controllers compared" not in text_of(reported()[0].read_bytes())
+    file = run.parent / "tables.json"
+    file.write_bytes(to_json({**robot_identity(anymal), **tables()}))
+    text = text_of(reported(tables=file)[0].read_bytes())
+    assert "Controllers compared From tables.json." in text
+    assert "generated, held out (4) base 50 % (10 to 90) C-G -" in text
+    assert "generated, held out: base -> C-G 1 1 1 1 4" in text  # mended, still failing, newly broken, fine, compared
+    assert "generated, held out (2) base 50 % (10 to 90), searched C-G -" in text
+
+
+def test_of_several_trainings_each_is_shown_and_the_mean_over_their_seeds():
+    values, limits = {"base": 0.5, "C-G": 0.6, "C-G@1": 0.8}, {"base": [0.4, 0.6], "C-G": [0.5, 0.7], "C-G@1": None}
+    over = {"mean": 0.7, "interval": None, "values": [0.6, 0.8]}
+    several = {
+        "controllers": {name: {"policy": name, "sha256": "0"} for name in values}, "terrains": {"near": 4},
+        **{measure: {"near": values} for measure in MEASURES}, "episodes": 20, "differences": {},
+        "intervals": {measure: {"near": limits} for measure in MEASURES},
+        "over_seeds": {measure: {"near": {"C-G": over}} for measure in MEASURES},
+    }  # fmt: skip
+    compared = compare_controllers(several, searched="1")
+    words, goals = compared["measures"][0]
+    assert not compared["of_searched"] and words == "goal reached" and goals.head == ["controller", "near (4)"]
+    expected = [["base", "50 % (40 to 60)"], ["C-G", "60 % (50 to 70)"], ["C-G@1", "80 %"], ["C-G, mean of 2", "70 %"]]
+    assert goals.rows == expected
+
+
+SETS = ("hand_crafted", "search-0")
+
+
+def round_of(controller, faults):
+    counts = {"elites": 40, "failing": 20, "confirmed": 18, "certified": 15}
+    counts |= {"episodes": 1000, "faults": faults}
+    return {"controller": controller, "search": f"search-{controller}", "certifiers": ["C-G"], **counts}
+
+
+def hardening():
+    # Of 13 terrains base crosses 4 and round-1 10: 7 are mended, 2 still failing, 1 newly broken, 3 fine.
+    goals = {"base": [0] * 9 + [4] * 4, "round-1": [4] * 7 + [0] * 3 + [4] * 3}
+    tables = make_report(dict.fromkeys(SETS, goals))
+    rounds = [round_of("base", 12), round_of("round-1", 3)]
+    return {"command": "faultline harden <b>", "robot": "anymal", "rounds": rounds, "tables": tables}
+
+
+def written(run, **changes):
+    """The run with its file."""
+    (run / "rounds.json").write_bytes(to_json(hardening() | changes))
+    return run
+
+
+def test_the_page_has_the_numbers_of_the_rounds(tmp_path):
+    choices = {"tune-1": {"kept": True, "why": "better"}, "tune-2": {"kept": False, "why": "<i>worse"}}
+    run = written(tmp_path, choices=choices)
+    text = text_of(write_report(run).read_bytes())
+    for part in (
+        "1 round of search and training: searches find 12 faults of anymal's controller before and 3 after",
+        "base 1,000 40 20 18 15 12 C-G round-1 1,000 40 20 18 15 3 C-G", "hand-crafted base 31 % round-1 77 %",
+        "base 31 % (8 to 62)", "search-0: base -> round-1 7 2 1 3 13",
+        "tune-1 kept better tune-2 not kept <i>worse", "faultline harden <b>",
+    ):  # fmt: skip
+        assert part in text
+    assert f"faultline report --run {tmp_path}/search-base " in text  # a command that works, wherever the run lies
+    assert f"Made from {tmp_path.name}:" in text
+    assert "report --robot anymal --run" in text_of(write_report(run, robot="anymal").read_bytes())
+    written(
+        run, rounds=[round_of("base", None)], tables={**hardening()["tables"], "differences": {}}
+    )  # one search alone
+    assert "search-0: base" not in text_of(write_report(run).read_bytes())
+
+
+def test_what_is_no_hardening_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="cassie"):
+        write_report(written(tmp_path), robot="cassie")
+    for changes in ({"rounds": []}, {"rounds": [{"controller": 3}]}, {"tables": {"episodes": 20}}):
+        with pytest.raises(ValueError, match="rounds"):
+            write_report(written(tmp_path, **changes))

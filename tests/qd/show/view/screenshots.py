@@ -9,8 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tests.qd.show.view.browser import LIMIT_MS, open_chromium, until_it_plays, wait_for
-from tests.qd.show.view.visitor import ROOT, serve
+from tests.qd.show.view.browser import LIMIT_MS, ROOT, open_chromium, serve, until_it_plays, wait_for
 
 DOCS = ROOT / "docs" / "pictures"
 SETTLE_MS = 4000  # for the last frames of a browser that draws without a GPU

@@ -18,7 +18,7 @@ from qd.show.view.tab import Tab
 from qd.show.view.viewed import open_viewed_run
 from sim.recording.recorder import read_recording
 from tests.builders import free_port
-from tests.qd.show.view.visitor import visit
+from tests.qd.show.view.browser import visit
 
 
 @pytest.fixture(scope="module")

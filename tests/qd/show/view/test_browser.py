@@ -4,13 +4,13 @@ import re
 
 import pytest
 
-from tests.qd.show.view.browser import BROWSER, LIMIT_MS, open_chromium, said, until_it_plays, wait_for, wait_until
-from tests.qd.show.view.visitor import serve
+from tests.qd.show.view import browser
+from tests.qd.show.view.browser import LIMIT_MS, open_chromium, said, serve, until_it_plays, wait_for, wait_until
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(BROWSER is None, reason="there is no browser: apt-get install chromium"),
+    pytest.mark.skipif(browser.BROWSER is None, reason="there is no browser: apt-get install chromium"),
 ]
 
 
