@@ -69,7 +69,7 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
         where = (wp.ones(count, dtype=int), wp.zeros(count, dtype=int), bank.terrain)  # all robots, on the one terrain
         how = (make_start_ranges(CrossingCfg(), robot), sensors)
         restart_episodes(*where, *how, joint_q, joint_qd, action, episodes, Rewards())
-    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), np.float32(base_com))
+    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), base_com.astype(np.float32))
 
 
 class EpisodeStates:

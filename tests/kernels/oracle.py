@@ -1,7 +1,7 @@
 """Terrain and contact written a second time: float64 NumPy, from the definitions, slow and plain.
 
-The tests hold the kernels against it, and against :mod:`sim.mujoco_c.model` for observation,
-command and penalties; nothing in either is shared with the kernels or ported from them. Vectors are world-local.
+The tests hold the kernels against it, and against :mod:`sim.mujoco_c.model` for heights, observation, command and
+penalties; nothing in either is shared with the kernels or ported from them. Vectors are world-local.
 """
 
 from typing import Any
@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
+
+from sim.mujoco_c.model import surface_heights
 
 Array = Any  # an array, or a sequence of numbers: checked by what is computed
 
@@ -26,16 +28,13 @@ TABLE_I = {  # the paper's minimum and maximum of each parameter, in gene order
 
 def mixture_height(genes: Array, x: Array, y: Array) -> Array:
     """The paper's equation 1 for one terrain: genes (8 * num_bumps,), heights of the shape of x and y."""
+    low, high = np.array(list(TABLE_I.values())).T
     height = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
-    for bump in np.clip(np.float64(genes), -1, 1).reshape(-1, 8):
-        bounds = TABLE_I.values()
-        values = [low + (gene + 1) / 2 * (high - low) for gene, (low, high) in zip(bump, bounds, strict=True)]
-        mu_x, mu_y, sigma_x, sigma_y, p_x, p_y, theta, w = values
+    for bump in low + (np.clip(np.float64(genes), -1, 1).reshape(-1, 8) + 1) / 2 * (high - low):
+        mu_x, mu_y, sigma_x, sigma_y, p_x, p_y, theta, w = bump
         x_rot = np.cos(theta) * (x - mu_x) - np.sin(theta) * (y - mu_y)
         y_rot = np.sin(theta) * (x - mu_x) + np.cos(theta) * (y - mu_y)
-        height += (
-            w * np.exp(-((np.abs(x_rot) / sigma_x) ** (2 * p_x))) * np.exp(-((np.abs(y_rot) / sigma_y) ** (2 * p_y)))
-        )
+        height += w * np.exp(-(np.abs(x_rot / sigma_x) ** (2 * p_x)) - np.abs(y_rot / sigma_y) ** (2 * p_y))
     return height
 
 
@@ -57,26 +56,6 @@ def triangles(grid: Array, spacing: float, x: float, y: float, reach: float) -> 
     return np.concatenate([low, high])
 
 
-def _area(u: Array, v: Array) -> Array:
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-
-
-def under(corners: Array, point: Array) -> Array:
-    """Barycentric weights (num, 3) of the vertical through ``point`` in each triangle."""
-    a, b, c = corners[:, 0, :2], corners[:, 1, :2], corners[:, 2, :2]
-    q = np.float64(point)
-    weights = np.stack([_area(b - q, c - q), _area(c - q, a - q), _area(a - q, b - q)], axis=1)
-    return weights / _area(b - a, c - a)[:, None]
-
-
-def surface_height(grid: Array, spacing: float, x: float, y: float) -> float:
-    """Height of the triangulated surface at one (x, y)."""
-    corners = triangles(grid, spacing, x, y, 0.0)
-    weights = under(corners, (x, y))
-    k = np.argmax(weights.min(axis=1))
-    return float(weights[k] @ corners[k, :, 2])
-
-
 def nearest_on_surface(grid: Array, spacing: float, p: Array, reach: float) -> tuple[float, Array | None]:
     """Signed distance of ``p`` to the surface and the nearest point; (inf, None) if nothing is within ``reach``.
 
@@ -87,7 +66,7 @@ def nearest_on_surface(grid: Array, spacing: float, p: Array, reach: float) -> t
     candidates = trimesh.triangles.closest_point(corners, np.tile(p, (len(corners), 1)))
     distances = np.linalg.norm(candidates - p, axis=1)
     best = np.argmin(distances)
-    below = p[2] < surface_height(grid, spacing, p[0], p[1])
+    below = p[2] < surface_heights(grid, p[0], p[1])
     if distances[best] > reach:
         return (-np.inf if below else np.inf), None
     return (-distances[best] if below else distances[best]), candidates[best]

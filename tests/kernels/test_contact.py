@@ -5,7 +5,9 @@ import pytest
 import warp as wp
 
 from kernels.contact import Contacts, Probes, collide_strips, make_contacts, sum_forces
-from kernels.ground import FIRM, Ground
+from kernels.ground import FIRM, PATCHES, Ground, make_ground
+from sim.mujoco_c.model import surface_heights
+from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import SPACING, crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
@@ -62,11 +64,7 @@ def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundl
     return records | {"count": count, "env": env, "buffer": buffer}
 
 
-def hard_terrain(kind):
-    if kind == "genes":
-        x, y = np.arange(321)[None, :] * SPACING, np.arange(161)[:, None] * SPACING
-        return np.float32(oracle.mixture_height(SUPER_GAUSSIAN.hard_random(1, 3)[0], x, y))
-    return crossing_terrain(kind, 9, 4)
+BOXES, [BUMPS] = crossing_terrain("boxes", 9, 4), make_heights(SUPER_GAUSSIAN.hard_random(1, 3))
 
 
 def sphere_poses(rng, grid, count):
@@ -76,7 +74,7 @@ def sphere_poses(rng, grid, count):
     poses[: count // 10, :, 0] = rng.uniform(-0.3, 16.3, (count // 10, len(RADII)))
     for pose in poses.reshape(-1, 7):
         near = oracle.triangles(grid, SPACING, pose[0], pose[1], max(RADII))[..., 2]
-        ground = oracle.surface_height(grid, SPACING, pose[0], pose[1])
+        ground = surface_heights(grid, pose[0], pose[1])
         low, high = (near.min(), near.max()) if rng.random() < 0.5 else (ground, ground)
         pose[2] = rng.uniform(low - 0.05, high + 0.12)
     quaternion = rng.normal(size=(count, len(RADII), 4))
@@ -96,7 +94,7 @@ def test_a_row_that_sags_is_looked_at_where_it_touches():
 
 
 def test_strips_report_first_deepest_and_last():
-    grid = hard_terrain("boxes")
+    grid = BOXES
     centres, radius = np.linspace([0, 0, -0.2], [0, 0, 0.2], 9), 0.04
     poses = sphere_poses(np.random.default_rng(8), grid, 100)[:, :1]
     records = collide(poses, np.zeros(100, int), grid[None], [(centres, radius)])
@@ -119,7 +117,7 @@ def test_strips_report_first_deepest_and_last():
 
 
 def test_a_bundle_of_strips_touches_what_each_does_alone():
-    grid, rng = hard_terrain("genes"), np.random.default_rng(10)
+    grid, rng = BUMPS, np.random.default_rng(10)
     strips = [(rng.uniform(-0.3, 0.3, 3) + np.linspace([0, 0, -0.1], [0, 0, 0.1], 5), radius) for radius in RADII]
     poses, found = np.repeat(sphere_poses(rng, grid, 200)[:, :1], len(RADII), axis=1), []
     poses[..., 2] += np.float32(rng.uniform(0.0, 0.6, (200, 1)))
@@ -133,7 +131,7 @@ def test_a_bundle_of_strips_touches_what_each_does_alone():
 
 def test_contacts_are_what_the_solver_reads():
     rng = np.random.default_rng(9)
-    grid = hard_terrain("genes")
+    grid = BUMPS
     poses = sphere_poses(rng, grid, 100)
     strips = [(rng.normal(0, 0.02, 3), radius) for radius in RADII]
     records = collide(poses, np.zeros(100, int), grid[None], strips)
@@ -147,6 +145,24 @@ def test_contacts_are_what_the_solver_reads():
     for touched in records["touched"][np.abs(records["distance"] + radius) < radius]:
         assert abs(oracle.nearest_on_surface(grid, SPACING, touched, 0.05)[0]) < 1e-5
     assert (records["friction"] == 1).all() and (records["time_constant"] == FIRM).all()
+
+
+def test_each_contact_has_the_ground_under_its_point():
+    # Of two robots of two spheres the first stands on terrain 1. Patches are terrain, row, column; beyond the edge the
+    # ground goes on.
+    patches = [(1, 0, 1), (1, 1, 1), (0, 3, 7), (0, 3, 0)]
+    points = [(3.02, 1.0), (3.06, 2.5), (15.92, 7.9), (-2.0, 9.0)]
+    ground = make_ground(2, str(wp.get_device()))
+    rng = np.random.default_rng(0)
+    friction, tau = rng.uniform(0.15, 1, (2, *PATCHES)), rng.uniform(0.02, 0.06, (2, *PATCHES))
+    tau[patches[0]] = FIRM
+    ground.friction.assign(np.float32(friction))
+    ground.time_constant.assign(np.float32(tau))
+    poses = [[x, y, 0.05, 0, 0, 0, 1] for x, y in points]
+    records = collide(poses, [1, 0], np.zeros((2, 161, 321)), [(np.zeros(3), 0.1)] * 2, ground=ground)
+    order = np.argsort(2 * records["env"] + records["shape"])
+    np.testing.assert_allclose(records["friction"][order], [friction[patch] for patch in patches], rtol=1e-6)
+    np.testing.assert_allclose(records["time_constant"][order], [tau[patch] for patch in patches], rtol=1e-6)
 
 
 def test_contacts_past_the_capacity_are_counted_but_not_written():

@@ -4,31 +4,24 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.heightfield import Terrain, ceiling_over, nearest_surface_point
+from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
+from sim.mujoco_c.model import surface_heights
 from tests.kernels import oracle
 from tests.kernels.states import SPACING, make_terrain, rough
 
 
-def surface_normal(grid, spacing, x, y):
-    """Upward unit normal of the triangle at one (x, y)."""
-    corners = oracle.triangles(grid, spacing, x, y, 0.0)
-    a, b, c = corners[np.argmax(oracle.under(corners, (x, y)).min(axis=1))]
-    normal = np.cross(b - a, c - a)
+def surface_normal(grid, x, y):
+    """Upward unit normal of the triangle at one (x, y), 5e-5 m or more from its edges."""
+    along_x = surface_heights(grid, x + 1e-5, y) - surface_heights(grid, x - 1e-5, y)
+    along_y = surface_heights(grid, x, y + 1e-5) - surface_heights(grid, x, y - 1e-5)
+    normal = np.array([-along_x, -along_y, 2e-5])
     return normal / np.linalg.norm(normal)
 
 
 @wp.kernel
-def _sample_kernel(
-    terrain: Terrain,
-    points: wp.array[wp.vec3],
-    reach: float,
-    distance_out: wp.array[float],
-    direction_out: wp.array[wp.vec3],
-):
+def _sample_kernel(terrain: Terrain, points: wp.array[wp.vec3], reach: float, nearest_out: wp.array[SurfacePoint]):
     k = wp.tid()
-    nearest = nearest_surface_point(terrain, 0, points[k], reach)
-    distance_out[k] = nearest.distance
-    direction_out[k] = nearest.normal
+    nearest_out[k] = nearest_surface_point(terrain, 0, points[k], reach)
 
 
 @wp.kernel
@@ -38,10 +31,9 @@ def _ceiling_kernel(terrain: Terrain, lower: wp.array[wp.vec2], upper: wp.array[
 
 
 def sample(terrain, points, reach):
-    out = [wp.zeros(len(points), dtype=kind) for kind in (float, wp.vec3)]
-    inputs = [terrain, wp.array(np.float32(points), dtype=wp.vec3), reach]
-    wp.launch(_sample_kernel, dim=len(points), inputs=inputs, outputs=out)
-    return [array.numpy() for array in out]
+    out = wp.zeros(len(points), dtype=SurfacePoint)
+    wp.launch(_sample_kernel, len(points), [terrain, wp.array(np.float32(points), dtype=wp.vec3), reach, out])
+    return out.numpy()["distance"], out.numpy()["normal"]
 
 
 def scatter(nrow, ncol, count):
@@ -71,8 +63,8 @@ def test_nearest_point(reach):
         elif expected == np.inf:
             assert got > reach - 1e-4
         elif expected == -np.inf:  # deep inside: the plane of the triangle straight above
-            plane = surface_normal(grid, SPACING, *p[:2])
-            depth = (p[2] - oracle.surface_height(grid, SPACING, *p[:2])) * plane[2]
+            plane = surface_normal(grid, *p[:2])
+            depth = (p[2] - surface_heights(grid, *p[:2])) * plane[2]
             assert got == pytest.approx(depth, abs=1e-5)
             np.testing.assert_allclose(normal, plane, atol=1e-5)
     assert near > 8

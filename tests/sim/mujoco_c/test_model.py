@@ -12,13 +12,12 @@ from kernels.penalties import penalty_columns
 from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import EpisodeStates, MujocoC, cross_in_mujoco_c, draw_starts
-from sim.mujoco_c.model import GROUND, crossing_model, to_mujoco
+from sim.mujoco_c.model import GROUND, crossing_model, surface_heights, to_mujoco
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
-from tests.kernels import oracle
 from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
 from tests.sim.plain_mujoco import cross_and_keep, rays_from_above
 from tests.sim.policies import Remembers, stand
@@ -54,7 +53,7 @@ def test_model_takes_stiffness_and_friction_from_the_robot_and_lets_the_solver_c
     far = [0, 0, 50, 1, *np.zeros(3 + robot.num_joints)]
     met, geoms = rays_from_above(model, points, far)
     assert (geoms == ground).all()
-    np.testing.assert_allclose(met, [oracle.surface_height(heights, SPACING, *point) for point in points], atol=1e-5)
+    np.testing.assert_allclose(met, surface_heights(heights, *np.transpose(points)), atol=1e-5)
 
 
 def test_plain_mujoco_takes_any_robot_that_the_search_takes(tmp_path):

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 from PIL import Image
 
+from sim.mujoco_c.model import surface_heights
 from sim.robots.shipped import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.maps.heightmap import as_terrain, read_heightmap
 from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, block_of, check_formats, write_terrain
-from tests.kernels import oracle
 from tests.sim.plain_mujoco import rays_from_above
 
 FLAT = np.full((NUM_ROWS, NUM_COLS), 0.2, np.float32)
@@ -38,7 +38,7 @@ def test_rays_meet_the_exported_scene_where_the_simulations_surface_is(rough, tm
     rng, limits = np.random.default_rng(1), np.array([NUM_COLS - 1, NUM_ROWS - 1])
     halves = rng.integers(2, 2 * limits - 1, (600, 2)) / 2 + 1e-3  # beside nodes, middles of cell edges and of cells
     places = SPACING * np.concatenate([halves, rng.uniform(0.01, limits - 0.01, (200, 2))])  # a ray may miss an edge
-    expected = [oracle.surface_height(rough, SPACING, x, y) for x, y in places]
+    expected = surface_heights(rough, *np.transpose(places))
     np.testing.assert_allclose(ray_heights(rough, tmp_path, places), expected, atol=1e-4)
     # The corners by name: x along the course, y across it.
     corners = [(1e-3, 1e-3), (15.999, 1e-3), (1e-3, 7.999), (15.999, 7.999)]
@@ -103,7 +103,7 @@ def test_a_mesh_is_a_closed_block_with_the_simulations_surface_on_top(rough):
     assert mesh.volume == pytest.approx(above, rel=1e-4)
     top = block_of(rough).triangles[: 2 * (NUM_ROWS - 1) * (NUM_COLS - 1)]
     for x, y, z in top.mean(axis=1)[::997]:
-        assert z == pytest.approx(oracle.surface_height(rough, SPACING, x, y), abs=1e-6)
+        assert z == pytest.approx(surface_heights(rough, x, y), abs=1e-6)
 
 
 def test_a_glb_stands_upright_and_is_coloured_by_height():
