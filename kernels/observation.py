@@ -9,7 +9,7 @@ import warp as wp
 
 from kernels.heightfield import Terrain, height_at
 from kernels.launch import kernel_over
-from kernels.state import base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
+from kernels.state import RobotStep, base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 
 NUM_BASE_COLUMNS = 12
 LIN_VEL_SCALE = wp.constant(2.0)
@@ -31,7 +31,6 @@ class Sensors:
     """Scan points ahead of the base in its yaw frame [m], shape (num_scan_points,)."""
     scan_y: wp.array[float]
     """Scan points left of the base in its yaw frame [m], shape (num_scan_points,)."""
-    base_com: wp.vec3
 
 
 @wp.struct
@@ -47,19 +46,16 @@ class Noise:
 
 
 @wp.func
-def _base_column(
-    joint_q: wp.array2d[float], joint_qd: wp.array2d[float], command: wp.array2d[float], sensors: Sensors, env: int,
-    k: int,
-) -> float:  # fmt: skip
+def _base_column(step: RobotStep, env: int, k: int) -> float:
     if k < 3:
-        return base_lin_vel_b(joint_q, joint_qd, sensors.base_com, env)[k] * LIN_VEL_SCALE
+        return base_lin_vel_b(step, env)[k] * LIN_VEL_SCALE
     if k < 6:
-        return base_ang_vel_b(joint_q, joint_qd, env)[k - 3] * ANG_VEL_SCALE
+        return base_ang_vel_b(step.joint_q, step.joint_qd, env)[k - 3] * ANG_VEL_SCALE
     if k < 9:
-        return projected_gravity(joint_q, env)[k - 6]
+        return projected_gravity(step.joint_q, env)[k - 6]
     if k < 11:
-        return command[env, k - 9] * LIN_VEL_SCALE
-    return command[env, 2] * ANG_VEL_SCALE
+        return step.command[env, k - 9] * LIN_VEL_SCALE
+    return step.command[env, 2] * ANG_VEL_SCALE
 
 
 @wp.func
@@ -92,10 +88,7 @@ def noise_width(noise: Noise, k: int, num_joints: int) -> float:
 
 @kernel_over("observation_out")
 def write_observation(
-    joint_q: wp.array2d[float],
-    joint_qd: wp.array2d[float],
-    command: wp.array2d[float],
-    last_action: wp.array2d[float],
+    step: RobotStep,
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     sensors: Sensors,
@@ -108,19 +101,19 @@ def write_observation(
     The command is in the base's yaw frame; ``noise_seed`` is one integer that the caller advances, shape (1,).
     """
     env, k = wp.tid()
-    num_joints = last_action.shape[1]
+    num_joints = step.action.shape[1]
     column = float(0.0)
     joint = k - NUM_BASE_COLUMNS
     if joint < 0:
-        column = _base_column(joint_q, joint_qd, command, sensors, env, k)
+        column = _base_column(step, env, k)
     elif joint < num_joints:
-        column = joint_q[env, 7 + joint] - sensors.default_joint_pos[joint]
+        column = step.joint_q[env, 7 + joint] - sensors.default_joint_pos[joint]
     elif joint < 2 * num_joints:
-        column = joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
+        column = step.joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
     elif joint < 3 * num_joints:
-        column = last_action[env, joint - 2 * num_joints]
+        column = step.action[env, joint - 2 * num_joints]
     else:
-        column = _scan_column(joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
+        column = _scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
     width = noise_width(noise, k, num_joints)
     if width > 0.0:
         state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)

@@ -104,7 +104,7 @@ def _plain_stumble(step: PlainStep) -> NDArray[Any]:
 
 @wp.func
 def _squared_velocity_error(step: RobotStep, env: int, axis: int) -> float:
-    velocity = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
+    velocity = base_lin_vel_b(step, env)
     error = velocity[axis] - step.command[env, axis]
     return error * error
 

@@ -18,7 +18,7 @@ from kernels.heightfield import Terrain, node_height
 from kernels.launch import kernel_over, make_zeros
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
-from kernels.state import velocity_beside
+from kernels.state import RobotStep, velocity_beside
 
 _CLEARING_THREADS = 64  # a row
 
@@ -80,21 +80,6 @@ def ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
 
 
 @wp.func
-def _store_result(
-    row: int, env: int, episodes: Episodes, penalty_sums: wp.array2d[float], rewards: Rewards, queue_out: EpisodeQueue
-):
-    queue_out.outcome[row] = episodes.outcome[env]
-    queue_out.invalidity[row] = episodes.invalidity[env]
-    queue_out.steps[row] = episodes.steps[env]
-    queue_out.final_pose[row] = episodes.final_pose[env]
-    for k in range(penalty_sums.shape[1]):
-        queue_out.penalty_sums[row, k] = penalty_sums[env, k]
-    if queue_out.reward.shape[0] > 0:
-        queue_out.reward[row] = rewards.total[env]
-    wp.atomic_add(queue_out.num_ended, row // queue_out.num_replicas, 1)
-
-
-@wp.func
 def _take_next(queue_out: EpisodeQueue) -> int:
     """Row of the next episode, -1 where none is ready."""
     ready = queue_out.ready[0]
@@ -130,7 +115,15 @@ def turn_over(
     if stepped[env] == Outcome.RUNNING:
         return
     if row >= 0:
-        _store_result(row, env, episodes_out, penalty_sums_out, rewards, queue_out)
+        queue_out.outcome[row] = episodes_out.outcome[env]
+        queue_out.invalidity[row] = episodes_out.invalidity[env]
+        queue_out.steps[row] = episodes_out.steps[env]
+        queue_out.final_pose[row] = episodes_out.final_pose[env]
+        for k in range(penalty_sums_out.shape[1]):
+            queue_out.penalty_sums[row, k] = penalty_sums_out[env, k]
+        if queue_out.reward.shape[0] > 0:
+            queue_out.reward[row] = rewards.total[env]
+        wp.atomic_add(queue_out.num_ended, row // queue_out.num_replicas, 1)
     row = _take_next(queue_out)
     queue_out.episode_of_env[env] = row
     if row < 0:
@@ -190,36 +183,6 @@ def highest_ground(terrain: Terrain, t: int, centre: wp.vec2, half: wp.vec2) -> 
     return highest
 
 
-@wp.func
-def _write_start(
-    rng: wp.uint32, terrain: Terrain, t: int, ranges: StartRanges, sensors: Sensors, env: int,
-    joint_q_out: wp.array2d[float], joint_qd_out: wp.array2d[float],
-):  # fmt: skip
-    """Write the joint coordinates and velocities of a start drawn from ``rng`` (base velocity: at the link origin)."""
-    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    if ranges.ahead > 0.0:  # else no number is drawn, and starts are those of a crossing
-        x += ranges.ahead * wp.randf(rng)
-    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
-    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
-    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
-    joint_q_out[env, 0] = x
-    joint_q_out[env, 1] = y
-    joint_q_out[env, 2] = ranges.base_height + highest_ground(terrain, t, wp.vec2(x, y), ranges.footprint)
-    for k in range(4):
-        joint_q_out[env, 3 + k] = rotation[k]
-    for j in range(sensors.default_joint_pos.shape[0]):
-        scale = 1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0)
-        joint_q_out[env, 7 + j] = sensors.default_joint_pos[j] * scale
-        joint_qd_out[env, 6 + j] = 0.0
-    v = ranges.velocity_range
-    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
-    com_velocity = velocity_beside(lin_vel, ang_vel, rotation, sensors.base_com)
-    for k in range(3):
-        joint_qd_out[env, k] = com_velocity[k]
-        joint_qd_out[env, 3 + k] = ang_vel[k]
-
-
 @kernel_over("mask")
 def restart_episodes(
     mask: wp.array[int],
@@ -227,25 +190,45 @@ def restart_episodes(
     terrain: Terrain,
     ranges: StartRanges,
     sensors: Sensors,
-    joint_q_out: wp.array2d[float],
-    joint_qd_out: wp.array2d[float],
-    last_action_out: wp.array2d[float],
+    step_out: RobotStep,
     episodes_out: Episodes,
     rewards_out: Rewards,
 ):
     """Grid (num_envs,): put robots at a new randomised start where the mask is not 0, and clear their memory.
 
-    Starts are drawn from ``rng`` of the episodes, which run from then on. ``rewards_out`` is empty where nothing is
-    rewarded.
+    Starts are drawn from ``rng`` of the episodes, which run from then on; base velocities are those of the link's
+    origin. ``rewards_out`` is empty where nothing is rewarded.
     """
     env = wp.tid()
     if mask[env] == 0:
         return
-    _write_start(episodes_out.rng[env], terrain, terrain_of_env[env], ranges, sensors, env, joint_q_out, joint_qd_out)
-    episodes_out.start[env] = wp.vec2(joint_q_out[env, 0], joint_q_out[env, 1])
+    rng = wp.uint32(episodes_out.rng[env])
+    x = ranges.position[0] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    if ranges.ahead > 0.0:  # else no number is drawn, and starts are those of a crossing
+        x += ranges.ahead * wp.randf(rng)
+    y = ranges.position[1] + ranges.position_range * wp.randf(rng, -1.0, 1.0)
+    half_yaw = 0.5 * ranges.yaw_range * wp.randf(rng, -1.0, 1.0)
+    rotation = wp.quat(0.0, 0.0, wp.sin(half_yaw), wp.cos(half_yaw))
+    ground = highest_ground(terrain, terrain_of_env[env], wp.vec2(x, y), ranges.footprint)
+    episodes_out.start[env] = wp.vec2(x, y)
+    step_out.joint_q[env, 0] = x
+    step_out.joint_q[env, 1] = y
+    step_out.joint_q[env, 2] = ranges.base_height + ground
+    for k in range(4):
+        step_out.joint_q[env, 3 + k] = rotation[k]
+    for j in range(sensors.default_joint_pos.shape[0]):
+        scale = 1.0 + ranges.joint_scale_range * wp.randf(rng, -1.0, 1.0)
+        step_out.joint_q[env, 7 + j] = sensors.default_joint_pos[j] * scale
+        step_out.joint_qd[env, 6 + j] = 0.0
+        step_out.action[env, j] = 0.0
+    v = ranges.velocity_range
+    lin_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    ang_vel = wp.vec3(wp.randf(rng, -v, v), wp.randf(rng, -v, v), wp.randf(rng, -v, v))
+    com_velocity = velocity_beside(lin_vel, ang_vel, rotation, step_out.base_com)
+    for k in range(3):
+        step_out.joint_qd[env, k] = com_velocity[k]
+        step_out.joint_qd[env, 3 + k] = ang_vel[k]
     begin_episode(env, episodes_out)
-    for j in range(last_action_out.shape[1]):
-        last_action_out[env, j] = 0.0
     if rewards_out.total.shape[0] == 0:
         return
     rewards_out.running[env] = 1

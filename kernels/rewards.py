@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from kernels.episode import Outcome
-from kernels.launch import kernel_over, make_zeros
+from kernels.launch import kernel_over, make_struct, make_zeros
 from kernels.penalties import COLLISION_FORCE, FOOT, LIMB, excess_contact_force, is_stumbling
 from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b, projected_gravity
 
@@ -82,7 +82,7 @@ def _shall_stand(motion: Motion, env: int) -> bool:
 @_term
 def tracking_lin_vel(motion: Motion, rewards: Rewards, env: int) -> float:
     """``exp(-|v_xy - v_xy,cmd|^2 / 0.25)``, base frame."""
-    velocity = base_lin_vel_b(motion.step.joint_q, motion.step.joint_qd, motion.step.base_com, env)
+    velocity = base_lin_vel_b(motion.step, env)
     error = wp.vec2(motion.step.command[env, 0] - velocity[0], motion.step.command[env, 1] - velocity[1])
     return wp.exp(-wp.length_sq(error) / TRACKING_VARIANCE)
 
@@ -97,7 +97,7 @@ def tracking_ang_vel(motion: Motion, rewards: Rewards, env: int) -> float:
 @_term
 def lin_vel_z(motion: Motion, rewards: Rewards, env: int) -> float:
     """Square of the base's velocity along its own z axis [m^2/s^2]."""
-    velocity = base_lin_vel_b(motion.step.joint_q, motion.step.joint_qd, motion.step.base_com, env)
+    velocity = base_lin_vel_b(motion.step, env)
     return velocity[2] * velocity[2]
 
 
@@ -246,12 +246,13 @@ class RewardWeights:
 
 def make_weights(weights: dict[str, float], *, only_positive: bool, falls: Collection[Outcome]) -> RewardWeights:
     """A kernel argument of weights of :data:`REWARDS` per second by name; ``falls`` cost ``termination``, unclipped."""
-    packed = RewardWeights()
-    packed.terms = _TermWeights(*(weights[name] for name in _TERMS))
-    packed.termination = weights["termination"]
-    packed.falls = sum(1 << outcome for outcome in falls)
-    packed.only_positive = int(only_positive)
-    return packed
+    return make_struct(
+        RewardWeights,
+        terms=_TermWeights(*(weights[name] for name in _TERMS)),
+        termination=weights["termination"],
+        falls=sum(1 << outcome for outcome in falls),
+        only_positive=int(only_positive),
+    )
 
 
 def make_rewards(num_envs: int, num_joints: int, num_geoms: int, device: str | None = None) -> Rewards:

@@ -61,18 +61,16 @@ def base_yaw(joint_q: wp.array2d[float], env: int) -> float:
 @wp.func
 def base_ang_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], env: int) -> wp.vec3:
     """Angular velocity of the base in its own frame [rad/s]."""
-    return wp.quat_rotate_inv(
-        base_rotation(joint_q, env), wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
-    )
+    rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
+    return wp.quat_rotate_inv(base_rotation(joint_q, env), rate)
 
 
 @wp.func
-def base_lin_vel_b(joint_q: wp.array2d[float], joint_qd: wp.array2d[float], base_com: wp.vec3, env: int) -> wp.vec3:
-    """Velocity of the base link's origin in the base frame [m/s]; ``base_com`` is the mass centre in that frame [m]."""
-    com_velocity = wp.quat_rotate_inv(
-        base_rotation(joint_q, env), wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
-    )
-    return com_velocity - wp.cross(base_ang_vel_b(joint_q, joint_qd, env), base_com)
+def base_lin_vel_b(step: RobotStep, env: int) -> wp.vec3:
+    """Velocity of the base link's origin in the base frame [m/s]."""
+    velocity = wp.vec3(step.joint_qd[env, 0], step.joint_qd[env, 1], step.joint_qd[env, 2])
+    com_velocity = wp.quat_rotate_inv(base_rotation(step.joint_q, env), velocity)
+    return com_velocity - wp.cross(base_ang_vel_b(step.joint_q, step.joint_qd, env), step.base_com)
 
 
 @wp.func

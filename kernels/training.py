@@ -105,7 +105,7 @@ def record_steps(step: RobotStep, rules: Rules, episodes: Episodes, rewards: Rew
     if (step.overflow[env] & rules.overflow_mask) != 0:
         training_out.statistics[env, wp.static(_COLUMN["overflow"])] += 1.0
     if outcome != Outcome.INVALID:
-        lin_vel = base_lin_vel_b(step.joint_q, step.joint_qd, step.base_com, env)
+        lin_vel = base_lin_vel_b(step, env)
         ang_vel = base_ang_vel_b(step.joint_q, step.joint_qd, env)
         error = wp.vec2(lin_vel[0] - training_out.command[env, 0], lin_vel[1] - training_out.command[env, 1])
         training_out.statistics[env, wp.static(_COLUMN["lin_vel_error"])] += wp.length(error)

@@ -186,12 +186,9 @@ class Simulation:
         self.joint_torque = self.solver.mjw_data.qfrc_actuator
         self.overflow = self.solver.mjw_data.overflow
         self.base_com = wp.vec3(*self.model.body_com.numpy()[0])
-        scan = dict(zip(("scan_x", "scan_y"), robot.scan_points(), strict=True))
-        arrays = {
-            name: wp.array(row, dtype=float)
-            for name, row in {**scan, "default_joint_pos": robot.default_joint_pos}.items()
-        }
-        self.sensors = make_struct(Sensors, self, **arrays)
+        scan_x, scan_y = robot.scan_points()
+        arrays = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
+        self.sensors = make_struct(Sensors, **{name: wp.array(row, dtype=float) for name, row in arrays.items()})
         # Columns of joints, bodies and targets in mujoco_warp's data, the same for all robots.
         solver: Any = self.solver
         columns = solver.mj_q_start.numpy()[1 : 1 + robot.num_joints]  # the first is the base's
@@ -254,8 +251,8 @@ class Simulation:
 
         Robots stand at new starts, and nothing is remembered of the episode before: its action, rewards, solver.
         """
-        state = (self.joint_q, self.joint_qd, step.action, episodes, rewards)
-        restart_episodes(mask, self.terrain_of_env, self.bank.terrain, ranges, self.sensors, *state)
+        where = (self.terrain_of_env, self.bank.terrain)
+        restart_episodes(mask, *where, ranges, self.sensors, step, episodes, rewards)
         self.clear_solver(mask)
         self.begin_conditions(mask)
 
@@ -267,8 +264,8 @@ class Simulation:
         By the conditions of their terrains they are pushed, and what they observe is disturbed. Episodes count steps of
         ``dt`` [s]. Noise is drawn from ``noise_seed``, (1,), and the environment's index.
         """
-        state = (self.joint_q, self.joint_qd, step.command, step.action, self.terrain_of_env)
-        write_observation(*state, self.bank.terrain, self.sensors, noise, noise_seed, observation)
+        where = (self.terrain_of_env, self.bank.terrain)
+        write_observation(step, *where, self.sensors, noise, noise_seed, observation)
         self.disturb(episodes, dt, observation)
 
     def begin_conditions(self, begins: Any) -> None:

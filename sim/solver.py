@@ -94,21 +94,7 @@ def _read_model(m: Any) -> SimpleNamespace:
     return SimpleNamespace(**arrays)
 
 
-def _tree_sizes(m: Any) -> TreeSizes:
-    return TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
-
-
-def _solver_sizes(m: Any, contacts: Contacts) -> Sizes:
-    return Sizes(
-        dofs=m.nv,
-        contacts=contacts.shape.shape[1],
-        dimensions=max(3, int(m.nmaxcondim)),
-        inertia=m.M_colind.shape[0],
-        losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
-    )
-
-
-def is_supported(m: Any, contacts: Contacts) -> bool:
+def is_supported(m: Any) -> bool:
     """Whether :class:`Dynamics` supports this model: robots of joints and position actuators, and nothing else."""
     flags = types.DisableBit
     needed = flags.GRAVITY | flags.SPRING | flags.DAMPER | flags.ACTUATION | flags.CLAMPCTRL | flags.CONSTRAINT
@@ -131,8 +117,6 @@ def is_supported(m: Any, contacts: Contacts) -> bool:
         (m.actuator_trntype.numpy() != types.TrnType.JOINT).any() or (m.actuator_ctrlnum.numpy() != 1).any(),
         m.actuator_dyntype.numpy().any() or (m.actuator_gaintype.numpy() != types.GainType.FIXED).any(),
         (m.actuator_biastype.numpy() > types.BiasType.AFFINE).any(),
-        not fits_block(_tree_sizes(m).shared_floats, dynamics.LANES),
-        not fits_block(_solver_sizes(m, contacts).shared_floats, solver.LANES),
     )
     return not any(unsupported)
 
@@ -158,14 +142,16 @@ class Dynamics:
         tree: The model.
     """
 
-    def __init__(self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, parked: Any) -> None:
+    def __init__(
+        self, m: Any, d: Any, contacts: Contacts, surfaces: Surfaces, parked: Any, tree_sizes: TreeSizes, sizes: Sizes
+    ) -> None:
         """Use a model that :func:`is_supported`, and write the forces of ``contacts``.
 
         Worlds where the int ``parked`` (num_worlds,) is 2 are left out.
         """
         self.surfaces = surfaces
-        self._tree_sizes = _tree_sizes(m)
-        self._sizes = _solver_sizes(m, contacts)
+        self._tree_sizes = tree_sizes
+        self._sizes = sizes
         self._num_worlds = d.nworld
         order, levels = _levels(m)
         actuator = np.full(m.nv, -1, np.int32)
@@ -259,6 +245,15 @@ def make_dynamics(
     shapes, (num_shapes,), the same in all worlds, and ``ground`` is the ground's.
     """
     surfaces = mix_surfaces(m, geoms, ground)
-    if is_supported(m, contacts):
-        return Dynamics(m, d, contacts, surfaces, parked)
+    tree = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
+    sizes = Sizes(
+        dofs=m.nv,
+        contacts=contacts.shape.shape[1],
+        dimensions=max(3, int(m.nmaxcondim)),
+        inertia=m.M_colind.shape[0],
+        losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
+    )
+    fits = fits_block(tree.shared_floats, dynamics.LANES) and fits_block(sizes.shared_floats, solver.LANES)
+    if fits and is_supported(m):
+        return Dynamics(m, d, contacts, surfaces, parked, tree, sizes)
     return StockDynamics(m, d, contacts, surfaces, ground)

@@ -12,11 +12,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.episode import Invalidity, Outcome, make_episodes
-from kernels.launch import make_struct
+from kernels.launch import make_struct, make_zeros
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES, penalty_columns
 from kernels.queue import restart_episodes
 from kernels.rewards import Rewards
+from kernels.state import RobotStep
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
@@ -60,16 +61,17 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     bank.set_heights(heights[None])
     base_com = _base_com(robot)
     with wp.ScopedDevice(device):
-        default = wp.array(robot.default_joint_pos, dtype=float)
-        sensors = make_struct(Sensors, base_com=base_com, default_joint_pos=default)
-        joint_q, joint_qd, action = (wp.zeros((count, width + robot.num_joints), dtype=float) for width in (7, 6, 0))
+        sensors = make_struct(Sensors, default_joint_pos=wp.array(robot.default_joint_pos, dtype=float))
+        widths = {"joint_q": 7, "joint_qd": 6, "action": 0}
+        shapes = {name: (count, width + robot.num_joints) for name, width in widths.items()}
+        step = make_zeros(RobotStep, device, **shapes)
+        step.base_com = base_com
         episodes = make_episodes(count)
         signed = int(np.uint32(seed).astype(np.int32))  # as a kernel takes it
         episodes.rng.assign(np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32))
         where = (wp.ones(count, dtype=int), wp.zeros(count, dtype=int), bank.terrain)  # all robots, on the one terrain
-        how = (make_start_ranges(CrossingCfg(), robot), sensors)
-        restart_episodes(*where, *how, joint_q, joint_qd, action, episodes, Rewards())
-    return to_mujoco(joint_q.numpy(), joint_qd.numpy(), base_com.astype(np.float32))
+        restart_episodes(*where, make_start_ranges(CrossingCfg(), robot), sensors, step, episodes, Rewards())
+    return to_mujoco(step.joint_q.numpy(), step.joint_qd.numpy(), base_com.astype(np.float32))
 
 
 class EpisodeStates:

@@ -220,8 +220,18 @@ def _observation_case(scene: Scene) -> Case:
     sim = scene.rollout.sim
     out = wp.zeros((scene.num_envs, scene.rollout.robot.observation_size), dtype=float)
     seed = wp.zeros(1, dtype=int)
-    state = (sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env)
-    arrays = (*state, sim.bank.heights, sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos)
+    step = sim.make_step(scene.command, scene.last_action)
+    arrays = (
+        sim.joint_q,
+        sim.joint_qd,
+        scene.command,
+        scene.last_action,
+        sim.terrain_of_env,
+        sim.bank.heights,
+        sim.sensors.scan_x,
+        sim.sensors.scan_y,
+        sim.sensors.default_joint_pos,
+    )
     tensors = [wp.to_torch(array) for array in arrays]
 
     def constant(*values: float) -> torch.Tensor:
@@ -235,10 +245,10 @@ def _observation_case(scene: Scene) -> Case:
     flops = scene.num_envs * (22 * points + 100 + 3 * joints)
     return Case(
         name="observation",
-        launch=lambda: write_observation(*state, sim.bank.terrain, sim.sensors, Noise(), seed, out),
+        launch=lambda: write_observation(step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, Noise(), seed, out),
         output=out,
         counterpart=counterparts.observation,
-        arguments=(*tensors, constant(*sim.sensors.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
+        arguments=(*tensors, constant(*sim.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
         work=Work(bytes=FLOAT * scene.num_envs * values, flops=flops),
         atol=5e-4,
         rtol=1e-5,
@@ -252,7 +262,7 @@ def _penalties_case(scene: Scene) -> Case:
     roles = sim.geom_role.numpy()
     joint_q, joint_qd, command, force = map(wp.to_torch, (sim.joint_q, sim.joint_qd, scene.command, sim.geom_force))
     feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
-    base_com = torch.tensor(list(sim.sensors.base_com), dtype=torch.float32, device=force.device)
+    base_com = torch.tensor(list(sim.base_com), dtype=torch.float32, device=force.device)
     limits = (robot.contact_force_limit, robot.physics_dt)
     step = sim.make_step(scene.command, scene.last_action)
     columns = penalty_columns(counterparts.PENALTIES)

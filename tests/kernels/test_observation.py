@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.observation import Noise, Sensors, apply_action, write_observation
+from kernels.state import RobotStep
 from sim.mujoco_c.model import observations, to_mujoco
 from tests.kernels.states import filled, make_terrain, random_states, rough, upright
 
@@ -14,15 +15,17 @@ BASE_COM = (-0.02, 0.01, 0.03)
 def make_sensors(num_joints, scan):
     x, y = np.reshape(scan, (-1, 2)).T
     default = np.linspace(-0.5, 0.5, num_joints)
-    return filled(Sensors, default_joint_pos=default, scan_x=x, scan_y=y, base_com=BASE_COM)
+    return filled(Sensors, default_joint_pos=default, scan_x=x, scan_y=y)
 
 
 def observe(states, command, last_action, terrain_of_env, grids, scan):
     num_envs, num_joints = np.shape(last_action)
     out = wp.zeros((num_envs, 12 + 3 * num_joints + len(scan)), dtype=float)
-    arrays = [wp.array(np.float32(array)) for array in (*states, command, last_action)]
-    on, sensors = wp.array(terrain_of_env, dtype=int), make_sensors(num_joints, scan)
-    write_observation(*arrays, on, make_terrain(grids), sensors, Noise(), wp.array([0], dtype=int), out)
+    names = ("joint_q", "joint_qd", "command", "action")
+    state = {name: np.float32(array) for name, array in zip(names, (*states, command, last_action), strict=True)}
+    on, seed = wp.array(terrain_of_env, dtype=int), wp.array([0], dtype=int)
+    step, sensors = filled(RobotStep, base_com=BASE_COM, **state), make_sensors(num_joints, scan)
+    write_observation(step, on, make_terrain(grids), sensors, Noise(), seed, out)
     return out.numpy()
 
 

@@ -8,6 +8,7 @@ from kernels.episode import Outcome, make_episodes
 from kernels.observation import Sensors
 from kernels.queue import clear_rows, make_queue, make_ready, restart_episodes, turn_over
 from kernels.rewards import Rewards, make_rewards
+from kernels.state import RobotStep
 from sim.crossing import CrossingCfg, make_start_ranges
 from tests.kernels import oracle
 from tests.kernels.states import filled, make_terrain, rough
@@ -72,21 +73,21 @@ def test_rows_are_taken_round_the_ring():
 def start(grids, replicas, anymal, outcome=None, rewards=None):
     """Joint coordinates and velocities and the episodes after a restart; all have ended unless ``outcome`` is given."""
     num_envs, joints = len(grids) * replicas, anymal.num_joints
-    q = wp.full((num_envs, 7 + joints), 3.0, dtype=float)
-    qd = wp.full((num_envs, 6 + joints), 3.0, dtype=float)
-    action = wp.full((num_envs, joints), 3.0, dtype=float)
+    widths = {"joint_q": 7 + joints, "joint_qd": 6 + joints, "action": joints}
+    step = filled(RobotStep, base_com=BASE_COM, **{n: np.full((num_envs, width), 3.0) for n, width in widths.items()})
     state = make_episodes(num_envs)
     state.steps.fill_(77)
     ended = np.full(num_envs, 1) if outcome is None else np.int32(outcome) != Outcome.RUNNING
     mask = wp.array(ended, dtype=int)
     terrain_of_env = wp.array(np.repeat(np.arange(len(grids)), replicas), dtype=int)
-    sensors = filled(Sensors, base_com=BASE_COM, default_joint_pos=anymal.default_joint_pos)
+    sensors = filled(Sensors, default_joint_pos=anymal.default_joint_pos)
     ranges = make_start_ranges(CrossingCfg(), anymal)
     state.rng.assign(np.random.default_rng(0).integers(2**32, size=num_envs, dtype=np.uint32))
     terrain = make_terrain(grids)
-    restart_episodes(mask, terrain_of_env, terrain, ranges, sensors, q, qd, action, state, rewards or Rewards())
-    assert (action.numpy() == np.where(q.numpy()[:, :1] == 3.0, 3.0, 0.0)).all()
-    return q.numpy(), qd.numpy(), state
+    restart_episodes(mask, terrain_of_env, terrain, ranges, sensors, step, state, rewards or Rewards())
+    q, qd, action = (getattr(step, name).numpy() for name in widths)
+    assert (action == np.where(q[:, :1] == 3.0, 3.0, 0.0)).all()
+    return q, qd, state
 
 
 def test_running_episodes_are_left_alone(anymal):

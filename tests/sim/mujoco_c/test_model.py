@@ -31,7 +31,7 @@ def test_starts_are_those_of_the_rollout(robot):
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=EPISODES, device="cpu")
     rollout.put(Terrains(genes=SUPER_GAUSSIAN.hard_random(1, 5), seeds=np.array([77], np.uint32)))
     sim = rollout.sim
-    expected = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.sensors.base_com))
+    expected = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.base_com))
     # Asking for more episodes does not change the first.
     starts = draw_starts(robot, sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
     np.testing.assert_array_equal(starts.qpos[:EPISODES], expected.qpos)
