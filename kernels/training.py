@@ -119,16 +119,6 @@ def _random_stream(counter: int, stream: int, num_envs: int, env: int) -> wp.uin
     return wp.rand_init(counter, -1 - (stream * num_envs + env))
 
 
-@wp.func
-def next_level(level: int, walked: float, commanded_speed: float, drawn: int, rules: Rules) -> int:
-    """Terrain level after an episode: up if it walked far, down if it lagged behind; past the last, the drawn one."""
-    if walked > rules.promotion_distance:
-        return wp.where(level + 1 < rules.num_levels, level + 1, drawn)
-    if walked < commanded_speed * rules.demotion_time_s:
-        return wp.max(level - 1, 0)
-    return level
-
-
 @kernel_over("terrain_of_env_out")
 def promote_episodes(
     joint_q: wp.array2d[float],
@@ -137,7 +127,10 @@ def promote_episodes(
     terrain_of_env_out: wp.array[int],
     training_out: TrainingState,
 ):
-    """Grid (num_envs,): move ended episodes up or down the levels by the distance walked; invalid ones stay."""
+    """Grid (num_envs,): move ended episodes a level up if they walked far, down if they lagged behind.
+
+    Past the last level follows a drawn one; invalid episodes stay.
+    """
     env = wp.tid()
     outcome = episodes.outcome[env]
     if outcome == Outcome.RUNNING:
@@ -148,7 +141,10 @@ def promote_episodes(
         drawn = wp.randi(rng, 0, rules.num_levels)
         walked = wp.length(wp.vec2(joint_q[env, 0], joint_q[env, 1]) - episodes.start[env])
         speed = wp.length(wp.vec2(training_out.command[env, 0], training_out.command[env, 1]))
-        level = next_level(level, walked, speed, drawn, rules)
+        if walked > rules.promotion_distance:
+            level = wp.where(level + 1 < rules.num_levels, level + 1, drawn)
+        elif walked < speed * rules.demotion_time_s:
+            level = wp.max(level - 1, 0)
     training_out.level[env] = level
     terrain_of_env_out[env] = level * rules.num_columns + training_out.column[env]
 
@@ -159,16 +155,6 @@ def seed_restarts(training: TrainingState, episodes_out: Episodes):
     env = wp.tid()
     num_envs = episodes_out.rng.shape[0]
     episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
-
-
-@wp.func
-def _draw_command(rng: wp.uint32, rules: Rules, env: int, training_out: TrainingState):
-    vx = wp.randf(rng, rules.lin_vel_x[0], rules.lin_vel_x[1])
-    vy = wp.randf(rng, rules.lin_vel_y[0], rules.lin_vel_y[1])
-    training_out.heading[env] = wp.randf(rng, -wp.pi, wp.pi)
-    moving = wp.where(wp.length(wp.vec2(vx, vy)) > rules.min_speed, 1.0, 0.0)
-    training_out.command[env, 0] = moving * vx
-    training_out.command[env, 1] = moving * vy
 
 
 @kernel_over("episodes.steps")
@@ -194,7 +180,13 @@ def command_episodes(
             training_out.command[env, k] = command[k]
     else:
         if episodes.steps[env] % rules.command_steps == 0:
-            _draw_command(_random_stream(counter, _STREAM_COMMAND, num_envs, env), rules, env, training_out)
+            drawn = _random_stream(counter, _STREAM_COMMAND, num_envs, env)
+            vx = wp.randf(drawn, rules.lin_vel_x[0], rules.lin_vel_x[1])
+            vy = wp.randf(drawn, rules.lin_vel_y[0], rules.lin_vel_y[1])
+            training_out.heading[env] = wp.randf(drawn, -wp.pi, wp.pi)
+            moving = wp.where(wp.length(wp.vec2(vx, vy)) > rules.min_speed, 1.0, 0.0)
+            training_out.command[env, 0] = moving * vx
+            training_out.command[env, 1] = moving * vy
         error = wrap_angle(training_out.heading[env] - base_yaw(joint_q, env))
         training_out.command[env, 2] = wp.clamp(task.yaw_gain * error, -task.max_yaw_rate, task.max_yaw_rate)
     if rules.push_steps == 0:

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -104,18 +104,6 @@ class RolloutResult:
         return replace(results[0], **changes)
 
 
-class Watcher(Protocol):
-    """Looks at a :class:`Rollout`'s arrays around every control step (:mod:`sim.recording.recorder`)."""
-
-    def before_step(self) -> None:
-        """Called before a control step: a robot that has just taken an episode stands at its start."""
-        ...
-
-    def after_step(self) -> None:
-        """Called after it, before robots whose episodes ended take the next."""
-        ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Lot:
     """Terrains that were put in together."""
@@ -146,6 +134,8 @@ class Rollout:
         episode: The episode that a robot runs: replica ``episode % replicas`` of terrain slot
             ``episode // replicas``, -1 for none; shape (num_envs,).
         outcome: :class:`kernels.episode.Outcome` of it, shape (num_envs,).
+        watch: Looks at these arrays before every control step (it is called with False), where a robot that has just
+            taken an episode stands at its start, and after it (True), before robots take the next.
     """
 
     def __init__(
@@ -180,6 +170,7 @@ class Rollout:
         self.replicas = replicas
         self.num_envs = min(num_envs or num_terrains * replicas, num_terrains * replicas)
         self.space = space
+        self.watch: Callable[[bool], None] | None = None
         self._with_ground = with_ground or bool(space.ground)
         self._with_conditions = with_conditions or bool(space.conditions)
         prepare_torch(device)
@@ -273,13 +264,7 @@ class Rollout:
         """Terrains that may be put in now."""
         return self.num_terrains - sum(lot.num_episodes for lot in self._lots) // self.replicas
 
-    def evaluate(
-        self,
-        terrains: Terrains,
-        *,
-        watcher: Watcher | None = None,
-        progress: Callable[[float], None] | None = None,
-    ) -> RolloutResult:
+    def evaluate(self, terrains: Terrains, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Run one crossing of every replica on every terrain, of at most ``num_terrains``; drops all pending lots.
 
         ``progress`` is called now and then with the share that is done.
@@ -287,10 +272,9 @@ class Rollout:
         self.clear()
         try:
             self.put(terrains)
-            return self.take(progress, watcher=watcher)
-        except BaseException:
+            return self.take(progress)
+        finally:
             self.clear()
-            raise
 
     def clear(self) -> None:
         """Drop all pending lots."""
@@ -345,26 +329,26 @@ class Rollout:
         if begin:
             self.sim.launch(self._turn_graph)
 
-    def control_step(self, watcher: Watcher | None = None) -> None:
+    def control_step(self) -> None:
         """Let the policy act, make the step, and let robots take the next episodes; waits for none of it."""
-        if watcher is not None:
-            watcher.before_step()
+        if self.watch is not None:
+            self.watch(False)
         self._policy()
         self.sim.launch(self._step_graph)
-        if watcher is not None:
-            watcher.after_step()
+        if self.watch is not None:
+            self.watch(True)
         self.sim.launch(self._turn_graph)
         self._step += 1
 
-    def _advance(self, watcher: Watcher | None = None) -> None:
+    def _advance(self) -> None:
         """Make the control steps up to the next look at what has ended."""
         poll = max(1, round(self.cfg.poll_every_s / self.robot.control_dt))
         since = self._step - self._began_at
         stop = min((since // every + 1) * every for every in (poll, self._max_episode_steps))
         for _ in range(stop - since):
-            self.control_step(watcher)
+            self.control_step()
 
-    def take(self, progress: Callable[[float], None] | None = None, *, watcher: Watcher | None = None) -> RolloutResult:
+    def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Wait for the terrains that were put in first, and return what came of their episodes.
 
         On a GPU what else is under way goes on without waiting. ``progress`` is called at every look with the share of
@@ -384,11 +368,11 @@ class Rollout:
             under_way = sum(other.num_episodes for other in self._lots) - self._num_unreleased
             if self._num_unreleased and sum(map(self._num_ended, self._lots)) == under_way:
                 self._release(begin=True)
-            self._advance(watcher)
+            self._advance()
         result = self._collect(lot)
         self._lots.popleft()
         going = any(self._num_ended(other) < other.num_episodes for other in self._lots)
-        if going and not self._num_unreleased and watcher is None:
+        if going and not self._num_unreleased:
             self._advance()
         return result
 

@@ -265,14 +265,10 @@ class MujocoC:
         for index, (grid, seed) in enumerate(zip(heights, terrains.seeds, strict=True)):
             starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)
             maps = None if ground is None else ground[index : index + 1]
-            chunks = [
-                cross_in_mujoco_c(
-                    self._robot, self._policy, grid, starts[first : first + _CHUNK],
-                    time_constant_s=self._time_constant_s, ground=maps,
-                )
-                for first in range(0, self._replicas, _CHUNK)
-            ]  # fmt: skip
-            results.append(RolloutResult.join(chunks, axis=1))
+            how = {"time_constant_s": self._time_constant_s, "ground": maps}
+            chunks = [starts[first : first + _CHUNK] for first in range(0, self._replicas, _CHUNK)]
+            crossed = [cross_in_mujoco_c(self._robot, self._policy, grid, chunk, **how) for chunk in chunks]
+            results.append(RolloutResult.join(crossed, axis=1))
             if progress is not None:
                 progress((index + 1) / len(heights))
         return RolloutResult.join(results)

@@ -134,7 +134,9 @@ class RolloutRecorder:
         self._num_frames = np.zeros(len(terrains) * self._rollout.replicas, dtype=np.int32)
         self._ended = np.zeros(len(self._num_frames), dtype=bool)
         self._frames: list[tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]] = []
-        result = self._rollout.evaluate(terrains, watcher=self, progress=progress)
+        self._rollout.watch = self._add_frames
+        result = self._rollout.evaluate(terrains, progress)
+        self._rollout.watch = None
         arrays: dict[str, NDArray[Any]] = {}
         for name, first in self._frames[0][2].items():
             fill, dtype = (False, np.bool_) if first.dtype == np.bool_ else (np.nan, np.float32)
@@ -153,13 +155,15 @@ class RolloutRecorder:
         )
         return replace(result, frames=frames)
 
-    def before_step(self) -> None:
-        """Add the present state of every robot on its way as a frame (:class:`sim.rollout.Watcher`)."""
-        self._add(np.flatnonzero(self._rollout.outcome.numpy() == Outcome.RUNNING), ended=False)
+    def _add_frames(self, stepped: bool) -> None:
+        """Add the present state of every robot on its way, or the last of every episode that ended.
 
-    def after_step(self) -> None:
-        """Add the last frame of every episode that ended; where a step broke the state, there is none."""
+        Where a step broke the state, there is no last one.
+        """
         outcome = self._rollout.outcome.numpy()
+        if not stepped:
+            self._add(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
+            return
         episode = self._rollout.episode.numpy()
         ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
         ended = ended[~self._ended[episode[ended]]]
