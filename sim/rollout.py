@@ -93,8 +93,7 @@ class RolloutResult:
         if len(results) == 1:
             return results[0]
         changes: dict[str, Any] = {
-            name: np.concatenate([getattr(result, name) for result in results], axis=axis)
-            for name in results[0].arrays
+            name: np.concatenate([getattr(result, name) for result in results], axis=axis) for name in results[0].arrays
         }
         if results[0].frames is not None:
             changes["frames"] = Frames.join([result.frames for result in results if result.frames is not None])

@@ -121,12 +121,10 @@ class Ranking(Evaluation):
 
     def by_cause(self) -> dict[str, NDArray[np.int64]]:
         """Rows of the failing elites by cause, the worst first; the commonest cause first, the unclear last."""
-        rows: dict[str, list[int]] = {}
-        for row in self.by_severity().tolist():
-            if self.causes[row]:
-                rows.setdefault(self.causes[row], []).append(row)
-        commonest = sorted(rows, key=lambda cause: (cause == UNCLEAR, -len(rows[cause])))
-        return {cause: np.array(rows[cause], np.int64) for cause in commonest}
+        severity = self.by_severity()
+        causes = np.array(self.causes)[severity]
+        rows = {cause: severity[causes == cause] for cause in dict.fromkeys(causes.tolist()) if cause}
+        return dict(sorted(rows.items(), key=lambda pair: (pair[0] == UNCLEAR, -len(pair[1]))))
 
     def by_severity(self) -> NDArray[np.int64]:
         """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
@@ -189,17 +187,15 @@ def rank(
     archive = archive.rows(chosen)
     families = find_families(archive.genes, space) if archive.family is None else archive.family
     causes = find_failing_causes(archive, space, half_width) if archive.cause is None else archive.cause
-    entries = [] if minima is None else minima.numbers["elites"]
+    entries = minima.numbers["elites"] if minima else []
     minimal_causes = {entry["elite"]: entry["cause"]["kind"] for entry in entries if entry["cause"]}
+    known = zip(chosen.tolist(), causes.tolist(), strict=True)
     ranking = Ranking(
         **values,
         numbers=chosen,
         is_fresh=is_fresh[chosen],
         verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
-        causes=tuple(
-            minimal_causes.get(number, cause) if cause else ""
-            for number, cause in zip(chosen.tolist(), causes.tolist(), strict=True)
-        ),
+        causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
     )
     worst_first = dict.fromkeys(families[ranking.by_severity()].tolist())
@@ -210,12 +206,11 @@ def rank(
 def best_values(archive: Archive) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
     """The evaluation of each elite by fresh episodes where valid ones exist, else as found, and where they do."""
     values = {field.name: np.asarray(getattr(archive, field.name)) for field in fields(Evaluation)}
-    fresh = archive.fresh
-    if fresh is None:
+    if archive.fresh is None:
         return values, np.zeros(len(archive), bool)
-    is_fresh = fresh.valid
+    is_fresh = archive.fresh.valid
     for name, value in values.items():
-        values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(fresh, name), value)
+        values[name] = np.where(is_fresh.reshape(-1, *[1] * (value.ndim - 1)), getattr(archive.fresh, name), value)
     return values, is_fresh
 
 
@@ -256,7 +251,6 @@ def summarise_search(ranking: Ranking, archive: Archive) -> str:
     failing = int(ranking.failing.sum())
     commonest = next(iter(ranking.by_cause()), UNCLEAR)
     cause = describe_commonest(commonest) if failing > 1 else f"cause: {commonest}"
-    return TEMPLATES.get_template("summary.txt").render(
-        count=len(ranking), failing=failing, cause="" if commonest == UNCLEAR else cause,
-        asked=failing and archive.certifiers, faults=count_faults(archive), certified=archive.certified.sum(),
-    )  # fmt: skip
+    judged = {"asked": failing and archive.certifiers, "certified": archive.certified.sum()}
+    counts = {"count": len(ranking), "failing": failing, "faults": count_faults(archive), **judged}
+    return TEMPLATES.get_template("summary.txt").render(cause="" if commonest == UNCLEAR else cause, **counts)

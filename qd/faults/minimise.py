@@ -72,8 +72,7 @@ def minimise(
             for row, n in enumerate(numbers)
         }
         genes = dict(zip(numbers, elites.genes, strict=True))
-        stored = read_minimal(run, archive)
-        if stored is not None:
+        if stored := read_minimal(run, archive):
             entries = {entry["elite"]: entry for entry in stored.numbers["elites"]} | entries
             genes = stored.genes | genes
         if not entries:
@@ -91,15 +90,14 @@ def _write(
 ) -> MinimalTerrains:
     """Writes numbers, genes and figure of all minimal terrains of a run."""
     search = judging.search
-    numbers = sorted(entries)
-    ordered = [entries[number] for number in numbers]
+    ordered = [entries[number] for number in sorted(entries)]
+    genes = {number: genes[number] for number in sorted(entries)}
     space = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
     content = {**judging.origin, **space, **_totals(ordered), "elites": ordered}
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}
-    arrays |= {"elite": np.array(numbers), "genes": np.array([genes[number] for number in numbers])}
+    arrays |= {"elite": np.array([*genes]), "genes": np.array([*genes.values()])}
     write_atomically(search.run / MINIMAL_FILE, npz_bytes(arrays))
     write_atomically(search.run / MINIMAL_NUMBERS_FILE, to_json(content))
-    genes = {number: genes[number] for number in numbers}
     save_figure(search.run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, search.space))
     return MinimalTerrains(numbers=content, genes=genes)
 

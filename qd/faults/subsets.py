@@ -152,19 +152,16 @@ def _greedy(case: Case) -> Steps:
     """A subset that fails, of which no part can be taken away."""
     while True:
         parts = case.whole
-        num_needed = 0
+        num_needed = 0  # of the parts since one was taken away the last time
         for part in cycle(case.parts):
-            if num_needed == len(parts):  # each is needed since one was taken away the last time
+            if num_needed == len(parts):
                 break
-            if part not in parts:
-                continue
-            rest = _rest(parts, part)
-            yield from _missing(case, case.best_trial(rest))
-            if case.fails(case.best_trial(rest)):
-                parts = rest
-                num_needed = 0
-            else:
-                num_needed += 1
+            if part in parts:
+                rest = _rest(parts, part)
+                yield from _missing(case, case.best_trial(rest))
+                is_needed = not case.fails(case.best_trial(rest))
+                num_needed = num_needed + 1 if is_needed else 0
+                parts = parts if is_needed else rest
         fresh = Trial(parts, fresh=True)
         yield from _missing(case, fresh)
         if case.fails(fresh) or parts == case.whole:

@@ -70,9 +70,8 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
     """
     if not all_ok:
         refuse_all_invalid(result)
-    words = explain_invalid(invalid_reasons(result), result.invalid.size)
-    if words is not None:
-        print(f"{label}: {words}", file=sys.stderr)
+    if text := explain_invalid(invalid_reasons(result), result.invalid.size):
+        print(f"{label}: {text}", file=sys.stderr)
 
 
 def find_flaw(result: Any, count: int, replicas: int) -> str | None:
@@ -84,15 +83,13 @@ def find_flaw(result: Any, count: int, replicas: int) -> str | None:
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
     shape = (count, replicas)
-    shapes = {name: value.shape for name, value in result.arrays.items()}
-    wrong = [f"{name} of shape {got}" for name, got in shapes.items() if got[:2] != shape]
-    if wrong:
+    if wrong := [f"{name} of shape {a.shape}" for name, a in result.arrays.items() if a.shape[:2] != shape]:
         return f"{', '.join(wrong)} for {count} terrains of {replicas} episodes"
-    penalties = result.penalties
     invalid = result.invalid
-    if penalties.shape != (*shape, len(result.penalty_names)):
-        return f"penalties of shape {penalties.shape}"
-    if not (np.isfinite(penalties[~invalid]) & (penalties[~invalid] >= 0.0)).all():
+    penalties = result.penalties[~invalid]
+    if result.penalties.shape != (*shape, len(result.penalty_names)):
+        return f"penalties of shape {result.penalties.shape}"
+    if not (np.isfinite(penalties) & (penalties >= 0.0)).all():
         return "valid episodes with penalties that are negative or not finite"
     if ((result.invalidity != 0) != invalid).any():
         return "invalid episodes without a reason, or valid ones with one"

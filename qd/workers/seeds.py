@@ -12,8 +12,7 @@ class Stream(IntEnum):
     SEARCH = 0
     FRESH = 1
     RECORDED_ELITE = 2
-    ABLATED_ELITES = 3
-    """Which elites ``results/make/ablation.py`` draws."""
+    ABLATED_ELITES = 3  # which results/make/ablation.py draws
     RECORDED_USER_TERRAIN = 4
     RESOLVED = 5
     OTHERS = 6
@@ -21,10 +20,8 @@ class Stream(IntEnum):
     VARIED = 8
     MINIMISED = 11
     MINIMISED_FRESH = 12
-    FRESH_AGAIN = 1001
-    """Of ``results/make/search_noise.py``."""
-    ABOUT_CONDITIONS = 2000
-    """Of ``results/make/conditions.py``."""
+    FRESH_AGAIN = 1001  # of results/make/search_noise.py
+    ABOUT_CONDITIONS = 2000  # of results/make/conditions.py
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = Stream.SEARCH) -> NDArray[np.uint32]:
