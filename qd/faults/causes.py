@@ -208,10 +208,7 @@ def _find_ground(genes: NDArray[np.float32], end: NDArray[np.floating], space: T
 
 
 def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
-    """The shape of a part, which adds heights [m] of shape (nrow, ncol), under a robot on the straight way.
-
-    ``half_width`` is that of the robot's stance [m].
-    """
+    """The shape of a part that adds heights [m], (nrow, ncol), under a robot of ``half_width`` [m] on its way."""
     heights = field.astype(np.float64)
     by_y, by_x = (np.gradient(heights, SPACING, axis=axis) for axis in (0, 1))
     ground, along, across = (_under(np.asarray(values), half_width) for values in (heights, by_x, by_y))

@@ -1,7 +1,7 @@
 """The elites of an archive by what is known best of each, in groups and in orders to show them in.
 
-Elites are grouped in two ways. Families: terrains that are much alike, so that they are not independent of each other.
-Causes: failing elites on which a part of the same kind stops the robot, such as a ridge.
+Families are terrains so much alike that they are not independent of each other. A cause groups failing elites on which
+parts of one kind stop the robot, such as ridges.
 """
 
 from collections.abc import Sequence
@@ -238,10 +238,8 @@ def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
 
 
 def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Root mean square distances of height maps [m], shape (T, num_nodes), to others, (N, num_nodes): shape (T, N).
-
-    They are double, since their squares are subtracted from each other.
-    """
+    """Root mean square distances of height maps [m], shape (T, num_nodes), to others, (N, num_nodes): shape (T, N)."""
+    # In double, since squares are subtracted from each other.
     squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
 

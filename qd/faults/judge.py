@@ -1,9 +1,8 @@
 """Judging: which elites of a search are faults of its controller.
 
-An elite is the best of many noisy evaluations and flatters itself; 40 fresh episodes do not. Those that fail by them
-are crossed with contact resolved, and by other controllers (:mod:`qd.faults.numbers` says what follows). Which episodes
-those are follows from the run's seed and from what names an elite. Crossings are kept in the run, so that a judging
-that was stopped finds them when it is run again.
+Elites that fail by fresh episodes are crossed with contact resolved and by other controllers: :mod:`qd.faults.numbers`
+says what follows. Episodes follow from the run's seed and from what names an elite. Crossings are kept in the run, so
+that a judging that was stopped finds them when it is run again.
 """
 
 from collections.abc import Mapping, Sequence

@@ -47,10 +47,7 @@ class Judging:
         return Terrains(genes=archive.genes[rows], seeds=seeds[rows], space=self.search.space)
 
     def count(self, policy: str, terrains: Terrains, label: str, **settings: Any) -> NDArray[np.int64]:
-        """Outcomes of terrains that a controller crosses, by default in 20 episodes each, shape (num_terrains, 4).
-
-        All else is as :meth:`qd.workers.crosser.Crosser.cross` takes it.
-        """
+        """Outcomes (num_terrains, 4) of a controller in 20 episodes each, or as :meth:`Crosser.cross` is told."""
         settings = {"replicas": EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
         return count_outcomes(self.crosser.cross(policy, terrains, **settings))
 
@@ -59,10 +56,9 @@ class Judging:
 def open_judging(
     search: Search, compute: Compute, certifiers: Mapping[str, str] | None, *, ask: bool
 ) -> Iterator[Judging]:
-    """Keeps other commands out of a search's run, and its crossings in it.
+    """Tries the controller, and certifiers if they are to be asked, and keeps other commands out of the search's run.
 
-    The controller is tried before, and the certifiers if they are to be asked; they are those of
-    :func:`qd.faults.searches.find_certifiers` if None.
+    Certifiers are those of :func:`qd.faults.searches.find_certifiers` if None. Crossings are kept in the run.
     """
     check_policy(search.policy, search.robot, compute.device)
     certifiers = find_certifiers(search) if certifiers is None else certifiers
@@ -195,10 +191,7 @@ class Others(Stage):
 
 
 class Varied(Stage):
-    """Crosses each fault under 20 draws of conditions, an episode each, by its controller and those that certify it.
-
-    They are draws of loads, motors, delays, noise and friction.
-    """
+    """Crosses faults under 20 draws of loads, motors, delays, noise and friction, by controller and certifiers."""
 
     name = "varied"
     asks_certifiers = True

@@ -1,7 +1,7 @@
 """Crossings and recordings on disk: arrays by key, in a folder of bounded size.
 
-A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored as
-soon as it is done, with a key for every terrain, and a terrain is found again in whatever lots.
+A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored when
+it is done, with a key for every terrain, and a terrain is read again in whatever lots.
 """
 
 import hashlib

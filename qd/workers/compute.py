@@ -1,7 +1,4 @@
-"""Where terrains are crossed: on which device, by how many workers, with how many robots at once; the Ray cluster.
-
-Ray takes seconds to load and need not be installed.
-"""
+"""Where terrains are crossed: device, workers and robots at once; and the Ray cluster, which takes seconds to load."""
 
 import importlib
 import logging

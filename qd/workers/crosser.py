@@ -37,10 +37,7 @@ _MUJOCO_C_LOT = 4  # terrains of a process
 
 @contextmanager
 def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterator[Pipeline]:
-    """Opens what crosses terrains, in as many processes as there is work for or on a Ray cluster, until the end.
-
-    ``build`` makes each worker's simulator.
-    """
+    """Opens what crosses terrains, in processes or on a Ray cluster, until the end; ``build`` makes simulators."""
     if cfg.on_ray:
         with importlib.import_module("qd.workers.ray_workers").open_ray_workers(cfg, build) as workers:
             yield workers
@@ -60,9 +57,9 @@ def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterat
 
 
 class Crosser(ExitStack):
-    """Lets controllers of a robot cross terrains; a simulation stays open for calls that agree in all but the terrains.
+    """Lets controllers of a robot cross terrains, and stores what is done in the folder ``cache``, if there is one.
 
-    Crossings that are done are stored in the folder ``cache``, if there is one.
+    A simulation stays open for calls that agree in all but the terrains.
     """
 
     def __init__(self, robot: RobotCfg | str, compute: Compute, *, cache: Path | None = None) -> None:
@@ -94,10 +91,8 @@ class Crosser(ExitStack):
         too; with ``record`` the result has frames, and is not stored. The progress bar shows ``label``, or ``progress``
         gets the share that is done. ``room`` are the terrains of the largest call to come that agrees with this one.
         Invalid episodes are reported on stderr where they are many; a result without a valid one is returned if
-        ``invalid_ok``.
-
-        The result has one row a terrain. Steps and time are those of the terrains that were not in the cache. MuJoCo C
-        does not say why an episode is invalid.
+        ``invalid_ok``. Steps and time of the result are those of the terrains that were not in the cache. MuJoCo C does
+        not say why an episode is invalid.
         """
         if replicas < 1 or engine not in get_args(Engine):
             raise ValueError(
@@ -188,10 +183,9 @@ def cross(
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
 ) -> dict[str, RolloutResult]:
-    """Lets each controller cross each terrain several times: one result a controller, by its name.
+    """Lets each controller cross each terrain: one result a controller, by its name.
 
-    Arguments are those of :class:`Crosser` and :meth:`Crosser.cross`; without ``compute`` the CPU crosses, by a process
-    a core.
+    All else is as :meth:`Crosser.cross` takes it; without ``compute`` the CPU crosses, by a process a core.
     """
     with Crosser(robot, compute or Compute(), cache=cache) as crosser:
         return {

@@ -64,10 +64,7 @@ def refuse_all_invalid(result: RolloutResult) -> None:
 
 
 def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -> None:
-    """Prints why episodes are invalid where over 5 % are, in a line that leaves progress bars whole.
-
-    If all of them are, that is an AllInvalidError, unless ``all_ok``.
-    """
+    """Prints why episodes are invalid where over 5 % are; if all are, that is an AllInvalidError unless ``all_ok``."""
     if not all_ok:
         refuse_all_invalid(result)
     if text := explain_invalid(invalid_reasons(result), result.invalid.size):

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.resource_tracker import ensure_running
-from typing import Any, NoReturn
+from typing import Any
 
 from sim.files.command import UserError, with_traceback
 
@@ -20,10 +20,7 @@ class EvaluatorError(UserError):
 
 
 class WorkerProcess:
-    """A process that has a simulation of its own, with room for ``num_terrains`` at once.
-
-    ``build``, a module-level function, is called in the process with ``cfg`` and ``num_terrains``.
-    """
+    """A process with a simulation, which ``build``, a module-level function, makes there for ``num_terrains``."""
 
     def __init__(self, num_terrains: int, build: Callable[[Any, int], Any], cfg: Any) -> None:
         context = multiprocessing.get_context("spawn")  # a fork of a process with threads and CUDA may hang
@@ -51,19 +48,16 @@ class WorkerProcess:
         try:
             message, value = self.connection.recv()
         except (EOFError, OSError):
-            self._raise_death()
+            self._process.join(timeout=5)
+            code = self._process.exitcode
+            reason = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
+            why = "out of memory?" if code == -signal.SIGKILL else "a crash in compiled code, of a controller's perhaps"
+            raise EvaluatorError(f"a worker process died ({reason}): {why}") from None
         if message == "refused":
             raise ValueError(value)
         if message == "failed":
             raise EvaluatorError(f"a worker process failed: {value}")
         return message, value
-
-    def _raise_death(self) -> NoReturn:
-        self._process.join(timeout=5)
-        code = self._process.exitcode
-        reason = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
-        why = "out of memory?" if code == -signal.SIGKILL else "a crash in compiled code, of a controller's perhaps"
-        raise EvaluatorError(f"a worker process died ({reason}): {why}") from None
 
     def stop(self) -> None:
         """Ends the process, whatever it does."""
@@ -79,18 +73,16 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
     inbox: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
     under_way = 0
 
-    def put_in(*, wait: bool) -> None:
+    def put_in() -> None:
         nonlocal under_way
-        while wait or not inbox.empty():
-            lot = inbox.get()
-            if lot is None:
+        while not under_way or not inbox.empty():
+            if (lot := inbox.get()) is None:
                 raise EOFError
             crosser.put(*lot)
             under_way += 1
-            wait = False
 
     def report(share: float) -> None:
-        put_in(wait=False)
+        put_in()
         connection.send(("progress", share))
 
     try:
@@ -101,7 +93,7 @@ def _serve(connection: Connection, cfg: Any, num_terrains: int, build: Callable[
         connection.send(("ready", None))
         threading.Thread(target=_read, args=(connection, inbox), daemon=True).start()
         while True:
-            put_in(wait=under_way == 0)
+            put_in()
             result = crosser.take(report)
             under_way -= 1
             connection.send(("result", result))

@@ -105,10 +105,7 @@ class _Shard:
 
 
 class RayWorkers(Pipeline):
-    """Evaluates terrains on Ray workers, one for each device that the cluster has or as many as asked for.
-
-    A worker that fails in any way is replaced, and its terrains are crossed again by another.
-    """
+    """Ray workers, one a device of the cluster or as many as asked for; others cross again what a failed one had."""
 
     def __init__(self, cfg: PipelineCfg, build: Build) -> None:
         super().__init__(cfg.num_terrains)

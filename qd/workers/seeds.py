@@ -25,9 +25,6 @@ class Stream(IntEnum):
 
 
 def episode_seeds(seed: int, iteration: int, count: int, *, stream: int = Stream.SEARCH) -> NDArray[np.uint32]:
-    """Seeds of the terrains of one evaluation, shape (count,); the same for the same numbers.
-
-    So a resumed search repeats nothing. Another ``stream`` shares no episodes with the search.
-    """
+    """Seeds of the terrains of an evaluation, shape (count,); another ``stream`` shares no episodes with the search."""
     sequence = np.random.SeedSequence([seed, iteration], spawn_key=(stream,) if stream else ())
     return sequence.generate_state(count, np.uint32).astype(np.uint32)

@@ -1,9 +1,9 @@
 """Searches over the stand-in evaluator, for tests of several files."""
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,7 +40,7 @@ CFG = SearchCfg(
 
 def run(path: Path, *, opener=open_stand_in, until=None, **changes) -> Archive:
     """A search, begun or gone on with, whose settings differ from CFG's by some."""
-    return search(dataclasses.replace(CFG, **changes), path, compute_by(opener), until=until)
+    return search(replace(CFG, **changes), path, compute_by(opener), until=until)
 
 
 def without_figures(patch: pytest.MonkeyPatch) -> None:

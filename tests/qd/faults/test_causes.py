@@ -1,6 +1,6 @@
 """Shapes of parts of terrains as a robot meets them, from surfaces whose slopes are known."""
 
-import dataclasses
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +45,7 @@ def test_a_ramp_by_hand():
     assert shape.slope_deg == shape.along_deg == pytest.approx(np.rad2deg(np.arctan(0.4)), abs=1e-3)
     assert shape.length_m == pytest.approx(5.5, abs=0.06)  # from half way up to half way down
     assert (shape.left_m, shape.right_m) == pytest.approx((4.05, 4.05))  # to beyond the edge of the grid
-    assert describe_cause(dataclasses.asdict(shape)) == "rise, 0.20 m high, 22 degrees steep"
+    assert describe_cause(asdict(shape)) == "rise, 0.20 m high, 22 degrees steep"
 
 
 DIP_BEFORE_A_WALL = np.where(X < 12, -0.2 * np.clip((X - 4) / 4, 0, 1), 0).astype(np.float32)
@@ -77,7 +77,7 @@ def test_kinds_and_whether_they_are_high_or_deep(field, kind, size):
     shape = measure_shape(field, HALF_WIDTH)
     assert shape.kind == kind
     size = f", {abs(shape.height_m):.2f} m {size}, {shape.slope_deg:.0f} degrees steep" if size else ""
-    assert describe_cause(dataclasses.asdict(shape)) == kind + size
+    assert describe_cause(asdict(shape)) == kind + size
 
 
 def test_every_kind_is_measured_described_and_documented():
@@ -118,8 +118,8 @@ def test_causes_depend_on_the_width_of_the_robot_that_was_searched(half_width, c
     genes = np.concatenate([beside, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 7])[None]
     ends = np.array([[8.0, 4.0]])
     assert find_causes(genes, ends, SUPER_GAUSSIAN, half_width) == [cause]
-    archive = dataclasses.replace(small_archive(1), genes=genes, end_position=ends, goal_rate=np.zeros(1))
-    archive = dataclasses.replace(archive, fresh=fresh_values(archive))
-    robot = dataclasses.replace(ROBOTS["anymal"], name="mine", footprint=(0.5, half_width))
+    archive = replace(small_archive(1), genes=genes, end_position=ends, goal_rate=np.zeros(1))
+    archive = replace(archive, fresh=fresh_values(archive))
+    robot = replace(ROBOTS["anymal"], name="mine", footprint=(0.5, half_width))
     search = Search(run=Path("run"), cfg=CFG, robot=robot, policy="", space=SUPER_GAUSSIAN)
     assert with_families(archive, search).cause.tolist() == [cause]

@@ -1,6 +1,6 @@
 """Elites in modes, families and orders: faults before costs, and no kind of failure twice among the first."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,8 +21,8 @@ def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid(
     elites = ranked(archive)
     assert not elites.is_fresh.any() and elites.numbers.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(elites.goal_rate, archive.goal_rate)
-    fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 40, 8, 0]))
-    corrected = ranked(dataclasses.replace(archive, fresh=fresh), judged=True)
+    fresh = replace(fresh_values(archive), invalid_episodes=np.array([0, 40, 8, 0]))
+    corrected = ranked(replace(archive, fresh=fresh), judged=True)
     assert corrected.is_fresh.all() and corrected.numbers.tolist() == [0, 2, 3]
     assert corrected.counted.tolist() == [40, 32, 40]
     np.testing.assert_array_equal(corrected.fitness, archive.fitness[[0, 2, 3]] / 2)
@@ -33,7 +33,7 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
     elites = ranked(judged_archive())
     assert elites.verdict.tolist() == [4, 3, 2, 1, 0]  # fault, confirmed, certified, failing, not failing
     assert elites.by_severity().tolist() == [0, 1, 2, 3, 4]
-    archive = dataclasses.replace(
+    archive = replace(
         small_archive(5),
         goal_rate=np.array([0.9, 0.1, 0.0, 0.0, 0.0]),
         collision_rate=np.array([0.0, 0.9, 0.2, 0.3, 0.3]),
@@ -47,13 +47,13 @@ def test_verdicts_come_before_rates_and_rates_before_fitness():
 
 def minima_with(causes):
     """Minimal terrains with causes of some kinds, by number of the elite."""
-    entries = [{"elite": number, "cause": cause and {"kind": cause}} for number, cause in causes.items()]
+    entries = [{"elite": number, "cause": cause and {"kind": cause}} for number, cause in enumerate(causes)]
     return MinimalTerrains(numbers={"elites": entries}, genes={})
 
 
 def six_elites(ends=(np.nan, np.nan)):
     """Six elites, worse from the first to the fifth, of which the third is a fault; the last is crossed."""
-    archive = dataclasses.replace(
+    archive = replace(
         small_archive(6),
         goal_rate=np.array([0.25, 0.0, 0.0, 0.0, 0.0, 0.75]),
         collision_rate=np.array([0.0, 0.5, 0.75, 0.75, 1.0, 0.25]),
@@ -61,12 +61,11 @@ def six_elites(ends=(np.nan, np.nan)):
         end_position=np.full((6, 2), ends, np.float32),
     )
     crossed = np.array([[0, 20, 0, 0], [20, 0, 0, 0]])[[0, 0, 1, 0, 0, 0]][:, None]
-    archive = dataclasses.replace(
+    archive = replace(
         archive, fresh=fresh_values(archive), resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",),
-        certifier_sha256=("a" * 64,), certifier_outcomes=crossed, certifier_resolved_outcomes=crossed,
+        certifier_sha256=("a" * 64,), certifier_outcomes=crossed, certifier_resolved_outcomes=crossed
     )  # fmt: skip
-    causes = {0: "ridge", 1: "drop", 2: "ridge", 3: "ridge", 4: None, 5: "ridge"}
-    return ranked(archive, minima_with(causes)), archive
+    return ranked(archive, minima_with(["ridge", "drop", "ridge", "ridge", None, "ridge"])), archive
 
 
 def test_an_elite_is_named_by_its_cause_and_ending():
@@ -80,7 +79,7 @@ def test_an_elite_is_named_by_its_cause_and_ending():
         "unclear: topples, 40 of 40",
         "crossed, 30 of 40",
     ]
-    lying = dataclasses.replace(ranking, fallen_rate=np.array([0.75] + 5 * [0.0]))  # standing until the time is over
+    lying = replace(ranking, fallen_rate=np.array([0.75] + 5 * [0.0]))  # standing until the time is over
     assert lying.name(0) == "ridge: topples, 30 of 40"
     outside, _ = six_elites((9.0, 10.01))
     assert outside.name(0) == "ridge: leaves the terrain, 30 of 40"
@@ -90,30 +89,24 @@ def test_causes_are_by_number_and_the_unclear_last():
     ranking, archive = six_elites()
     by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
     assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
-    summary, crosses = (
-        "5 of 6 terrains stop the robot; ridges are the commonest cause",
-        "another controller of this robot",
-    )
+    summary = "5 of 6 terrains stop the robot; ridges are the commonest cause"
+    crosses = "another controller of this robot"
     assert summarise_search(ranking, archive) == f"{summary}; 1 is a fault: {crosses} crosses it"
-    judged = dataclasses.replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
+    judged = replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
     assert summarise_search(ranking, judged) == f"{summary}; {crosses} crosses 1 of them"
-    alone = dataclasses.replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
+    alone = replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
     assert summarise_search(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
     one = alone.rows(np.array([0]))
     assert summarise_search(ranked(one), one) == "The only terrain stops the robot"
-    crossed = dataclasses.replace(alone, goal_rate=np.ones(6))
+    crossed = replace(alone, goal_rate=np.ones(6))
     assert summarise_search(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
-    bumps = (
-        bump(x=6.0, sigma_x=0.5, height=0.25),
-        bump(x=8.0, sigma_x=0.5, height=-0.2),
-        bump(x=10.0, sigma_x=1.5, height=-0.25),
-    )
-    genes = np.concatenate([*bumps, *[bump(x=8.0, sigma_x=0.5, height=0.0)] * 5])[None].repeat(4, axis=0)
+    shapes = [(6.0, 0.5, 0.25), (8.0, 0.5, -0.2), (10.0, 1.5, -0.25), *[(8.0, 0.5, 0.0)] * 5]
+    genes = np.concatenate([bump(x=x, sigma_x=sigma, height=height) for x, sigma, height in shapes])[None].repeat(4, 0)
     ends = np.array([[5.6, 4.0], [7.8, 4.0], [9.2, 4.0], [2.0, 4.0]], np.float32)
-    archive = dataclasses.replace(small_archive(4), genes=genes, goal_rate=np.zeros(4), end_position=ends)
+    archive = replace(small_archive(4), genes=genes, goal_rate=np.zeros(4), end_position=ends)
     assert ranked(archive).causes == ("ridge", "ditch", "drop", "unclear")
 
 
@@ -121,11 +114,11 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
     archive = small_archive(20)  # 6 stuck, 9 collided, 5 across
     genes = archive.genes.copy()
     genes[7] = genes[0] = genes[6]  # two collided and one stuck are the same terrain
-    archive = dataclasses.replace(
+    archive = replace(
         archive, genes=genes, goal_rate=np.array([*np.linspace(0.01, 0.06, 6), 0.0, 0.0, *[0.05] * 7, *[1.0] * 5]),
-        collision_rate=np.repeat([0.0, 1.0, 0.0], (6, 9, 5)), fallen_rate=np.zeros(20),
+        collision_rate=np.repeat([0.0, 1.0, 0.0], (6, 9, 5)), fallen_rate=np.zeros(20)
     )  # fmt: skip
-    ranking = ranked(archive, minima_with({n: "drop" if n < 6 else "ridge" for n in range(15)}))
+    ranking = ranked(archive, minima_with(["drop"] * 6 + ["ridge"] * 9))
     order = ranking.order()
     assert sorted(order.tolist()) == list(range(20))
     assert ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6

@@ -1,6 +1,6 @@
 """Faults in numbers and in words."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,8 +36,7 @@ def test_numbers_by_hand():
 
 @pytest.mark.parametrize(("certifiers", "expected"), [(("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))])
 def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expected):
-    archive = judged_archive()
-    archive = dataclasses.replace(archive, certifiers=certifiers)
+    archive = replace(judged_archive(), certifiers=certifiers)
     assert pick_numbers(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
 
 
@@ -53,17 +52,17 @@ def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
 def test_numbers_of_what_nobody_looked_at_are_none():
     archive, names = judged_archive(), ("failing", "certified", "confirmed", "faults_panel")
     assert pick_numbers(small_archive(), *names) == (None,) * 4
-    fresh_alone = dataclasses.replace(small_archive(5), fresh=archive.fresh)
+    fresh_alone = replace(small_archive(5), fresh=archive.fresh)
     assert pick_numbers(fresh_alone, *names) == (4, None, None, None)
-    fine = dataclasses.replace(fresh_alone, fresh=dataclasses.replace(archive.fresh, goal_rate=np.ones(5)))
+    fine = replace(fresh_alone, fresh=replace(archive.fresh, goal_rate=np.ones(5)))
     assert pick_numbers(fine, *names) == (0,) * 4
-    unresolved = dataclasses.replace(archive, resolved_outcomes=0 * archive.resolved_outcomes)
+    unresolved = replace(archive, resolved_outcomes=0 * archive.resolved_outcomes)
     assert pick_numbers(unresolved, *names) == (4, 2, None, None)
 
 
 def test_numbers_of_fresh_episodes_by_hand():
     archive = small_archive(3)
-    fresh = dataclasses.replace(
+    fresh = replace(
         fresh_values(archive),
         cell=np.array([0, 0, 5]),  # found in 0, 1 and 2
         fitness=np.array([1.0, 2.0, 4.0]),
@@ -83,9 +82,8 @@ def test_sentences_say_counts_and_verdicts():
     archive = judged_archive()
     texts = [describe_judgement(archive, number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
-    assert [("a fault" in text[-1], "not known" in text[-1]) for text in texts] == [
-        (True, False), (False, True), (False, False), (False, True), (False, False),
-    ]  # fmt: skip
+    assert ["a fault" in text[-1] for text in texts] == [True, False, False, False, False]
+    assert ["not known" in text[-1] for text in texts] == [False, True, False, True, False]
     assert "9 of 20 (45%, 26 to 66%)" in texts[0][0]
     assert describe_judgement(small_archive(5), 0) == []
 
@@ -105,6 +103,6 @@ def test_rates_and_certificates_of_an_elite():
 
 def test_fresh_episodes_of_an_elite_are_counted():
     archive = small_archive(3)
-    fresh = dataclasses.replace(fresh_values(archive), goal_rate=np.full(3, 0.1), collision_rate=np.full(3, 0.8))
+    fresh = replace(fresh_values(archive), goal_rate=np.full(3, 0.1), collision_rate=np.full(3, 0.8))
     # Of 40 episodes 10 % arrive and 80 % collide.
-    assert fresh_counts(dataclasses.replace(archive, fresh=fresh), 0).tolist() == [4, 32, 4, 0]
+    assert fresh_counts(replace(archive, fresh=fresh), 0).tolist() == [4, 32, 4, 0]

@@ -26,8 +26,8 @@ BOTH = pytest.mark.parametrize("how", ["exhaustive", "greedy"])
 
 
 def case(how="exhaustive", parts=range(8), scalable=True):
-    whole = tuple(parts)
-    return Case(parts=whole, how=how, scalable=scalable, counts={Trial(tuple(sorted(whole)), fresh=True): 2 * FAILS})
+    counts = {Trial(tuple(sorted(parts)), fresh=True): 2 * FAILS}
+    return Case(parts=tuple(parts), how=how, scalable=scalable, counts=counts)
 
 
 def solve(case, rule, crossed=None):
@@ -51,32 +51,22 @@ def two_and_five(trial):
 
 @BOTH
 def test_the_parts_that_are_needed_are_found_and_scaled(how):
-    minimal = solve(case(how), two_and_five)
-    assert minimal.minimal == (2, 5)
-    assert minimal.fresh.tolist() == [6, 34, 0, 0]
+    crossed = []
+    minimal = solve(case(how, parts=(7, 0, 5, 1, 2, 6, 3, 4)), two_and_five, crossed)
+    assert minimal.minimal == (2, 5) and minimal.fresh.tolist() == [6, 34, 0, 0]
     assert {part: counts.tolist() for part, counts in minimal.without.items()} == {2: [18, 2, 0, 0], 5: [18, 2, 0, 0]}
+    assert minimal.cause({2: 0.1, 5: 0.2}) == 5 and minimal.cause({2: 0.3, 5: 0.2}) == 2
     # .5 passes, .75 fails, .625 fails, .5625 and .59375 pass
     assert (minimal.scale, minimal.passing_scale) == (0.625, 0.59375)
-    assert sorted(scales(minimal)) == [0.5, 0.5625, 0.59375, 0.625, 0.75]
-    assert minimal.cause({2: 0.1, 5: 0.2}) == 5 and minimal.cause({2: 0.3, 5: 0.2}) == 2
-
-
-def test_subsets_are_crossed_from_the_smallest_on_all_of_a_size_at_once():
-    crossed = []
-    solve(case(), two_and_five, crossed)
-    # none, one of eight, two of eight; fresh episodes and scales one by one
-    assert [len(wanted) for wanted in crossed] == [1, 8, 28, 1, 1, 1, 1, 1, 1]
-    assert crossed[3] == [Trial((2, 5), fresh=True)] and crossed[4] == [Trial((2, 5), scale=0.5)]
-
-
-def test_greedy_crosses_each_part_once_and_what_is_left_once_more():
-    crossed = []
-    solve(case("greedy", parts=(7, 0, 5, 1, 2, 6, 3, 4)), two_and_five, crossed)
+    assert scales(minimal) == [0.5, 0.75, 0.625, 0.5625, 0.59375]
+    if how == "exhaustive":  # all of a size at once: none, one of eight, two of eight; the rest one by one
+        assert [len(wanted) for wanted in crossed] == [1, 8, 28, 1, 1, 1, 1, 1, 1]
+        assert crossed[3] == [Trial((2, 5), fresh=True)] and crossed[4] == [Trial((2, 5), scale=0.5)]
+        return
     subsets = [trial.parts for (trial,) in crossed if trial.scale == 1.0 and not trial.fresh]
     assert subsets[0] == tuple(range(7))  # without 7, which comes first
     # Eight, and 5 and 2 again without what was taken away after them.
-    assert len(subsets) == len(set(subsets)) == 10
-    assert set(subsets[-2:]) == {(2,), (5,)}
+    assert len(subsets) == len(set(subsets)) == 10 and set(subsets[-2:]) == {(2,), (5,)}
 
 
 @BOTH
@@ -150,6 +140,12 @@ def test_parts_go_from_the_lowest_under_the_robot_on(on_gpu, how):
     assert [(trial, counts.sum()) for trial, counts in case.counts.items()] == [(Trial((1, 4, 6), fresh=True), 40)]
 
 
+def take_all_apart(archive, cases, robots, space=SUPER_GAUSSIAN):
+    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
+    with Crosser(ROBOT, compute_by(robots)) as crosser:
+        take_apart(archive, cases, Judging(search=search, certifiers={}, crosser=crosser))
+
+
 @BOTH
 def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
     archive = small_archive(3)
@@ -160,12 +156,9 @@ def test_elites_are_taken_apart_together_each_with_its_own_episodes(how):
         whose = np.abs(archive.genes[:, None] - genes).sum(axis=2).argmin(axis=0)
         return (np.abs(genes[:, 7::8]) > 0.6 * np.abs(archive.genes[whose, 7::8]))[:, [2, 5]].all(axis=1)
 
-    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=SUPER_GAUSSIAN)
-
     def apart(numbers, robots):
         cases = {number: case(how) for number in numbers}
-        with Crosser(ROBOT, compute_by(robots)) as crosser:
-            take_apart(archive, cases, Judging(search=search, certifiers={}, crosser=crosser))
+        take_all_apart(archive, cases, robots)
         return cases
 
     together, alone = Robots(fails), Robots(fails)
@@ -195,9 +188,7 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
 
     case = open_case(archive, 0, space, 0.3, how, on_gpu=True)
     assert sorted(case.parts) == [3, 8, 10] and sorted(case.flat) == [8, 10]
-    search = Search(run=Path("run"), cfg=CFG, robot=ROBOT, policy=str(ROBOT.policy_file), space=space)
-    with Crosser(ROBOT, compute_by(Robots(fails))) as crosser:
-        take_apart(archive, {0: case}, Judging(search=search, certifiers={}, crosser=crosser))
+    take_all_apart(archive, {0: case}, Robots(fails), space)
     assert (case.minimal, case.scale) == ((3, 8), 0.625)
     effects = find_effects(genes[0], range(11), space)
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")

@@ -30,9 +30,10 @@ TERRAINS = Terrains(genes=GENES, seeds=SEEDS)
 
 
 def cross_all(
-    opened, cache=None, genes=GENES, seeds=SEEDS, *, replicas=20, policy=POLICY, space=SUPER_GAUSSIAN, **kwargs
-):
-    with Crosser(ROBOT, compute_by(opened, TWO_WORKERS), cache=cache) as crosser:
+    opened, cache=None, genes=GENES, seeds=SEEDS, *, robot=ROBOT, compute=TWO_WORKERS, replicas=20, policy=POLICY,
+    space=SUPER_GAUSSIAN, **kwargs
+):  # fmt: skip
+    with Crosser(robot, compute_by(opened, compute), cache=cache) as crosser:
         return crosser.cross(policy, Terrains(genes=genes, seeds=seeds, space=space), replicas=replicas, **kwargs)
 
 
@@ -63,41 +64,28 @@ def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_anoth
 CHANGES = [
     {"replicas": 10}, {"engine": "resolved"}, {"reward": True}, {"penalties_from_s": 1.0}, {"space": COURSE},
     {"policy": str(get_robot("cassie").policy_file)}, {"genes": -GENES}, {"seeds": SEEDS + np.uint32(100)},
+    {"robot": get_robot("cassie")}, {"compute": Compute("cuda")}, {}
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("change", CHANGES, ids=lambda change: next(iter(change)))
-def test_crossings_of_another_kind_are_not_found(tmp_path, change):
+@pytest.mark.parametrize("change", CHANGES, ids=lambda change: next(iter(change), "code"))
+def test_crossings_of_another_kind_or_by_other_code_are_not_found(tmp_path, monkeypatch, change):
     cross_all(Robots(), tmp_path)
+    if not change:
+        monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
     other = Robots()
     cross_all(other, tmp_path, **change)
     assert len(other.crossed) == len(GENES)
 
 
-def test_crossings_by_other_code_robot_or_kind_of_device_are_not_found(tmp_path, monkeypatch):
-    cross_all(Robots(), tmp_path)
-    for robot, compute in ((get_robot("cassie"), TWO_WORKERS), (ROBOT, Compute("cuda"))):
-        opened = Robots()
-        cross({"a": POLICY}, TERRAINS, robot=robot, compute=compute_by(opened, compute), replicas=20,
-              cache=tmp_path)  # fmt: skip
-        assert len(opened.crossed) == len(GENES)
-    monkeypatch.setattr(service, "code_fingerprint", lambda rooms: "of other code")
-    changed = Robots()
-    cross_all(changed, tmp_path)
-    assert len(changed.crossed) == len(GENES)
-
-
 def test_a_reward_of_other_weights_is_not_found_and_what_has_no_reward_is(tmp_path):
     training = replace(ROBOT.training, rewards=replace(ROBOT.training.rewards, tracking_lin_vel=7.0))
     heavier = replace(ROBOT, training=training)  # as a user edits them in the robot's own file
-    for reward, times in ((True, 2), (False, 1)):
-        crossed = []
-        for robot in (ROBOT, heavier, heavier):
-            opened = Robots()
-            cross({"a": POLICY}, TERRAINS, robot=robot, compute=compute_by(opened, TWO_WORKERS), replicas=20,
-                  cache=tmp_path / str(reward), reward=reward)  # fmt: skip
-            crossed.append(len(opened.crossed))
-        assert crossed == [len(GENES) if time < times else 0 for time in range(3)]
+    for reward, expected in ((True, [9, 9, 0]), (False, [9, 0, 0])):
+        every = [Robots(), Robots(), Robots()]
+        for opened, robot in zip(every, (ROBOT, heavier, heavier), strict=True):
+            cross_all(opened, tmp_path / str(reward), robot=robot, reward=reward)
+        assert [len(opened.crossed) for opened in every] == expected
 
 
 @pytest.mark.parametrize("damage", ["flip", "rename"])
@@ -122,12 +110,12 @@ def test_a_damaged_lot_is_crossed_again_and_said_in_a_line(tmp_path, capsys, dam
 
 
 def test_the_cache_removes_the_least_recently_used_file(tmp_path):
-    block = block_of(0)
+    block = draw_block(0)
     cache = Cache(tmp_path, max_bytes=25_000)
     for key in ("a", "b", "c"):
         cache.write(key, block)
-    for place, key in enumerate(("a", "b", "c")):
-        os.utime(cache.file(key), (place, place))
+    for second, key in enumerate(("a", "b", "c")):
+        os.utime(cache.file(key), (second, second))
     assert cache.read("a") is not None  # now b is the least recently used one
     reopened = Cache(tmp_path, max_bytes=25_000)
     assert all(reopened.read(key, ["values"]) for key in ("a", "b", "c"))  # looking through is no use
@@ -137,24 +125,22 @@ def test_the_cache_removes_the_least_recently_used_file(tmp_path):
     assert cache.keys() == ["e"]
 
 
-def block_of(number):
+def draw_block(number):
     return {"values": np.random.default_rng(number).random(1000)}  # 8 kB that cannot be packed
 
 
 def write_often(folder, number):
-    block = block_of(number)
     for count in range(40):
-        Cache(folder, max_bytes=20_000).write(f"key-{count % 4}", block)
+        Cache(folder, max_bytes=20_000).write(f"key-{count % 4}", draw_block(number))
 
 
 def test_processes_share_a_cache(tmp_path):
     with ProcessPoolExecutor(2) as pool:
-        for done in [pool.submit(write_often, tmp_path, number) for number in range(2)]:
-            done.result()
+        list(pool.map(write_often, [tmp_path] * 2, range(2)))
     cache = Cache(tmp_path)
     stored = [cache.read(key)["values"].tolist() for key in cache.keys("key")]
     assert len(stored) == 2  # of four, for which there is no room
-    assert all(block in [block_of(number)["values"].tolist() for number in range(2)] for block in stored)
+    assert all(block in [draw_block(number)["values"].tolist() for number in range(2)] for block in stored)
 
 
 def test_a_simulation_stays_open_for_calls_that_agree():

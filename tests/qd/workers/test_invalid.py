@@ -1,11 +1,13 @@
-"""What is said of invalid episodes, and the error where there is nothing else."""
+"""What is said of invalid episodes, the error where there is nothing else, and results that cannot be true."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from kernels.episode import Invalidity
-from qd.workers.invalid import AllInvalidError, explain_invalid, invalid_iterations, report_invalid
-from tests.qd.stand_in import make_result
+from kernels.episode import Invalidity, Outcome
+from qd.workers.invalid import AllInvalidError, explain_invalid, find_flaw, invalid_iterations, report_invalid
+from tests.qd.stand_in import evaluate, make_result
 
 FINE, ACTION, SPEED = Invalidity.NONE, Invalidity.ACTION, Invalidity.SPEED
 
@@ -44,3 +46,23 @@ def test_nothing_but_invalid_episodes_is_an_error_unless_it_may_be(capsys):
     assert [line[:5] for line in capsys.readouterr().err.splitlines()] == ["flat:", "steep"]
     report_invalid(result_of([[FINE] * 3]), "flat")
     assert capsys.readouterr().err == ""
+
+
+RESULT = evaluate(np.zeros((3, 64), np.float32), np.arange(3), 4)
+CHANGES = [
+    {"penalties": np.ones((2, 4, 6))},
+    {"penalties": np.ones((3, 4, 5))},
+    {"penalties": np.full((3, 4, 6), -1.0)},
+    {"penalties": np.full((3, 4, 6), np.inf)},
+    {"outcome": np.full((3, 4), Outcome.INVALID, np.uint8)},  # without a reason
+    {"duration_s": np.zeros((3, 4), np.float32)},
+    {"physics_steps": 0},
+    {"reward": np.full((3, 4), np.nan)},
+    {"reward": np.zeros((3, 3))},
+]
+
+
+@pytest.mark.parametrize("changes", CHANGES, ids=lambda changes: next(iter(changes)))
+def test_a_result_that_cannot_be_true_is_known(changes):
+    assert find_flaw(RESULT, 3, 4) is None
+    assert find_flaw(replace(RESULT, **changes), 3, 4) and find_flaw("all went well", 3, 4)

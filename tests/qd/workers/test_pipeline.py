@@ -1,9 +1,9 @@
-import dataclasses
 import multiprocessing
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,19 +26,18 @@ SEEDS = np.arange(100, 115, dtype=np.uint32)
 class Crosser(crossers.Crosser):
     """Crosses by the stand-in; time and steps say with which seed a shard begins."""
 
-    def evaluate(self, terrains, *, progress=None):
-        steps = int(terrains.seeds[0])
+    def take(self, progress=None):
+        steps = int(self.lots[0].seeds[0])
         if self.cfg.policy == f"refuse at {steps}":
             raise ValueError("terrains of another kind")
-        result = super().evaluate(terrains, progress=progress)
-        return dataclasses.replace(result, wall_s=float(steps), physics_steps=steps, robot_steps=steps)
+        return replace(super().take(progress), wall_s=float(steps), physics_steps=steps, robot_steps=steps)
 
 
 class Echo(crossers.Crosser):
     """Returns the terrains as penalties."""
 
-    def evaluate(self, terrains, *, progress=None):
-        return dataclasses.replace(stand_in.evaluate(np.zeros((2, 64)), terrains.seeds), penalties=terrains.heights)
+    def take(self, progress=None):
+        return replace(stand_in.evaluate(np.zeros((2, 64)), SEEDS[:2]), penalties=self.lots.pop(0).heights)
 
 
 def drawn(rows):
@@ -48,7 +47,7 @@ def drawn(rows):
 
 def test_workers_as_the_command_line_names_them():
     assert [parse_workers(text) for text in (None, "4", "ray", "ray:16")] == [
-        (False, None), (False, 4), (True, None), (True, 16),
+        (False, None), (False, 4), (True, None), (True, 16)
     ]  # fmt: skip
     for text in ("", "0", "1.5", "auto", "ray:0", "ray4", "9999999"):
         with pytest.raises(ValueError, match="workers"):
@@ -68,7 +67,7 @@ def test_workers_as_the_command_line_names_them():
 )
 def test_sizes(monkeypatch, num_terrains, replicas, workers, processes, terrains):
     monkeypatch.setattr(module, "available_cores", lambda: 3)
-    cfg = dataclasses.replace(CFG, num_terrains=num_terrains, replicas=replicas, compute=Compute(workers=workers))
+    cfg = replace(CFG, num_terrains=num_terrains, replicas=replicas, compute=Compute(workers=workers))
     assert (cfg.num_workers, cfg.terrains_of_worker) == (processes, terrains)
 
 
@@ -76,7 +75,7 @@ def test_sizes(monkeypatch, num_terrains, replicas, workers, processes, terrains
 def evaluate(request):
     """Two processes that have six terrains under way, or a simulation in this process, as on a GPU."""
     compute = Compute(workers="2") if request.param == "2" else Compute(request.param)
-    with open_pipeline(dataclasses.replace(CFG, compute=compute), build=Crosser) as pipeline:
+    with open_pipeline(replace(CFG, compute=compute), build=Crosser) as pipeline:
         yield pipeline
 
 
@@ -113,7 +112,7 @@ def test_contact_is_resolved_at_the_same_control_rate():
     rollout = module.build_simulator(cfg, 1)
     assert (rollout.robot.physics_dt, rollout.robot.control_dt) == (0.001, robot.control_dt)
     assert rollout.sim.solver.mjw_model.geom_solref.numpy()[..., 0] == pytest.approx(0.003)
-    as_searched = module.build_simulator(dataclasses.replace(cfg, engine="search"), 1)
+    as_searched = module.build_simulator(replace(cfg, engine="search"), 1)
     assert as_searched.robot.physics_dt == robot.physics_dt == 0.005
     assert (as_searched.sim.solver.mjw_model.geom_solref.numpy()[..., 0] > 0.005).all()
 
@@ -123,14 +122,14 @@ def test_contact_is_resolved_at_the_same_control_rate():
     [("build", ValueError, "does not fit"), ("raise", EvaluatorError, "broken"), ("die", EvaluatorError, "SIGKILL")],
 )
 def test_why_a_worker_ended_is_known(tmp_path, how, error, reason):
-    cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:1")
+    cfg = replace(CFG, policy=f"{how}:{tmp_path}:1")
     with pytest.raises(error, match=reason), open_pipeline(cfg, build=crossers.Failing) as evaluate:
         evaluate(drawn(slice(None)))
 
 
 def test_a_worker_that_ended_in_between_is_heard_when_it_gets_the_next_lot():
     """It refuses its second lot while nobody listens: the third cannot be sent, and the reason is no death."""
-    with open_pipeline(dataclasses.replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
+    with open_pipeline(replace(CFG, policy="refuse at 102"), build=Crosser) as evaluate:
         for lot in (slice(0, 2), slice(2, 4)):
             evaluate.put(drawn(lot))
         assert_same(evaluate.take(), stand_in.evaluate(GENES[:2], SEEDS[:2], 4))
@@ -145,7 +144,7 @@ def test_large_height_maps_go_in_while_results_come_out():
     """8 lots of 3 MB each way through pipes of 64 KB: neither side waits for the other to read."""
     maps = np.zeros((8, 2, 161, 321, 7), np.float32)
     maps[..., 0] = GENES[:8, :1, None, None]
-    with open_pipeline(dataclasses.replace(CFG, num_terrains=16), build=Echo) as evaluate:
+    with open_pipeline(replace(CFG, num_terrains=16), build=Echo) as evaluate:
         for lot in maps:
             evaluate.put(Terrains(heights=lot, seeds=SEEDS[:2]))
         for lot in maps:
@@ -167,8 +166,23 @@ def test_the_first_worker_too_leaves_ctrl_c_to_its_parent():
 
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
-    cfg = dataclasses.replace(CFG, policy=f"sleep:{tmp_path}:2")
+    cfg = replace(CFG, policy=f"sleep:{tmp_path}:2")
     with open_pipeline(cfg, build=crossers.Failing) as evaluate:
         evaluate.put(drawn(slice(6)))
         began = time.monotonic()
     assert time.monotonic() - began < 15 and not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("name", ["{}/model.pt", "{}/mine.py:act", "{}/mine.py:adapt@{}/model.pt", "os.path:join"])
+def test_the_files_of_a_controller_travel(tmp_path, name):
+    pytest.importorskip("ray")
+    from qd.workers.ray_workers import PackedCode
+
+    sent_from, sent_to = tmp_path / "sent_from", tmp_path / "sent_to"
+    sent_from.mkdir()
+    content = {"model.pt": b"weights", "mine.py": b"x = 1"}
+    for file, text in content.items():
+        (sent_from / file).write_bytes(text)
+    assert PackedCode.of(name.format(sent_from, sent_from)).unpacked(sent_to) == name.format(sent_to, sent_to)
+    sent = {file.name: file.read_bytes() for file in sent_to.iterdir()}
+    assert sent == {file: text for file, text in content.items() if file in name}

@@ -1,10 +1,10 @@
 """Ray workers: how terrains are spread changes nothing, and no failure of a worker loses or alters a result."""
 
-import dataclasses
 import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +46,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
     def interrupt(share: float) -> None:
         raise KeyboardInterrupt
 
-    with open_pipeline(dataclasses.replace(CFG, compute=Compute(workers="ray:3")), build=crossers.Crosser) as evaluate:
+    with open_pipeline(replace(CFG, compute=Compute(workers="ray:3")), build=crossers.Crosser) as evaluate:
         for count in (1, 8, 21):
             assert_crossed(evaluate(TERRAINS[:count]), slice(count))
         with pytest.raises(KeyboardInterrupt):
@@ -64,7 +64,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
 
 @pytest.mark.parametrize("how", ["die", "raise", "nan"])
 def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, how):
-    cfg = dataclasses.replace(CFG, policy=f"{how}:{tmp_path}:3")
+    cfg = replace(CFG, policy=f"{how}:{tmp_path}:3")
     with open_pipeline(cfg, build=crossers.Failing) as evaluate:
         for _ in range(3):
             assert_crossed(evaluate(TERRAINS), slice(21))
@@ -72,7 +72,7 @@ def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, h
 
 
 def test_what_every_worker_refuses_ends_the_evaluation(cluster, tmp_path):
-    cfg = dataclasses.replace(CFG, policy=f"refuse:{tmp_path}:99")
+    cfg = replace(CFG, policy=f"refuse:{tmp_path}:99")
     with pytest.raises(ValueError, match="terrains"), open_pipeline(cfg, build=crossers.Failing) as evaluate:
         evaluate(TERRAINS[:8])
 
@@ -108,7 +108,7 @@ def test_a_cluster_is_used_as_it_grows_and_shrinks():
     try:
         run = subprocess.Popen(
             [sys.executable, "-c", GROWING_RUN], cwd=ROOT, env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
         )  # fmt: skip
 
         def ask(workers: int) -> list[str]:
