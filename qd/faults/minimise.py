@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 
 from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
-from qd.faults.numbers import (
-    MINIMAL_FILE,
-    MINIMAL_NUMBERS_FILE,
-    MinimalTerrains,
-    judgement,
-    rate_numbers,
-    read_minimal,
-)
+from qd.faults.numbers import MINIMAL_FILE, MINIMAL_NUMBERS_FILE, MinimalTerrains, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_search
 from qd.faults.stages import STAGES, Judging, open_judging
 from qd.faults.subsets import Case, How, Trial, cut_genes, open_case, take_apart
