@@ -61,6 +61,7 @@ class PackedCode:
         return str(self.spec.in_folder(folder) if self.files else self.spec)
 
 
+_Packed = tuple[PackedCode, PackedRobot | str, PackedCode | None]  # controller, robot and space
 _ray: Any = ray  # its annotations leave out what it documents
 
 
@@ -68,17 +69,9 @@ _ray: Any = ray  # its annotations leave out what it documents
 class RayWorker:
     """One device's simulation, which Ray gave to this process; controller, robot and space come with their files."""
 
-    def prepare(
-        self,
-        num_terrains: int,
-        code: str,
-        cfg: PipelineCfg,
-        controller: PackedCode,
-        robot: PackedRobot | str,
-        space: PackedCode | None,
-        build: Build,
-    ) -> None:
+    def prepare(self, num_terrains: int, code: str, cfg: PipelineCfg, packed: _Packed, build: Build) -> None:
         """Builds the simulation; refuses to if this machine has other code."""
+        controller, robot, space = packed
         if code_fingerprint(_ROOMS) != code:
             raise ValueError(f"{socket.gethostname()} has other code or packages: use the same commit everywhere")
         # The process may be killed at any time, so the folder must not live as long as it does.
@@ -115,9 +108,9 @@ class RayWorkers(Pipeline):
         self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
         space = PackedCode.of(split_name(cfg.space)[0]) if is_user_space(cfg.space) else None
-        packed = [ray.put(value) for value in (PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space)]
+        packed = ray.put((PackedCode.of(cfg.policy), pack_robot(get_robot(cfg.robot)), space))
         compute = replace(cfg.compute, device="cuda:0" if gpus else "cpu")
-        self._arguments = code_fingerprint(_ROOMS), replace(cfg, compute=compute, robot=""), *packed, build
+        self._arguments = code_fingerprint(_ROOMS), replace(cfg, compute=compute, robot=""), packed, build
         self._size = cfg.terrains_of_worker
         self._workers: set[Any] = set()
         self._idle: deque[Any] = deque()
