@@ -1,27 +1,266 @@
-"""Judging: which elites of a search are faults of its controller.
+"""Judging: which elites of a search are faults of its controller, stage by stage.
 
 Elites that fail by fresh episodes are crossed with contact resolved and by other controllers: :mod:`qd.faults.numbers`
 says what follows. Episodes follow from the run's seed and from what names an elite. Crossings are kept in the run, so
 that a judging that was stopped finds them when it is run again.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.sets import hash_elites, read_trained_on
-from qd.faults.numbers import VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
-from qd.faults.searches import find_search
-from qd.faults.stages import STAGES, Judging, open_judging, with_families
-from qd.search.archive import ARCHIVE_FILE, Archive, write_archive
-from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory
+from qd.faults.families import find_failing_causes, find_families
+from qd.faults.numbers import EPISODES, FRESH_EPISODES, VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
+from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
+from qd.search.archive import ARCHIVE_FILE, OUTCOMES, Archive, FreshValues, goal_rates, write_archive
+from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
+from qd.search.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluate_rollout
 from qd.show import figures
-from qd.workers.compute import Compute
-from sim.controllers.spec import ControllerSpec
+from qd.workers.compute import Compute, check_policy
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import PipelineCfg, build_simulator
+from qd.workers.seeds import Stream
+from sim.controllers.spec import ControllerSpec, controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
+from sim.rollout import RolloutResult
+from sim.terrains.spaces.wider import varied_genes, varied_space
+from sim.terrains.terrains import Terrains
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judging:
+    """A search whose elites are judged, other controllers by name, and the service that crosses terrains."""
+
+    search: Search
+    certifiers: Mapping[str, str]
+    crosser: Crosser
+    step: str = ""
+    """What bars say before their label."""
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """Provenance of what is judged."""
+        search = self.search
+        return self.crosser.compute.origin(search.cfg.seed) | controller_identity(search.robot, search.policy)
+
+    def elite_terrains(self, archive: Archive, rows: NDArray[np.int64] | slice, stream: Stream) -> Terrains:
+        """Some elites as terrains, with the seeds of a stream."""
+        seeds = elite_seeds(archive, self.search.cfg.seed, stream=stream)
+        return Terrains(genes=archive.genes[rows], seeds=seeds[rows], space=self.search.space)
+
+    def count(self, policy: str, terrains: Terrains, label: str, **settings: Any) -> NDArray[np.int64]:
+        """Outcomes (num_terrains, 4) of a controller in 20 episodes each, or as :meth:`Crosser.cross` is told."""
+        settings = {"replicas": EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
+        return count_outcomes(self.crosser.cross(policy, terrains, **settings))
+
+
+@contextmanager
+def open_judging(
+    search: Search, compute: Compute, certifiers: Mapping[str, str] | None, *, ask: bool
+) -> Iterator[Judging]:
+    """Tries the controller, and certifiers if they are to be asked, and keeps other commands out of the search's run.
+
+    Certifiers are those of :func:`qd.faults.searches.find_certifiers` if None. Crossings are kept in the run.
+    """
+    check_policy(search.policy, search.robot, compute.device)
+    certifiers = find_certifiers(search) if certifiers is None else certifiers
+    if ask:
+        check_certifiers(certifiers, search, compute.device)
+    with claimed(search.run), Crosser(search.robot, compute, cache=search.run / "crossings") as crosser:
+        yield Judging(search=search, certifiers=certifiers, crosser=crosser)
+
+
+def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
+    """Seeds of episodes on N elites, ``times`` in succession for each, shape (N * times,).
+
+    They follow from the seed of the search and from what names an elite, its cell and the iteration that found it.
+    """
+    names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
+    rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
+    return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
+
+
+def count_outcomes(result: RolloutResult) -> NDArray[np.int64]:
+    """Episodes of each terrain by :data:`qd.search.archive.OUTCOMES`, shape (num_terrains, 4)."""
+    flags = (result.reached_goal, result.base_collision, result.invalid)
+    goal, collided, invalid = (flag.sum(axis=1) for flag in flags)
+    return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
+
+
+class Stage(ABC):
+    """A step of judging."""
+
+    name: ClassVar[str]
+    asks_certifiers: ClassVar[bool] = False
+    """Whether certifiers cross terrains in it."""
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses, before anything is crossed, what cannot be judged; ``before`` are the stages that come first."""
+        if archive.fresh is None and "fresh" not in before:
+            raise ValueError(f"stages must begin with fresh, got none: {judging.search.run} has no fresh episodes")
+
+    @abstractmethod
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with the stage's columns filled anew."""
+
+
+class Fresh(Stage):
+    """Crosses every elite in 40 fresh episodes, since an elite is the best of many noisy evaluations."""
+
+    name = "fresh"
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Any search can be judged."""
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with fresh values, families and causes, by descending corrected fitness."""
+        search = judging.search
+        terrains = judging.elite_terrains(archive, slice(None), Stream.FRESH)
+        label = f"{judging.step}fresh episodes"
+        result = judging.crosser.cross(search.policy, terrains, replicas=FRESH_EPISODES, label=label)
+        corrected = archive.corrected_by(fresh_values(archive, result, search.cfg.fitness))
+        if not np.array_equal(archive.cell, corrected.cell):
+            print(f"Elites of {search.run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)
+        return with_families(corrected, search)
+
+
+def fresh_values(archive: Archive, result: RolloutResult, fitness: FitnessCfg) -> FreshValues:
+    """The values of an archive's elites by 40 fresh episodes on each."""
+    cells = archive.cells
+    fresh = evaluate_rollout(result, cells, fitness)
+    collided = (result.base_collision & ~result.invalid)[:, :BIT_EPISODES].any(axis=1)
+    cell = cells.find_cells(fresh.ratios, collided)
+    reproduced = fresh.valid & cells.are_neighbours(archive.cell, cell)
+    return FreshValues(**{**vars(fresh), "cell": cell}, reproduced=reproduced)
+
+
+def with_families(archive: Archive, search: Search) -> Archive:
+    """The archive with the family and the cause of each elite, as its fresh episodes have it."""
+    families = find_families(archive.genes, search.space)
+    causes = find_failing_causes(archive, search.space, search.robot.half_width)
+    return replace(archive, family=families, cause=causes)
+
+
+class Resolved(Stage):
+    """Crosses the failing elites in 20 episodes with contact resolved: in steps of 1 ms."""
+
+    name = "resolved"
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with outcomes of the controller that was searched."""
+        rows = np.flatnonzero(archive.failing)
+        terrains = judging.elite_terrains(archive, rows, Stream.RESOLVED)
+        outcomes = archive.resolved_outcomes.copy()
+        outcomes[rows] = judging.count(judging.search.policy, terrains, "contact resolved", engine="resolved")
+        return replace(archive, resolved_outcomes=outcomes)
+
+
+class Others(Stage):
+    """Lets certifiers cross the failing elites in 20 episodes, at the search's settings and with contact resolved.
+
+    A terrain that a certifier crosses less than half of the time at the search's settings is not crossed with contact
+    resolved, since it cannot get a certificate. Outcomes of a certifier that is not asked stay; another controller of
+    the same name replaces them.
+    """
+
+    name = "others"
+    asks_certifiers = True
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with outcomes of each certifier."""
+        rows = np.flatnonzero(archive.failing)
+        for name, policy in judging.certifiers.items():
+            terrains = judging.elite_terrains(archive, rows, Stream.OTHERS)
+            outcomes = judging.count(policy, terrains, name)
+            crossed = goal_rates(outcomes) >= FAILING_GOAL_RATE
+            terrains = judging.elite_terrains(archive, rows[crossed], Stream.OTHERS_RESOLVED)
+            resolved = np.zeros_like(outcomes)
+            resolved[crossed] = judging.count(policy, terrains, f"{name}, contact resolved", engine="resolved")
+            stored = dict(zip(archive.certifiers, archive.certifier_sha256, strict=True))
+            hashes = stored | {name: str(controller_hash(policy))}
+            column = [*hashes].index(name)
+            columns: dict[str, Any] = {"certifier_outcomes": outcomes, "certifier_resolved_outcomes": resolved}
+            for field, values in columns.items():
+                table = np.pad(getattr(archive, field), ((0, 0), (0, len(hashes) - len(stored)), (0, 0)))
+                if hashes != stored:  # what another controller of the name did is gone
+                    table[:, column] = 0
+                table[rows, column] = values
+                columns[field] = table
+            if hashes != stored:
+                columns |= {"varied_outcomes": None, "certifier_varied_outcomes": None}
+            archive = replace(archive, certifiers=tuple(hashes), certifier_sha256=tuple(hashes.values()), **columns)
+        return archive
+
+
+class Varied(Stage):
+    """Crosses faults under 20 draws of loads, motors, delays, noise and friction, by controller and certifiers."""
+
+    name = "varied"
+    asks_certifiers = True
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses a search without faults or that cannot have conditions, and certifiers that are not at hand."""
+        super().check(archive, judging, before)
+        if "others" not in before and ("fresh" in before or not archive.is_judged):
+            raise ValueError(f"stages must have others before varied: {judging.search.run} has no faults to cross")
+        self._check_certifiers(archive, judging, renewed="others" in before)
+        if before:  # else the stage itself finds out at once
+            search = judging.search
+            local = Compute(judging.crosser.compute.device if judging.crosser.compute.on_gpu else "cpu")
+            sizes: dict[str, Any] = {"num_terrains": 1, "replicas": 1, "space": varied_space(search.space).name}
+            build_simulator(PipelineCfg(compute=local, robot=search.robot, policy=search.policy, **sizes), 1)
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with outcomes of all controllers under the same conditions."""
+        self._check_certifiers(archive, judging)
+        search = judging.search
+        rows = np.flatnonzero(archive.is_fault)
+        space = varied_space(search.space)
+        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
+        drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]
+        genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, space.num_genes)
+
+        def cross(policy: str, chosen: NDArray[np.bool_], label: str) -> NDArray[np.int64]:
+            chosen_genes = genes[chosen].reshape(-1, space.num_genes)
+            terrains = Terrains(genes=chosen_genes, seeds=seeds[chosen].ravel(), space=space)
+            outcomes = judging.count(policy, terrains, f"{label}, varied conditions", replicas=1)
+            return outcomes.reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
+
+        outcomes = np.zeros_like(archive.resolved_outcomes)
+        outcomes[rows] = cross(search.policy, np.ones(len(rows), bool), "searched")
+        others = np.zeros_like(archive.certifier_outcomes)
+        for column, name in enumerate(archive.certifiers):
+            certified = archive.certificates[rows, column]
+            if certified.any():
+                others[rows[certified], column] = cross(judging.certifiers[name], certified, name)
+        archive = replace(archive, varied_outcomes=outcomes, certifier_varied_outcomes=others)
+        num_robust = archive.robust.sum()
+        print(f"{num_robust} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
+        return archive
+
+    @staticmethod
+    def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
+        """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
+        hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
+        certificates = archive.certificates[archive.is_fault].T
+        stored = zip(archive.certifiers, archive.certifier_sha256, certificates, strict=True)
+        names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
+        if lost := [name for name in names if not (renewed and name in hashes)]:
+            raise ValueError(
+                f"certifiers must be those that certify faults of {judging.search.run}, got none or another file for "
+                f"{', '.join(lost)}: give the files by --certifiers, or other controllers of these names and the "
+                "stages others, varied"
+            )
+
+
+STAGES: dict[str, Stage] = {stage.name: stage for stage in (Fresh(), Resolved(), Others(), Varied())}
 
 
 def judge(
@@ -36,7 +275,7 @@ def judge(
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
-    ``stages`` are some of :data:`qd.faults.stages.STAGES`, ``certifiers`` other controllers by name, those of
+    ``stages`` are some of :data:`qd.faults.judge.STAGES`, ``certifiers`` other controllers by name, those of
     :func:`qd.faults.searches.find_certifiers` if None; robot, policy and space are as
     :func:`qd.faults.searches.find_search` takes them.
     """

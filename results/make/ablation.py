@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from qd.faults.families import find_families
+from qd.faults.judge import elite_seeds, fresh_values
 from qd.faults.numbers import FRESH_EPISODES, fresh_numbers
-from qd.faults.stages import elite_seeds, fresh_values
 from qd.search.archive import Archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg

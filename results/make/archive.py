@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qd.faults.judge import judge
-from qd.faults.stages import STAGES
+from qd.faults.judge import STAGES, judge
 from qd.search.directory import RunDirectory
 from results.make.common import ARCHIVE_FILES, CURVE_FILE, FRESH_COUNTS, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically

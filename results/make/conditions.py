@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.faults.judge import count_outcomes, elite_seeds
 from qd.faults.minimise import minimise
 from qd.faults.numbers import EPISODES
-from qd.faults.stages import count_outcomes, elite_seeds
 from qd.search.archive import Archive, goal_rates
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.crosser import Crosser

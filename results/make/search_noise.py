@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from qd.faults.families import find_families
-from qd.faults.judge import judge
+from qd.faults.judge import elite_seeds, fresh_values, judge
 from qd.faults.numbers import FRESH_EPISODES
-from qd.faults.stages import elite_seeds, fresh_values
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.pool import chance_to_stay

@@ -17,8 +17,8 @@ from qd.faults.causes import (
     find_effects,
     measure_shape,
 )
+from qd.faults.judge import with_families
 from qd.faults.searches import Search
-from qd.faults.stages import with_families
 from sim.robots.shipped import ROBOTS
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import CONDITIONS

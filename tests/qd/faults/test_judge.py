@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from qd.faults import judge as judging
-from qd.faults.judge import find_seen, judge
-from qd.faults.stages import count_outcomes, elite_seeds, fresh_values
+from qd.faults.judge import count_outcomes, elite_seeds, find_seen, fresh_values, judge
 from qd.search.archive import read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
