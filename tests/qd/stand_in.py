@@ -1,8 +1,12 @@
-"""A cheap, deterministic stand-in for the simulation: genes and seeds in, a result shaped like a rollout's out."""
+"""A cheap, deterministic stand-in for the simulation: genes and seeds in, results shaped like a rollout's out."""
 
+import os
+import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,3 +111,54 @@ class StandInCompute(Compute):
     """Where terrains are crossed by what ``opener`` opens; tests/conftest.py has pipelines opened by it."""
 
     opener: Any = None
+
+
+class Crosser(Stub):
+    """Crosses by the stand-in."""
+
+    def __init__(self, cfg, num_terrains: int) -> None:
+        super().__init__(lambda genes, seeds: evaluate(genes, seeds, cfg.replicas))
+        self.cfg, self.num_terrains = cfg, num_terrains
+
+    def put(self, terrains):
+        super().put(terrains)
+        assert sum(map(len, self.lots)) <= self.num_terrains
+
+    def take(self, progress=None):
+        if progress is not None:
+            progress(0.5)
+            progress(1.0)
+        return super().take()
+
+
+class Failing(Crosser):
+    """Fails as the policy's name says: ``<how>:<folder>:<times>``, so often in all, counted by files in the folder."""
+
+    def __init__(self, cfg, num_terrains: int) -> None:
+        super().__init__(cfg, num_terrains)
+        self.how, self.folder, self.times = cfg.policy.split(":")
+        if self.how == "build":
+            raise ValueError("policy 'x' does not fit:\nuse another")
+
+    def take(self, progress=None):
+        result = super().take(progress)
+        for number in range(int(self.times)):
+            try:
+                (Path(self.folder) / str(number)).touch(exist_ok=False)
+            except FileExistsError:
+                continue
+            self.fail(result)
+            break
+        return result
+
+    def fail(self, result):
+        match self.how:
+            case "die":
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "raise":
+                raise RuntimeError("the solver is broken")
+            case "refuse":
+                raise ValueError("terrains of another kind")
+            case "sleep":
+                time.sleep(60)
+        result.penalties[0, 0, 0] = np.nan

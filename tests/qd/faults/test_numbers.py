@@ -1,12 +1,14 @@
-"""Faults in numbers and in words."""
+"""Elites in numbers and words, by cause, in families and in orders: faults first, no kind of failure twice at first."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise_search
 from qd.faults.numbers import (
     SPECIALIST,
+    MinimalTerrains,
     count_faults,
     describe_judgement,
     fault_numbers,
@@ -15,7 +17,10 @@ from qd.faults.numbers import (
     judgement,
     rate_numbers,
 )
-from tests.builders import fresh_values, judged_archive, small_archive
+from qd.search.archive import no_outcomes
+from sim.terrains.bank import make_heights
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import bump, fresh_values, judged_archive, small_archive
 
 
 def pick_numbers(archive, *names, **known):
@@ -106,3 +111,140 @@ def test_fresh_episodes_of_an_elite_are_counted():
     fresh = replace(fresh_values(archive), goal_rate=np.full(3, 0.1), collision_rate=np.full(3, 0.8))
     # Of 40 episodes 10 % arrive and 80 % collide.
     assert fresh_counts(replace(archive, fresh=fresh), 0).tolist() == [4, 32, 4, 0]
+
+
+def ranked(archive, minima=None, **chosen):
+    return rank(archive, SUPER_GAUSSIAN, minima, half_width=0.4, **chosen)
+
+
+def test_elites_are_as_found_without_fresh_values_and_else_those_that_are_valid():
+    archive = small_archive(4)
+    elites = ranked(archive)
+    assert not elites.is_fresh.any() and elites.numbers.tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(elites.goal_rate, archive.goal_rate)
+    fresh = replace(fresh_values(archive), invalid_episodes=np.array([0, 40, 8, 0]))
+    corrected = ranked(replace(archive, fresh=fresh), judged=True)
+    assert corrected.is_fresh.all() and corrected.numbers.tolist() == [0, 2, 3]
+    assert corrected.counted.tolist() == [40, 32, 40]
+    np.testing.assert_array_equal(corrected.fitness, archive.fitness[[0, 2, 3]] / 2)
+    assert [corrected.find_row(number) for number in (0, 2, 3)] == [0, 1, 2]
+
+
+def test_verdicts_come_before_rates_and_rates_before_fitness():
+    elites = ranked(judged_archive())
+    assert elites.verdict.tolist() == [4, 3, 2, 1, 0]  # fault, confirmed, certified, failing, not failing
+    assert elites.by_severity().tolist() == [0, 1, 2, 3, 4]
+    archive = replace(
+        small_archive(5),
+        goal_rate=np.array([0.9, 0.1, 0.0, 0.0, 0.0]),
+        collision_rate=np.array([0.0, 0.9, 0.2, 0.3, 0.3]),
+        fallen_rate=np.array([0.0, 0.0, 0.5, 0.0, 0.1]),
+        fitness=np.array([9.0, 5.0, 4.0, 3.0, 2.0]),
+    )
+    elites = ranked(archive)
+    assert elites.verdict.tolist() == [0, 1, 1, 1, 1]  # by the episodes that found them: nobody else looked
+    assert elites.by_severity().tolist() == [4, 3, 2, 1, 0]
+
+
+def minima_with(causes):
+    """Minimal terrains with causes of some kinds, by number of the elite."""
+    entries = [{"elite": number, "cause": cause and {"kind": cause}} for number, cause in enumerate(causes)]
+    return MinimalTerrains(numbers={"elites": entries}, genes={})
+
+
+def six_elites(ends=(np.nan, np.nan)):
+    """Six elites, worse from the first to the fifth, of which the third is a fault; the last is crossed."""
+    archive = replace(
+        small_archive(6),
+        goal_rate=np.array([0.25, 0.0, 0.0, 0.0, 0.0, 0.75]),
+        collision_rate=np.array([0.0, 0.5, 0.75, 0.75, 1.0, 0.25]),
+        fallen_rate=np.array([0.0, 0.0, 0.25, 0.75, 1.0, 0.0]),
+        end_position=np.full((6, 2), ends, np.float32),
+    )
+    crossed = np.array([[0, 20, 0, 0], [20, 0, 0, 0]])[[0, 0, 1, 0, 0, 0]][:, None]
+    archive = replace(
+        archive, fresh=fresh_values(archive), resolved_outcomes=np.tile([0, 20, 0, 0], (6, 1)), certifiers=("C-G",),
+        certifier_sha256=("a" * 64,), certifier_outcomes=crossed, certifier_resolved_outcomes=crossed
+    )  # fmt: skip
+    return ranked(archive, minima_with(["ridge", "drop", "ridge", "ridge", None, "ridge"])), archive
+
+
+def test_an_elite_is_named_by_its_cause_and_ending():
+    ranking, _ = six_elites()
+    assert ranking.causes == ("ridge", "drop", "ridge", "ridge", "unclear", "")
+    assert [ranking.name(row) for row in range(6)] == [
+        "ridge: gets stuck, 30 of 40",
+        "drop: hits the ground, 20 of 40",  # of two endings as common the collision
+        "ridge: hits the ground, 30 of 40",  # a third of those that collide have fallen
+        "ridge: topples, 30 of 40",
+        "unclear: topples, 40 of 40",
+        "crossed, 30 of 40",
+    ]
+    lying = replace(ranking, fallen_rate=np.array([0.75] + 5 * [0.0]))  # standing until the time is over
+    assert lying.name(0) == "ridge: topples, 30 of 40"
+    outside, _ = six_elites((9.0, 10.01))
+    assert outside.name(0) == "ridge: leaves the terrain, 30 of 40"
+
+
+def test_causes_are_by_number_and_the_unclear_last():
+    ranking, archive = six_elites()
+    by_cause = {cause: rows.tolist() for cause, rows in ranking.by_cause().items()}
+    assert by_cause == {"ridge": [2, 3, 0], "drop": [1], "unclear": [4]} and [*by_cause] == ["ridge", "drop", "unclear"]
+    summary = "5 of 6 terrains stop the robot; ridges are the commonest cause"
+    crosses = "another controller of this robot"
+    assert summarise_search(ranking, archive) == f"{summary}; 1 is a fault: {crosses} crosses it"
+    judged = replace(archive, resolved_outcomes=np.zeros((6, 4), np.int64))
+    assert summarise_search(ranking, judged) == f"{summary}; {crosses} crosses 1 of them"
+    alone = replace(archive, fresh=None, **no_outcomes(6), certifiers=(), certifier_sha256=())
+    assert summarise_search(ranked(alone), alone) == "5 of 6 terrains stop the robot"  # nobody knows why
+    one = alone.rows(np.array([0]))
+    assert summarise_search(ranked(one), one) == "The only terrain stops the robot"
+    crossed = replace(alone, goal_rate=np.ones(6))
+    assert summarise_search(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
+
+
+def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
+    shapes = [(6.0, 0.5, 0.25), (8.0, 0.5, -0.2), (10.0, 1.5, -0.25), *[(8.0, 0.5, 0.0)] * 5]
+    genes = np.concatenate([bump(x=x, sigma_x=sigma, height=height) for x, sigma, height in shapes])[None].repeat(4, 0)
+    ends = np.array([[5.6, 4.0], [7.8, 4.0], [9.2, 4.0], [2.0, 4.0]], np.float32)
+    archive = replace(small_archive(4), genes=genes, goal_rate=np.zeros(4), end_position=ends)
+    assert ranked(archive).causes == ("ridge", "ditch", "drop", "unclear")
+
+
+def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families():
+    archive = small_archive(20)  # 6 stuck, 9 collided, 5 across
+    genes = archive.genes.copy()
+    genes[7] = genes[0] = genes[6]  # two collided and one stuck are the same terrain
+    archive = replace(
+        archive, genes=genes, goal_rate=np.array([*np.linspace(0.01, 0.06, 6), 0.0, 0.0, *[0.05] * 7, *[1.0] * 5]),
+        collision_rate=np.repeat([0.0, 1.0, 0.0], (6, 9, 5)), fallen_rate=np.zeros(20)
+    )  # fmt: skip
+    ranking = ranked(archive, minima_with(["drop"] * 6 + ["ridge"] * 9))
+    order = ranking.order()
+    assert sorted(order.tolist()) == list(range(20))
+    assert ranking.worst(2) == [6, 1]  # 0 is worse than 1, and of the family of 6
+    assert ranking.families[[0, 6, 7]].tolist() == [1, 1, 1]
+    by_worst = ranking.families[ranking.order("fault")].tolist()
+    assert [*dict.fromkeys(by_worst)] == [*range(1, 1 + len(set(by_worst)))]
+    count = len(set(ranking.families[:15]))
+    assert len(set(ranking.families[order[:count]])) == count  # other families come first
+    assert set(order[15:].tolist()) == set(range(15, 20))
+    assert ranking.order("fault").tolist()[:2] == [6, 7]
+    assert six_elites()[0].order().tolist()[:3] == [2, 1, 4]  # the fault comes before other causes
+    families = ranking.families[ranking.order("family")]
+    assert families.tolist() == sorted(families) and families[0] == families[1] == 1
+    for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
+        values = getattr(ranking, name)[ranking.order(name)]
+        assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
+
+
+def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
+    strangers = np.clip(SUPER_GAUSSIAN.hard_random(4, 0), -1.0, 1.0).astype(np.float32)
+    child, grandchild = strangers[1].copy(), strangers[1].copy()
+    child[31], grandchild[31] = strangers[1, 31] - 0.5, strangers[1, 31] - 1.0  # the height of a bump
+    genes = np.stack([*strangers, child, grandchild])
+    first, second, third = make_heights(genes[[1, 4, 5]])
+    near = [float(np.sqrt(((heights - others) ** 2).mean())) for heights, others in ((first, second), (second, third))]
+    assert max(near) < KIN_M < np.sqrt(((first - third) ** 2).mean())
+    assert find_families(genes[[0, 5, 1, 2, 4, 3]], SUPER_GAUSSIAN).tolist() == [0, 1, 1, 2, 1, 3]
+    assert find_families(genes[:0], SUPER_GAUSSIAN).tolist() == []

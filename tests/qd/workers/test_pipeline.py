@@ -15,7 +15,7 @@ from qd.workers.pipeline import PipelineCfg
 from qd.workers.process import EvaluatorError
 from sim.robots.find import get_robot
 from sim.terrains.terrains import Terrains
-from tests.qd import crossers, stand_in
+from tests.qd import stand_in
 from tests.qd.stand_in import assert_same
 
 CFG = PipelineCfg(robot="anymal", policy="p", num_terrains=6, replicas=4, compute=Compute(workers="1"))
@@ -23,7 +23,7 @@ GENES = np.random.default_rng(0).uniform(-1, 1, (15, 64)).astype(np.float32)
 SEEDS = np.arange(100, 115, dtype=np.uint32)
 
 
-class Crosser(crossers.Crosser):
+class Crosser(stand_in.Crosser):
     """Crosses by the stand-in; time and steps say with which seed a shard begins."""
 
     def take(self, progress=None):
@@ -33,7 +33,7 @@ class Crosser(crossers.Crosser):
         return replace(super().take(progress), wall_s=float(steps), physics_steps=steps, robot_steps=steps)
 
 
-class Echo(crossers.Crosser):
+class Echo(stand_in.Crosser):
     """Returns the terrains as penalties."""
 
     def take(self, progress=None):
@@ -123,7 +123,7 @@ def test_contact_is_resolved_at_the_same_control_rate():
 )
 def test_why_a_worker_ended_is_known(tmp_path, how, error, reason):
     cfg = replace(CFG, policy=f"{how}:{tmp_path}:1")
-    with pytest.raises(error, match=reason), open_pipeline(cfg, build=crossers.Failing) as evaluate:
+    with pytest.raises(error, match=reason), open_pipeline(cfg, build=stand_in.Failing) as evaluate:
         evaluate(drawn(slice(None)))
 
 
@@ -167,7 +167,7 @@ def test_the_first_worker_too_leaves_ctrl_c_to_its_parent():
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
     cfg = replace(CFG, policy=f"sleep:{tmp_path}:2")
-    with open_pipeline(cfg, build=crossers.Failing) as evaluate:
+    with open_pipeline(cfg, build=stand_in.Failing) as evaluate:
         evaluate.put(drawn(slice(6)))
         began = time.monotonic()
     assert time.monotonic() - began < 15 and not multiprocessing.active_children()

@@ -15,7 +15,7 @@ from qd.workers.crosser import open_pipeline
 from qd.workers.pipeline import PipelineCfg
 from sim.terrains.terrains import Terrains
 from tests.builders import free_port
-from tests.qd import crossers, stand_in
+from tests.qd import stand_in
 
 pytestmark = pytest.mark.ray
 
@@ -46,7 +46,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
     def interrupt(share: float) -> None:
         raise KeyboardInterrupt
 
-    with open_pipeline(replace(CFG, compute=Compute(workers="ray:3")), build=crossers.Crosser) as evaluate:
+    with open_pipeline(replace(CFG, compute=Compute(workers="ray:3")), build=stand_in.Crosser) as evaluate:
         for count in (1, 8, 21):
             assert_crossed(evaluate(TERRAINS[:count]), slice(count))
         with pytest.raises(KeyboardInterrupt):
@@ -65,7 +65,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
 @pytest.mark.parametrize("how", ["die", "raise", "nan"])
 def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, how):
     cfg = replace(CFG, policy=f"{how}:{tmp_path}:3")
-    with open_pipeline(cfg, build=crossers.Failing) as evaluate:
+    with open_pipeline(cfg, build=stand_in.Failing) as evaluate:
         for _ in range(3):
             assert_crossed(evaluate(TERRAINS), slice(21))
         assert evaluate.status().retries == 3
@@ -73,24 +73,24 @@ def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, h
 
 def test_what_every_worker_refuses_ends_the_evaluation(cluster, tmp_path):
     cfg = replace(CFG, policy=f"refuse:{tmp_path}:99")
-    with pytest.raises(ValueError, match="terrains"), open_pipeline(cfg, build=crossers.Failing) as evaluate:
+    with pytest.raises(ValueError, match="terrains"), open_pipeline(cfg, build=stand_in.Failing) as evaluate:
         evaluate(TERRAINS[:8])
 
 
 def test_a_worker_of_other_code_is_refused(cluster, monkeypatch):
     monkeypatch.setattr("qd.workers.ray_workers.code_fingerprint", lambda rooms: "of this machine")
-    with pytest.raises(ValueError, match="code"), open_pipeline(CFG, build=crossers.Crosser):
+    with pytest.raises(ValueError, match="code"), open_pipeline(CFG, build=stand_in.Crosser):
         pass
 
 
 GROWING_RUN = """
 import sys, time
-from tests.qd import crossers
+from tests.qd import stand_in
 from tests.qd.workers.test_ray_workers import CFG, TERRAINS, open_pipeline
 from qd.workers.compute import Compute, choose_device
 choose_device("cpu", "ray")
 cfg = CFG.__class__(**{**vars(CFG), "compute": Compute(workers="ray")})
-with open_pipeline(cfg, build=crossers.Crosser) as evaluate:
+with open_pipeline(cfg, build=stand_in.Crosser) as evaluate:
     for line in sys.stdin:  # how many workers to wait for
         while True:
             total = evaluate(TERRAINS).penalties.sum()
