@@ -271,10 +271,8 @@ class Described(torch.nn.Module):
         clip = self.cfg.observation_clip
         memory = self._get_memory(len(row))
         sensed = read_row(row, self.robot)
-        columns = [
-            self._compute_quantity(term, sensed, memory, sensor)[:, index]
-            for term, sensor, index in zip(self.cfg.observation, self._sensors, self._index, strict=True)
-        ]
+        terms = zip(self.cfg.observation, self._sensors, self._index, strict=True)
+        columns = [self._compute_quantity(term, sensed, memory, at)[:, index] for term, at, index in terms]
         now = (torch.cat(columns, dim=1) - self._zeros).clamp(self._low, self._high) * self._scale
         now = now if clip is None else now.clamp(-clip, clip)
         history = self.cfg.history
@@ -284,9 +282,9 @@ class Described(torch.nn.Module):
         if history.fill == "first":
             past = torch.where(memory.steps[:, :, None] == 0.0, now[:, None], past)
         memory.past.copy_(past)
-        terms = [past] if history.by == "row" else past.split(self.widths, dim=2)
-        steps = [term[:, :length] for term, length in zip(terms, self.lengths, strict=False)]
-        return torch.cat([(term.flip(1) if history.newest == "last" else term).flatten(1) for term in steps], dim=1)
+        blocks = [past] if history.by == "row" else past.split(self.widths, dim=2)
+        steps = [block[:, :length] for block, length in zip(blocks, self.lengths, strict=False)]
+        return torch.cat([(block.flip(1) if history.newest == "last" else block).flatten(1) for block in steps], dim=1)
 
     @torch.inference_mode()
     def act(self, output: torch.Tensor) -> torch.Tensor:

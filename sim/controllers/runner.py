@@ -127,7 +127,15 @@ class PolicyRunner:
         self.memory = find_memory(policy)
         self._observation, self._action, self._begins = map(wp.to_torch, (observation, action, begins))
         self._plain = isinstance(policy, torch.nn.Module) and self.memory is Memory.NONE
-        self._graph = self._capture() if self._observation.is_cuda and is_graph_safe(policy) else None
+        self._graph = torch.cuda.CUDAGraph() if self._observation.is_cuda and is_graph_safe(policy) else None
+        if self._graph is not None:
+            with torch.inference_mode():
+                for _ in range(3):
+                    self._call()
+                torch.cuda.synchronize()
+                stream = torch.cuda.current_stream()
+                with recording(), torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
+                    self._call()  # while other threads may use the device
 
     def reset(self) -> None:
         """Begins an episode of all robots, of a policy whose memory is :attr:`Memory.SHARED`."""
@@ -150,17 +158,6 @@ class PolicyRunner:
         if problem := action_problem(action, shape):
             raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")
         self._action.copy_(action[: len(self._action)])
-
-    @torch.inference_mode()
-    def _capture(self) -> torch.cuda.CUDAGraph:
-        for _ in range(3):
-            self._call()
-        torch.cuda.synchronize()
-        graph = torch.cuda.CUDAGraph()
-        stream = torch.cuda.current_stream()
-        with recording(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-            self._call()  # while other threads may use the device
-        return graph
 
     @torch.inference_mode()
     def __call__(self) -> None:

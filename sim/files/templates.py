@@ -7,10 +7,5 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 def open_templates(folder: Path) -> Environment:
     """The templates of a folder: a missing value is an error, and values in ``*.html`` are escaped."""
-    return Environment(
-        loader=FileSystemLoader(folder),
-        autoescape=select_autoescape(["html"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options = {"autoescape": select_autoescape(["html"]), "trim_blocks": True, "lstrip_blocks": True}
+    return Environment(loader=FileSystemLoader(folder), undefined=StrictUndefined, **options)

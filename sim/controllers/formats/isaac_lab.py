@@ -172,20 +172,14 @@ def _read_term(
     elif function == "gait_phase":
         row["period_s"] = params["period"]
     elif function == "height_scan":
-        row |= _read_scan(scene[params["sensor_cfg"]["name"]], params.get("offset", 0.5), source)
+        sensor = scene[params["sensor_cfg"]["name"]]
+        grid = sensor["pattern_cfg"]
+        turns = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
+        if "resolution" not in grid or not turns:
+            raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {grid}")
+        row["order"] = "x fastest" if grid.get("ordering", "xy") == "xy" else "y fastest"
+        row["offset"] = params.get("offset", 0.5)
+        step = grid["resolution"]
+        for axis, side, mid in zip("xy", grid["size"], sensor["offset"]["pos"], strict=False):
+            row[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
     return row
-
-
-def _read_scan(sensor: dict[str, Any], offset: float, source: Source) -> dict[str, Any]:
-    """Points of a grid in the yaw frame of the sensor [m], and their order."""
-    pattern = sensor["pattern_cfg"]
-    in_yaw_frame = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
-    if "resolution" not in pattern or not in_yaw_frame:
-        raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {pattern}")
-    step = pattern["resolution"]
-    x, y = (
-        [round(centre - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
-        for side, centre in zip(pattern["size"], sensor["offset"]["pos"], strict=False)
-    )
-    order = "x fastest" if pattern.get("ordering", "xy") == "xy" else "y fastest"
-    return {"order": order, "offset": offset, "x": x, "y": y}

@@ -42,9 +42,8 @@ def load_network(
     if sizes is not None and policy.sizes != sizes:
         what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
         must = f"{label} has {sizes[0]} observations and {sizes[1]} joints"
-        raise ValueError(
-            f"policy '{path}' {what}, but {must}: give one that fits, or describe it (docs/controllers.md)"
-        )
+        remedy = "give one that fits, or describe it (docs/controllers.md)"
+        raise ValueError(f"policy '{path}' {what}, but {must}: {remedy}")
     return policy.to(device).eval()
 
 
@@ -128,7 +127,5 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
                 together = torch.stack([recurrent(step) for step in rows], dim=1)
                 if torch.allclose(together, torch.stack(separate), rtol=1e-4, atol=1e-4):
                     return _RecurrentScript(module, initial, axis).to(device)
-    buffers = ", ".join(initial)
-    raise ValueError(
-        f"policy '{path}' remembers one robot alone, in {buffers}: give the checkpoint that it was made of"
-    )
+    remedy = "give the checkpoint that it was made of"
+    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: {remedy}")

@@ -13,12 +13,8 @@ from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.controllers.spec import agent_file
 from sim.files.settings import read_yaml
 
-_TORCH_NAMES = (nn.ELU, nn.SELU, nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.GELU, nn.Mish, nn.Identity)
-ACTIVATIONS: dict[str, type[nn.Module]] = {
-    **{layer.__name__.lower(): layer for layer in _TORCH_NAMES},
-    "lrelu": nn.LeakyReLU,
-    "swish": nn.SiLU,
-}
+_LAYERS = (nn.ELU, nn.SELU, nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.GELU, nn.Mish, nn.Identity)
+ACTIVATIONS = {layer.__name__.lower(): layer for layer in _LAYERS} | {"lrelu": nn.LeakyReLU, "swish": nn.SiLU}
 """What rsl_rl calls the functions between layers."""
 _FORMER_NAMES = {"actor.": "mlp.", "memory_a.rnn.": "rnn.rnn.", "actor_obs_normalizer.": "obs_normalizer."}
 """Prefixes of an actor's tensors in rsl_rl 1 to 4, and in rsl_rl 5."""
@@ -104,7 +100,17 @@ def read_weights(path: Path) -> Any:
 def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | RnnPolicy:
     """The actor of a file, from what :func:`read_weights` returned; without ``activation`` the file must name it."""
     state = _read_state(content, path)
-    activation = activation or _find_activation(content, path)
+    if activation is None:
+        is_ours = {"iter"} <= content.keys() <= _ELU_KEYS or str(content.get("format", "")).startswith("faultline")
+        activation = content.get("activation", "elu" if is_ours else None)
+        if activation is None and (agent := agent_file(path)) is not None:
+            activation = read_activation(read_yaml(agent))
+        if activation is None:
+            described = 'describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
+            remedy = f"put the agent.yaml of its training beside it, or {described}"
+            raise ValueError(f"policy '{path}' does not say what is between its layers: {remedy}")
+        if not isinstance(activation, str) or activation not in ACTIVATIONS:
+            raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")
     try:
         return (RnnPolicy if any(key.startswith("rnn.") for key in state) else MlpPolicy)(state, activation)
     except (KeyError, RuntimeError, AttributeError, TypeError, IndexError, ValueError, ZeroDivisionError) as error:
@@ -133,21 +139,6 @@ def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
         got = ", ".join(sorted(statistics))
         raise ValueError(f"policy '{path}' must have _mean and _std of its normaliser, got {got}")
     return {names[key]: value for key, value in state.items()} | normaliser
-
-
-def _find_activation(content: dict[str, Any], path: Path) -> str:
-    """The function between a checkpoint's layers, by its file or by the agent.yaml of its training."""
-    ours = str(content.get("format", "")).startswith("faultline") or ("iter" in content and content.keys() <= _ELU_KEYS)
-    activation = content.get("activation", "elu" if ours else None)
-    if activation is None and (agent := agent_file(path)) is not None:
-        activation = read_activation(read_yaml(agent))
-    if activation is None:
-        described = 'describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
-        remedy = f"put the agent.yaml of its training beside it, or {described}"
-        raise ValueError(f"policy '{path}' does not say what is between its layers: {remedy}")
-    if not isinstance(activation, str) or activation not in ACTIVATIONS:
-        raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")
-    return activation
 
 
 def read_activation(agent: dict[str, Any]) -> Any:
