@@ -9,7 +9,6 @@ import pytest
 
 from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
-from qd.evaluate import tables
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
@@ -19,6 +18,7 @@ from qd.workers.compute import Compute
 from sim.files.command import run_command
 from tests.builders import make_archive
 from tests.qd.robots import Robots
+from tests.qd.searches import crossing_by
 from tests.qd.stand_in import PENALTIES, compute_by
 from tests.train.conftest import write_trained
 
@@ -71,7 +71,7 @@ def test_the_tables_from_end_to_end(anymal, archive, tmp_path):
     assert mended == sorted(split_elites(make_archive(30)).test[:4].tolist())
     # Each controller crossed four sets, in one simulation a size; the far elites are among the generated ones.
     assert [cfg.policy for cfg, _ in robots.crossed] == [STAND] * 16 + [STRETCH] * 16
-    assert all(cfg.reward and cfg.replicas == 2 for cfg in robots.opened)
+    assert all(cfg.reward and cfg.replicas == 2 for cfg in robots.opened) and not is_regression(report)
 
 
 @pytest.mark.parametrize("where", ["test", "independent"])
@@ -125,19 +125,12 @@ def test_errors_come_before_any_work_in_one_line(archive, flags, field, monkeypa
     assert field in line and not Path("runs").exists()
 
 
-@pytest.mark.parametrize(("worse", "names"), [(STAND, ("old", "new")), (STRETCH, ("new", "old"))])
-def test_a_regression_is_a_goal_rate_below_that_of_before(anymal, archive, worse, names):
-    robots = Robots(lambda cfg, terrains, seeds: np.full(len(seeds), cfg.policy == worse))
-    policies = {"old": STAND, "new": STRETCH}
-    report = tables_of(anymal, robots, {name: policies[name] for name in names}, archive=archive)
-    assert is_regression(report) == (worse == STRETCH) and list(report["controllers"]) == ["old", "new"]
-    assert json.loads(Path("runs/anymal-tables/compared.json").read_text()) == json.loads(json.dumps(report))
-    assert not is_regression(tables_of(anymal, robots, {"base": STAND}, sets=("hand_crafted",)))
-
-
-@pytest.mark.parametrize("status", [0, 1])
-def test_the_exit_status_says_whether_it_is_a_regression(archive, monkeypatch, status):
-    monkeypatch.setattr(evaluation, "evaluate_tables", lambda robot, controllers, cfg, **_: cfg)
-    monkeypatch.setattr(tables, "is_regression", lambda cfg: type(cfg) is SetsCfg and cfg.seed == 1)
-    flags = ["--policies", "old=shipped", "new=C-G.pt", "--archive", "archive.npz", "--seed", str(status)]
-    assert run_command(EvaluateCommand, [*flags, "--device", "cpu"], name="evaluate") == status
+@pytest.mark.parametrize(("worse", "status"), [("new", 1), ("old", 0)])
+def test_a_regression_is_a_goal_rate_below_that_of_before(archive, worse, status):
+    policies = {"new": STAND, "old": STRETCH}
+    robots = Robots(lambda cfg, terrains, seeds: np.full(len(seeds), cfg.policy == policies[worse]))
+    flags = ["--policies", *map("=".join, policies.items()), "--archive", "archive.npz", "--terrains", "4"]
+    with crossing_by(robots):
+        assert run_command(EvaluateCommand, [*flags, "--device", "cpu"], name="evaluate") == status
+    report = json.loads(Path("runs/anymal-tables/compared.json").read_text())
+    assert list(report["controllers"]) == ["old", "new"] and list(report["goal"]) == ["elites"]

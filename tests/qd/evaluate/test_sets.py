@@ -1,18 +1,22 @@
 """The sets that controllers are evaluated on, and the elites that are held out."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from qd.evaluate.labels import SETS
 from qd.evaluate.sets import (
+    TRAINED_ON,
     generated_set,
     hash_elites,
     make_sets,
     nearest_distance,
     random_elites,
     read_independent,
+    read_trained_on,
     set_rng,
     split_elites,
 )
@@ -22,8 +26,10 @@ from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import fresh_values, make_archive, write_run
 from tests.qd.searches import CFG
+from tests.train.conftest import write_actor, write_trained
 
 PARTS = ("test", "validation")
+GENES = make_archive(20).genes
 
 
 @pytest.mark.parametrize(
@@ -156,3 +162,21 @@ def test_an_independent_archive_is_of_another_search(tmp_path, anymal):
     ):
         with pytest.raises(ValueError, match=field):
             read_independent(path, trained, anymal)
+
+
+def test_the_records_of_all_files_of_a_controller_are_read(tmp_path):
+    path = write_trained(tmp_path, GENES[:3])
+    marks = hash_elites(GENES[:3])
+    assert len(set(marks)) == 3 and hash_elites(GENES[2::-1].astype(np.float64)) == marks[::-1]
+    for policy in (str(path), str(tmp_path / "tuned.onnx"), f"some.module:adapter@{path}"):
+        assert read_trained_on(policy) == set(marks)
+    assert read_trained_on("some.module:walk") == set() == read_trained_on(str(tmp_path / "other.pt"))
+    path.with_suffix(".train.json").write_text(json.dumps({TRAINED_ON: 5}))
+    with pytest.raises(ValueError, match=TRAINED_ON):
+        read_trained_on(str(path))
+
+
+def test_marks_in_the_file_itself_count_where_no_record_lies_beside_it(tmp_path):
+    path = write_actor(tmp_path / "policy.pt")
+    torch.save(torch.load(path, weights_only=True) | {TRAINED_ON: hash_elites(GENES)}, path)
+    assert read_trained_on(str(path)) == read_trained_on(f"some.module:adapter@{path}") == set(hash_elites(GENES))
