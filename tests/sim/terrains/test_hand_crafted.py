@@ -18,11 +18,6 @@ def crossings():
     return terrain.hand_crafted_crossings(300, 7)
 
 
-@pytest.fixture(scope="module")
-def tiles():
-    return terrain.training_tiles(20, 7)
-
-
 def square(heights):
     """The 8 m x 8 m feature in the middle of a grid."""
     return heights[:, col(4) : col(12) + 1]
@@ -38,6 +33,8 @@ def test_crossing_types_have_equal_shares_and_levels_are_uniform(crossings):
     assert set(np.unique(levels)) == set(range(10))
     assert abs(levels.mean() - 4.5) < 0.5  # standard error of 300 uniform levels: 2.87 / sqrt(300) = 0.17
     assert np.bincount(terrain.hand_crafted_crossings(8, 0)[1]).tolist() == [2, 2, 1, 1, 1, 1]
+    with pytest.raises(ValueError, match="count"):
+        terrain.hand_crafted_crossings(0, 0)
 
 
 @pytest.mark.parametrize("kind", CROSSING_TYPES)
@@ -118,8 +115,8 @@ def test_a_terrain_depends_on_the_seed_and_its_place_alone(crossings):
 # Training tiles
 
 
-def test_tiles_are_laid_out_by_level_and_column(tiles):
-    heights, types = tiles
+def test_tiles_are_laid_out_by_level_and_column():
+    heights, types = terrain.training_tiles(20, 7)
     assert heights.shape == (200, *GRID) and heights.dtype == np.float32 and np.isfinite(heights).all()
     assert np.bincount(types).tolist() == [2, 2, 7, 5, 4]  # .1 .1 .35 .25 .2 of 20 columns
     for level, column, kind in [(0, 4, "stairs_up"), (9, 4, "stairs_up"), (5, 15, "stairs_down"), (3, 0, "slope")]:
@@ -160,8 +157,3 @@ def test_obstacles_tile_has_the_levels_heights_and_keeps_off_the_edge():
     tiles = np.stack([square(training_tile("obstacles", 9, seed)) for seed in range(50)])
     np.testing.assert_allclose(np.unique(tiles), [-0.23, -0.115, 0.0, 0.115, 0.23], atol=1e-6)  # 0.05 + 0.2 * 0.9
     assert not tiles[:, [0, -1]].any() and not tiles[:, :, [0, -1]].any()
-
-
-def test_no_crossings_are_refused():
-    with pytest.raises(ValueError, match="count"):
-        terrain.hand_crafted_crossings(0, 0)

@@ -52,7 +52,7 @@ def test_an_element_appears_wherever_elements_do(name):
     assert all(dose in DoseCommand.help_values()["obstacles"] for dose in element.doses)
     for dose in element.doses:
         grids = all_doses()[dose].terrains(1, np.random.default_rng(0))
-        assert np.ptp(grids, axis=(1, 2)).min() > 0.0
+        assert np.ptp(grids, axis=(1, 2)).min() > 0.0 and (grids[1:] != grids[:-1]).any(axis=(1, 2)).all()
     kind = space.kinds.index(name)
     genes = np.full((1, space.num_genes), 0.9, np.float32)
     genes[:, ::6] = (2 * kind + 1) / len(space.kinds) - 1
