@@ -43,12 +43,9 @@ def kernel_over(array: str, **options: Any) -> Callable[[Callable[..., None]], C
 
 def make_struct(struct: Any, *sources: Any, **values: Any) -> Any:
     """A kernel argument with these values, and with what ``sources`` have under the names of other fields."""
+    named = {name: getattr(source, name) for source in sources for name in struct.vars if hasattr(source, name)}
     made = struct()
-    for name in struct.vars:
-        for source in sources:
-            if name not in values and hasattr(source, name):
-                setattr(made, name, getattr(source, name))
-    for name, value in values.items():
+    for name, value in (named | values).items():
         setattr(made, name, value)
     return made
 

@@ -79,18 +79,6 @@ def ring_slices(first: int, count: int, size: int) -> tuple[slice, ...]:
     return (whole, slice(0, rest)) if rest > 0 else (whole,)
 
 
-@wp.func
-def _take_next(queue_out: EpisodeQueue) -> int:
-    """Row of the next episode, -1 where none is ready."""
-    ready = queue_out.ready[0]
-    if queue_out.taken[0] >= ready:  # waiting robots must not increment it for ever
-        return -1
-    number = wp.atomic_add(queue_out.taken, 0, 1)
-    if number >= ready:
-        return -1
-    return number % (queue_out.seed.shape[0] * queue_out.num_replicas)
-
-
 @kernel_over("stepped")
 def turn_over(
     stepped: wp.array[int],
@@ -109,7 +97,7 @@ def turn_over(
     """
     env = wp.tid()
     queue_out.begins[env] = 0
-    row = queue_out.episode_of_env[env]
+    row = int(queue_out.episode_of_env[env])
     if row >= 0:
         queue_out.busy[env] += 1
     if stepped[env] == Outcome.RUNNING:
@@ -124,7 +112,12 @@ def turn_over(
         if queue_out.reward.shape[0] > 0:
             queue_out.reward[row] = rewards.total[env]
         wp.atomic_add(queue_out.num_ended, row // queue_out.num_replicas, 1)
-    row = _take_next(queue_out)
+        row = -1
+    ready = queue_out.ready[0]
+    if queue_out.taken[0] < ready:  # waiting robots must not increment it for ever
+        number = wp.atomic_add(queue_out.taken, 0, 1)
+        if number < ready:
+            row = number % (queue_out.seed.shape[0] * queue_out.num_replicas)
     queue_out.episode_of_env[env] = row
     if row < 0:
         return

@@ -170,12 +170,13 @@ class Rollout:
         self.num_envs = min(num_envs or num_terrains * replicas, num_terrains * replicas)
         self.space = space
         self.watch: Callable[[bool], None] | None = None
-        self._with_ground = with_ground or bool(space.ground)
-        self._with_conditions = with_conditions or bool(space.conditions)
+        with_ground |= bool(space.ground)
+        with_conditions |= bool(space.conditions)
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
-            self._build(loaded, solver, device)
+            bank = TerrainBank(num_terrains, device=device, with_ground=with_ground, with_conditions=with_conditions)
+            self._build(bank, loaded, solver)
         except (MemoryError, RuntimeError) as error:  # those of Warp have no type of their own
             failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
             if not failed and not str(error).startswith("Failed to allocate"):
@@ -185,14 +186,11 @@ class Rollout:
                 f"and {num_terrains:,} terrains at once: give fewer"
             ) from error
 
-    def _build(self, policy: Policy, solver: SolverCfg | None, device: str) -> None:
+    def _build(self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None) -> None:
         from sim.simulation import Reward, Simulation  # Newton takes seconds to load: only what simulates loads it
 
         robot = self.robot
         num_envs = self.num_envs
-        bank = TerrainBank(
-            self.num_terrains, device=device, with_ground=self._with_ground, with_conditions=self._with_conditions
-        )
         self.sim = sim = Simulation(robot, bank, np.zeros(num_envs, dtype=int), cfg=solver)
         self._lots: deque[_Lot] = deque()  # under way, the oldest first
         self._next_slot = 0  # of the ring, where the next terrain goes
@@ -202,7 +200,7 @@ class Rollout:
         self._began_at = 0  # the step at which all robots last began together
         self._taken_at = 0  # step and time of the last result
         self._taken_s = time.perf_counter()
-        with wp.ScopedDevice(device):
+        with wp.ScopedDevice(bank.device):
             self.command = wp.zeros((num_envs, 3), dtype=float)
             self._action = wp.zeros((num_envs, robot.num_joints), dtype=float)
             self._last_action = wp.zeros_like(self._action)
@@ -210,7 +208,7 @@ class Rollout:
             self._counter = wp.zeros(1, dtype=int)
             self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
             self._queue = make_queue(
-                num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=device
+                num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=bank.device
             )
             self.episode = self._queue.episode_of_env
             self._ranges = make_start_ranges(self.cfg, robot)
