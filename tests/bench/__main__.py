@@ -20,8 +20,15 @@ from sim.files.intervals import format_value
 from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
-from tests.bench.ceiling import Ceiling, measure_ceiling
-from tests.bench.timing import Timing, fit_launches, repeat_torch, repeat_warp, time_in_turns
+from tests.bench.ceiling import (
+    Ceiling,
+    Timing,
+    fit_launches,
+    measure_ceiling,
+    repeat_torch,
+    repeat_warp,
+    time_in_turns,
+)
 
 
 def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *, compiled: bool) -> dict[str, Any]:
@@ -44,29 +51,17 @@ def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *,
     variants["ours"] = fit_launches(partial(repeat_warp, case.launch, device=device), device, timing)
     ms = {name: 1e3 * seconds for name, seconds in time_in_turns(variants, device, timing).items()}
     ceiling_share, bound_by = ceiling.judge(case.work, 1e-3 * ms["ours"])
-    return {
-        "kernel": case.name,
-        "ours_ms": ms["ours"],
-        "torch_ms": ms["torch"],
-        "torch_compile_ms": ms.get("torch_compile"),
-        "speedup": ms["torch"] / ms["ours"],
-        "ceiling_share": ceiling_share,
-        "bound_by": bound_by,
-    }
+    times = {f"{name}_ms": ms.get(name) for name in ("ours", "torch", "torch_compile")}
+    speedup = ms["torch"] / ms["ours"]
+    return {"kernel": case.name, **times, "speedup": speedup, "ceiling_share": ceiling_share, "bound_by": bound_by}
 
 
 def print_table(report: dict[str, Any]) -> None:
     """Prints the rows."""
-    rows = [
-        (
-            row["kernel"],
-            *(format_value(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")),
-            f"{row['speedup']:.1f}x",
-            f"{row['ceiling_share']:.1%}",
-            row["bound_by"],
-        )
-        for row in report["rows"]
-    ]
+    rows = []
+    for row in report["rows"]:
+        times = [format_value(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")]
+        rows.append((row["kernel"], *times, f"{row['speedup']:.1f}x", f"{row['ceiling_share']:.1%}", row["bound_by"]))
     title = f"{report['device']}: {report['num_envs']} robots on {report['num_terrains']} terrains"
     show_table(title, ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"), rows)
 

@@ -60,19 +60,6 @@ def surface(heights: Tensor, terrain_of_env: Tensor, spacing: float, x: Tensor, 
     return height, torch.where(low, low_x, high_x) / spacing, torch.where(low, low_y, high_y) / spacing
 
 
-def scan(
-    joint_q: Tensor, terrain_of_env: Tensor, heights: Tensor, scan_x: Tensor, scan_y: Tensor, spacing: float
-) -> Tensor:
-    """Height scan as in the observation row, shape (E, scan points)."""
-    qx, qy, qz, qw = joint_q[:, 3:7].unbind(1)
-    yaw = torch.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))[:, None]
-    cos, sin = yaw.cos(), yaw.sin()
-    x = joint_q[:, 0:1] + cos * scan_x - sin * scan_y
-    y = joint_q[:, 1:2] + sin * scan_x + cos * scan_y
-    ground = surface(heights, terrain_of_env, spacing, x, y)[0]
-    return (joint_q[:, 2:3] - columns.SCAN_OFFSET - ground).clamp(-1.0, 1.0) * columns.SCAN_SCALE
-
-
 def rotate_inverse(quaternion: Tensor, vector: Tensor) -> Tensor:
     """World vectors (E, 3) in the frames that the quaternions (E, 4), xyzw, turn into the world."""
     axis, w = quaternion[:, :3], quaternion[:, 3:]
@@ -94,6 +81,12 @@ def observation(
 ) -> Tensor:  # fmt: skip
     """The whole observation row without noise, shape (E, 12 + 3 J + scan points); ``down`` is (0, 0, -1)."""
     lin_vel, ang_vel = base_velocities(joint_q, joint_qd, base_com)
+    qx, qy, qz, qw = joint_q[:, 3:7].unbind(1)
+    yaw = torch.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))[:, None]
+    cos, sin = yaw.cos(), yaw.sin()
+    x = joint_q[:, 0:1] + cos * scan_x - sin * scan_y
+    y = joint_q[:, 1:2] + sin * scan_x + cos * scan_y
+    ground = surface(heights, terrain_of_env, spacing, x, y)[0]
     row = [
         lin_vel * columns.LIN_VEL_SCALE,
         ang_vel * columns.ANG_VEL_SCALE,
@@ -102,7 +95,7 @@ def observation(
         joint_q[:, 7:] - default_joint_pos,
         joint_qd[:, 6:] * columns.JOINT_VEL_SCALE,
         last_action,
-        scan(joint_q, terrain_of_env, heights, scan_x, scan_y, spacing),
+        (joint_q[:, 2:3] - columns.SCAN_OFFSET - ground).clamp(-1.0, 1.0) * columns.SCAN_SCALE,
     ]
     return torch.cat(row, dim=1).clamp_(-columns.OBSERVATION_LIMIT, columns.OBSERVATION_LIMIT)
 
