@@ -88,7 +88,7 @@ class SolverCfg:
 
     iterations: int = 5
     """Newton iterations a step at most. Caps of 3 to 50 give the same rates (results/bench/options-*.json), but with 4
-    the forces of a hard landing are off by up to 2 % of its impulse (tests/sim/robots/test_standing.py notices)."""
+    the forces of a hard landing are off by up to 2 % of its impulse (tests/sim/robots/test_drops.py notices)."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
     time_constant_s: float | None = None

@@ -119,6 +119,10 @@ def test_a_recording_comes_back_from_its_file(recording, anymal, tmp_path):
     assert back.origin["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
     assert {"policy", "space", "command", "commit", "device", "versions", "seed", "date"} <= back.origin.keys()
     assert back.labels == ("spike", "slope") and back.robot == "anymal" and back.genes is None
+    hit, longest = back.select_terrain(0), recording.num_frames[0].max()
+    for name in ("penalties", "touching"):
+        np.testing.assert_array_equal(getattr(hit, name), getattr(recording, name)[:1, :, :longest])
+    assert hit.labels == ("spike",) and hit.seeds.tolist() == [5]
     # A frame is 3 + 4 + 6 floats of 4 bytes and 12 + 12 + 3 of 2; with two height grids no more than that.
     assert (tmp_path / "a.npz").stat().st_size < 8 * 51 * 106 + 2 * 161 * 321 * 4
 
@@ -135,28 +139,15 @@ def test_terrains_given_by_genes_are_stored_as_genes(rollout, anymal, tmp_path):
     assert np.ptp(back.heights) > 0.1
 
 
-CHANGES = {
-    "another version": {"format": np.array("faultline recording 0")},
-    "neither genes nor heights": {"heights": None},
-    "an origin that is no JSON": {"origin": np.array("{")},
-}
-
-
 def test_what_is_no_recording_is_refused(recording, tmp_path):
     path = tmp_path / "a.npz"
     write_recording(path, recording)
     with np.load(path) as content:
         arrays = dict(content)
-    for name, changes in CHANGES.items():
-        np.savez(path, **{key: value for key, value in (arrays | changes).items() if value is not None})
+    for name, value in {"format": "faultline recording 0", "heights": None, "origin": "{"}.items():
+        changed = arrays | {name: np.array(value)}
+        np.savez(path, **{key: array for key, array in changed.items() if array.dtype != object})
         with pytest.raises(ValueError, match=r"a\.npz"):
-            pytest.fail(f"{name}: {read_recording(path)}")
+            read_recording(path)
     with pytest.raises(FileNotFoundError):
         read_recording(tmp_path / "elsewhere.npz")
-
-
-def test_the_recording_of_one_terrain(recording):
-    terrain, most = recording.select_terrain(0), int(recording.num_frames[0].max())
-    np.testing.assert_array_equal(terrain.penalties, recording.penalties[:1, :, :most])
-    np.testing.assert_array_equal(terrain.touching, recording.touching[:1, :, :most])
-    assert terrain.labels == ("spike",) and terrain.seeds.tolist() == [5]

@@ -1,17 +1,27 @@
-"""The shipped robots: published numbers, the same robot to Newton and to MuJoCo, and what is asked of each."""
+"""The shipped robots: published numbers, the same robot to Newton and to MuJoCo, and what is asked of each; records
+name the robot and the controller that they are of, and of a robot that is another now they are refused."""
 
+import dataclasses
+import hashlib
 import json
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
 from kernels.penalties import BASE, FOOT, LIMB
-from sim.robots.find import read_penalty_scales
+from sim.controllers.loaders import load_policy
+from sim.controllers.spec import controller_identity
+from sim.robots.find import get_robot, read_penalty_scales, resolve_robot
 from sim.robots.model import build_robot
-from sim.robots.robot import robot_identity
+from sim.robots.robot import check_robot_identity, robot_digest, robot_identity
+from sim.robots.shipped import ROBOTS
+from sim.robots.training import TrainingCfg
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
+from tests.builders import rsl_rl_actor, save_checkpoint
+from tests.sim.dogs import write_dog
 from tests.sim.scenes import ONLY_ANYMAL, ONLY_CASSIE
 
 
@@ -108,3 +118,47 @@ def test_penalty_scales_are_read(anymal, monkeypatch, tmp_path):
     file.write_text(json.dumps({"scales": scales | {"stumble": 0.0}, **robot_identity(anymal)}))
     with pytest.raises(ValueError, match="stumble"):
         read_penalty_scales(anymal)
+
+
+def test_records_name_robot_and_controller_by_hash(anymal, tmp_path):
+    record = controller_identity(anymal, anymal.policy_file)
+    assert record["robot"] == "anymal" and record["policy"] == "anymal.pt"
+    assert record["robot_sha256"] == robot_digest(anymal)
+    assert record["policy_sha256"] == hashlib.sha256(anymal.policy_file.read_bytes()).hexdigest()
+    check_robot_identity(record, anymal, Path("a.json"), "make it anew")
+    for key in ("robot_sha256", "penalty_definition"):
+        for changed in (record | {key: "other"}, {name: value for name, value in record.items() if name != key}):
+            with pytest.raises(ValueError, match=r"a\.json"):
+                check_robot_identity(changed, anymal, Path("a.json"), "make it anew")
+
+
+def test_a_robots_hash_follows_its_settings_but_those_of_training(anymal):
+    digest = robot_digest(anymal)
+    assert robot_digest(dataclasses.replace(anymal, max_speed=99.0)) != digest
+    assert robot_digest(dataclasses.replace(anymal, training=TrainingCfg(push_speed=9.0))) == digest
+
+
+def test_a_changed_robot_is_warned_of_by_its_controller_and_refused_by_its_records(tmp_path, capsys):
+    dog = write_dog(tmp_path)
+    robot = get_robot(str(dog))
+    record = {"robot": "dog", **robot_identity(robot)}
+    assert resolve_robot(record, str(dog), tmp_path) == robot
+    policy = save_checkpoint(dog.parent / "a1.pt", rsl_rl_actor(12 + 24 + 15, 8).state_dict())
+    policy.with_suffix(".train.json").write_text(json.dumps({"settings": {"robot_sha256": robot_digest(robot)}}))
+    load_policy(policy, dataclasses.replace(robot, physics_dt=0.001, decimation=20), "cpu")  # finer, not another
+    assert "warning" not in capsys.readouterr().err
+    dog.write_text(dog.read_text().replace("contact_force_limit=150.0", "contact_force_limit=15.0"))
+    changed = get_robot(str(dog))
+    with pytest.raises(ValueError, match=record["robot_sha256"][:12]):
+        resolve_robot(record, str(dog), tmp_path)
+    load_policy(policy, changed, "cpu")
+    load_policy(policy, changed, "cpu")
+    assert capsys.readouterr().err.count("warning") == 1
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_shipped_scales_are_of_the_shipped_robot_and_controller(name):
+    """If this fails, a shipped file has changed: its scales must be measured again."""
+    robot = ROBOTS[name]
+    content = json.loads(robot.scales_file.read_text())
+    assert controller_identity(robot, robot.policy_file).items() <= content.items()
