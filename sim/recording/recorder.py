@@ -246,26 +246,22 @@ def read_recording(path: str | Path) -> Recording:
     if not os.path.isfile(path):
         raise FileNotFoundError(f"no recording at {path}: commands that show crossings keep theirs in runs/recordings")
     try:
-        return _read(path)
+        content = read_arrays(path)
+        version = str(content.pop("format", "none"))
+        if version != FORMAT:
+            raise ValueError(f"its format is {version}, expected '{FORMAT}'")
+        values: dict[str, Any] = {"genes": None, **content}
+        for name, array in content.items():
+            if array.dtype.kind == "U":
+                values[name] = tuple(array.tolist()) if array.ndim else str(array)
+            elif array.dtype == np.float16:
+                values[name] = array.astype(np.float32)
+        origin = values["origin"] = json.loads(values["origin"])
+        if maps := {name: values.pop(name) for name in _MAPS if name in content}:
+            values["ground"] = GroundMaps(**maps)
+        if "heights" not in content:
+            values["heights"] = make_heights(content["genes"], get_space(origin["space"]))
+        values["dt"] = float(content["dt"])
+        return Recording(**values)
     except Exception as error:  # zip, zlib, npy headers and JSON answer damage with a dozen types
         raise ValueError(f"{path} must be a recording of crossings, got: {error}: record it again") from None
-
-
-def _read(path: Path) -> Recording:
-    content = read_arrays(path)
-    version = str(content.pop("format", "none"))
-    if version != FORMAT:
-        raise ValueError(f"its format is {version}, expected '{FORMAT}'")
-    values: dict[str, Any] = {"genes": None, **content}
-    for name, array in content.items():
-        if array.dtype.kind == "U":
-            values[name] = tuple(array.tolist()) if array.ndim else str(array)
-        elif array.dtype == np.float16:
-            values[name] = array.astype(np.float32)
-    origin = values["origin"] = json.loads(values["origin"])
-    if maps := {name: values.pop(name) for name in _MAPS if name in content}:
-        values["ground"] = GroundMaps(**maps)
-    if "heights" not in content:
-        values["heights"] = make_heights(content["genes"], get_space(origin["space"]))
-    values["dt"] = float(content["dt"])
-    return Recording(**values)

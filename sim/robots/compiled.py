@@ -4,6 +4,7 @@ Each joint has at most one position actuator, of the joint's name; geoms touch t
 MuJoCo's but gravity and ``impratio``.
 """
 
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
@@ -86,7 +87,14 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
         home = next((list(key.qpos) for key in spec.keys if key.name == "home"), [])
         _name_geoms(spec)
         refused = [*_refused_elements(spec)]
-        _strip(spec)
+        # What simulations leave out; whatever names a body would keep it from being fused.
+        unused = (spec.sensors, spec.keys, spec.excludes, spec.pairs, spec.cameras, spec.lights, spec.tuples)
+        for element in itertools.chain(*unused):
+            spec.delete(element)
+        usual = mj.MjSpec()
+        for name in ("gravity", "impratio"):
+            setattr(usual.option, name, getattr(spec.option, name))
+        spec.option = usual.option
         spec.fuse_static()
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
@@ -178,16 +186,6 @@ def _name_geoms(spec: Any) -> None:
                     geom.name += "_"
             taken.add(geom.name)
             geom.contype, geom.conaffinity = 1, 0
-
-
-def _strip(spec: Any) -> None:
-    """Takes out what simulations leave out of a file; whatever names a body would keep it from being fused."""
-    for element in (*spec.sensors, *spec.keys, *spec.excludes, *spec.pairs, *spec.cameras, *spec.lights, *spec.tuples):
-        spec.delete(element)
-    usual = mj.MjSpec()
-    for name in ("gravity", "impratio"):
-        setattr(usual.option, name, getattr(spec.option, name))
-    spec.option = usual.option
 
 
 def _refused_elements(spec: Any) -> Iterator[str]:

@@ -116,6 +116,11 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     if len(pose) != model.njnt - 1 or not all(isinstance(q, int | float) and math.isfinite(q) for q in pose):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
     roles = _infer_roles(given, model, pose)
+    data = mj.MjData(model)
+    data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *pose]
+    mj.mj_kinematics(model, data)
+    feet = [k for k in range(model.ngeom) if model.geom(k).name in roles["foot_geoms"]]
+    reach = np.abs(data.geom_xpos[feet, :2]) + model.geom_rbound[feet, None]  # of the feet from the base
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     controller = file.with_name("controller.toml")
     terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
@@ -127,7 +132,7 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
         "default_joint_pos": pose,
         "penalties": [p.name for p in PENALTIES.values() if p.default and (roles["limb_geoms"] or not p.needs_limbs)],
         "contact_force_limit": float(f"{weight:.3g}"),
-        "footprint": _footprint(model, pose, roles["foot_geoms"]),
+        "footprint": [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)],
         "scan_x": scan.get("x", []),
         "scan_y": scan.get("y", []),
     }
@@ -148,16 +153,6 @@ def _infer_roles(given: dict[str, Any], model: Any, pose: Sequence[float]) -> di
     with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
     roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
     return roles
-
-
-def _footprint(model: Any, pose: Sequence[float], feet: Sequence[str]) -> list[float]:
-    """Half length and half width of the rectangle about the base that holds the feet in the default pose [m]."""
-    data = mj.MjData(model)
-    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), pose
-    mj.mj_kinematics(model, data)
-    numbers = [k for k in range(model.ngeom) if model.geom(k).name in feet]
-    reach = np.abs(data.geom_xpos[numbers, :2]) + model.geom_rbound[numbers, None]
-    return [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)]
 
 
 def describe_inferred(robot: RobotCfg) -> str:
