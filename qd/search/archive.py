@@ -30,10 +30,7 @@ class FreshValues(Evaluation):
     """Whether an elite lands in its cell or in a neighbour again, shape (N,)."""
 
     def corrected_elites(self) -> NDArray[np.int64]:
-        """Rows of the archive that fresh episodes alone would make: the fittest elite of each cell.
-
-        It is the "corrected archive" of Flageat and Cully 2023.
-        """
+        """Rows of the "corrected archive" of Flageat and Cully 2023: by fresh episodes the fittest of each cell."""
         valid = np.flatnonzero(self.valid & (self.fitness > FITNESS_FLOOR))
         order = valid[np.lexsort((-self.fitness[valid], self.cell[valid]))]
         return order[np.unique(self.cell[order], return_index=True)[1]]
@@ -83,7 +80,8 @@ class Subject:
 class Archive(Evaluation, Subject):
     """N elites by descending fitness: by the corrected one if there are fresh episodes, else as they were found.
 
-    Outcomes count episodes by :data:`OUTCOMES`; they are 0 for an elite that was not crossed.
+    Outcomes count episodes by :data:`OUTCOMES`: those of the controller that was searched in arrays of shape (N, 4),
+    those of C others, the certifiers, in (N, C, 4). They are 0 for an elite that was not crossed.
     """
 
     penalties: tuple[str, ...]
@@ -92,7 +90,6 @@ class Archive(Evaluation, Subject):
     """What raw penalty sums were divided by."""
     iterations: int
 
-    # As found, beside the evaluation.
     genes: NDArray[np.float32]
     """Clipped genes, shape (N, num_genes)."""
     iteration: NDArray[np.int64]
@@ -106,24 +103,17 @@ class Archive(Evaluation, Subject):
     """What stops the robot where its typical episode ends (:func:`qd.faults.causes.find_causes`), shape (N,); empty
     where the elite does not fail."""
 
-    # With contact resolved, by the controller that was searched.
     resolved_outcomes: NDArray[np.int64]
-    """Shape (N, 4)."""
-
-    # By C other controllers.
+    """With contact resolved."""
     certifiers: tuple[str, ...] = ()
-    """Their names."""
     certifier_sha256: tuple[str, ...] = ()
     certifier_outcomes: NDArray[np.int64]
-    """At the search's settings, shape (N, C, 4)."""
+    """At the search's settings."""
     certifier_resolved_outcomes: NDArray[np.int64]
-    """With contact resolved, shape (N, C, 4)."""
 
     # Under varied conditions (:func:`sim.terrains.spaces.wider.varied_genes`); None before.
     varied_outcomes: NDArray[np.int64] | None = None
-    """By the controller that was searched, shape (N, 4)."""
     certifier_varied_outcomes: NDArray[np.int64] | None = None
-    """By the others, shape (N, C, 4)."""
 
     def __len__(self) -> int:
         return len(self.fitness)
@@ -192,13 +182,6 @@ class Archive(Evaluation, Subject):
         """Whether anything was crossed with contact resolved or by other controllers."""
         return bool(self.certifiers) or bool(self.resolved_outcomes.any())
 
-    def has_same_elites(self, other: "Archive") -> bool:
-        """Whether another archive found the same elites with the same values, in whatever order."""
-        if len(self) != len(other):
-            return False
-        tables = (self.rows(np.argsort(self.cell)), other.rows(np.argsort(other.cell)))
-        return all(np.array_equal(*(getattr(table, name) for table in tables)) for name in _FOUND)
-
     def rows(self, chosen: NDArray[Any]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
         return replace(super().rows(chosen), fresh=self.fresh and self.fresh.rows(chosen))
@@ -210,12 +193,8 @@ class Archive(Evaluation, Subject):
 
 def no_outcomes(num_elites: int) -> dict[str, Any]:
     """Columns of an :class:`Archive` whose elites nobody has crossed under other conditions."""
-    nobody = np.zeros((num_elites, 0, 4), np.int64)
-    return {
-        "resolved_outcomes": np.zeros((num_elites, 4), np.int64),
-        "certifier_outcomes": nobody,
-        "certifier_resolved_outcomes": nobody,
-    }
+    shapes = {"resolved_outcomes": (4,), "certifier_outcomes": (0, 4), "certifier_resolved_outcomes": (0, 4)}
+    return {name: np.zeros((num_elites, *shape), np.int64) for name, shape in shapes.items()}
 
 
 # Arrays of the file by group, with their dimensions: N elites, G genes, P penalties, C certifiers, or a size.
@@ -231,6 +210,7 @@ _CERTIFIERS = {"certifiers": "C", "certifier_sha256": "C"}
 _CROSSED = {**_CERTIFIERS, "resolved_outcomes": "N4", "certifier_outcomes": "NC4", "certifier_resolved_outcomes": "NC4"}
 _VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
 _BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED)  # groups that a file has whole, or not at all
+_TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
 
 
@@ -258,31 +238,19 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *_FOUND) if name not in _OPTIONAL or name in stored]
         names += [name for group in _BY_JUDGING if not stored.isdisjoint(group) for name in group]
         arrays = read_arrays(file, names)
-        _check(arrays)
-        values = {name: _to_field(name, array) for name, array in arrays.items()}
+        sizes = {"2": 2, "4": len(OUTCOMES)}
+        check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
+        for name, array in arrays.items():
+            kinds, content = ("U", "texts") if name in _TEXTS else ("bif", "numbers")
+            if array.dtype.kind not in kinds:
+                raise ValueError(f"{name} must hold {content}, got {array.dtype}")
+            if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():
+                raise ValueError(f"{name} must be finite")
+        values: dict[str, Any] = no_outcomes(len(arrays["fitness"])) | arrays
+        for name in arrays.keys() & {*_SETTINGS, *_CERTIFIERS}:  # as the dataclass has them
+            values[name] = tuple(array.tolist()) if (array := arrays[name]).ndim else array.item()
         fresh = {name.removeprefix(_PREFIX): values.pop(name) for name in _FRESH if name in values}
-        values = no_outcomes(len(arrays["fitness"])) | values
         return Archive(**values, fresh=FreshValues(**fresh) if fresh else None)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         message = f"{file} must be the archive of a search, but it is damaged or another file: {error}"
         raise ValueError(message) from None
-
-
-def _to_field(name: str, array: NDArray[Any]) -> Any:
-    """A field as the dataclass has it: settings and names as Python values, columns as they are."""
-    if name not in (*_SETTINGS, *_CERTIFIERS):
-        return array
-    return tuple(array.tolist()) if array.ndim else array.item()
-
-
-def _check(arrays: dict[str, NDArray[Any]]) -> None:
-    """Refuses arrays of other shapes, texts in place of numbers, and numbers in place of texts."""
-    sizes = {"2": 2, "4": len(OUTCOMES)}
-    check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
-    texts = {*_SETTINGS, *_CERTIFIERS, "cause"} - {"intervals", "collision_bit", "iterations", "scales"}
-    for name, array in arrays.items():
-        is_text = name in texts
-        if array.dtype.kind not in ("U" if is_text else "bif"):
-            raise ValueError(f"{name} must hold {'texts' if is_text else 'numbers'}, got {array.dtype}")
-        if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():
-            raise ValueError(f"{name} must be finite")

@@ -14,11 +14,10 @@ from typing import Any
 from qd.search.methods import METHODS
 from sim.files.atomic import write_atomically
 
+REMEDY = "put a copy of it back, or start a new run"
 _KIND = b"faultline search checkpoint "
 _MAGIC = _KIND + b"6\n"
 _HASH_BYTES = 32
-_REMEDY = "put a copy of it back, or start a new run"
-
 _ADMITTED = {
     "numpy": ("dtype", "ndarray", "float32", "float64", "int32", "int64"),
     "numpy._core.multiarray": ("_reconstruct", "scalar"),
@@ -47,8 +46,7 @@ class _StateUnpickler(pickle.Unpickler):
     """Builds plain values and the admitted classes."""
 
     def find_class(self, module: str, name: str) -> Any:
-        methods = {method.__name__: method for method in METHODS.values()}
-        if name in methods:
+        if name in (methods := {method.__name__: method for method in METHODS.values()}):
             return methods[name]
         if name not in _ADMITTED.get(module, ()):
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which is no part of a search")
@@ -66,22 +64,21 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {_REMEDY}") from None
+        raise ValueError(f"{path} must be a search checkpoint, got: {error.strerror}; {REMEDY}") from None
     header = len(_MAGIC) + _HASH_BYTES
     if not data.startswith(_KIND):
-        raise ValueError(f"{path} must start with {_KIND!r}, got {data[: len(_KIND)]!r}: another file's; {_REMEDY}")
+        raise ValueError(f"{path} must start with {_KIND!r}, got {data[: len(_KIND)]!r}: another file's; {REMEDY}")
     if not data.startswith(_MAGIC):
         raise ValueError(f"{path} was written by another version of faultline: start a new run")
     payload = data[header:]
     if hashlib.sha256(payload).digest() != data[len(_MAGIC) : header]:
-        raise ValueError(
-            f"{path} is truncated or damaged: its {len(payload)} bytes of state do not have their SHA-256; {_REMEDY}"
-        )
+        damage = f"its {len(payload)} bytes of state do not have their SHA-256"
+        raise ValueError(f"{path} is truncated or damaged: {damage}; {REMEDY}")
     try:
         state = _StateUnpickler(io.BytesIO(payload)).load()
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{path} is no checkpoint of a search: {reason}; {_REMEDY}") from None
+        raise ValueError(f"{path} is no checkpoint of a search: {reason}; {REMEDY}") from None
     if not isinstance(state, dict):
         raise ValueError(f"{path} is no checkpoint of a search: expected a dictionary, got {type(state).__name__}")
     return state

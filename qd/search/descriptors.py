@@ -33,17 +33,12 @@ def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64
 class Cells:
     """The reachable cells of an archive, numbered from 0, and the mapping of ratios to them.
 
-    A tuple of interval indices i_1 .. i_n (each in 0 .. intervals - 1) spans a box whose lower corner sums to
-    sum(i) / intervals and whose upper corner to (sum(i) + n) / intervals. The plane sum(ratios) = 1 passes through
-    the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple does not count if the plane only touches
-    a corner of its box. With a collision bit every tuple is two cells, the one with a collision in the upper half of
-    the numbers.
-
-    Args:
-        num_ratios: Number of ratio descriptors, at least 2.
-        intervals: Intervals that [0, 1] is divided into; 1.0 belongs to the last.
-        collision_bit: Whether a base collision in any of 20 episodes is a descriptor too
-            (:attr:`qd.search.fitness.Evaluation.collides`).
+    A tuple of interval indices i_1 .. i_n (each in 0 .. intervals - 1, where 1.0 belongs to the last interval) spans a
+    box whose lower corner sums to sum(i) / intervals and whose upper corner to (sum(i) + n) / intervals. The plane
+    sum(ratios) = 1 passes through the inside of the box exactly when sum(i) < intervals < sum(i) + n; a tuple does not
+    count if the plane only touches a corner of its box. With a ``collision_bit``, which says whether there is a base
+    collision in any of 20 episodes (:attr:`qd.search.fitness.Evaluation.collides`), every tuple is two cells, the one
+    with a collision in the upper half of the numbers.
     """
 
     def __init__(self, num_ratios: int, intervals: int = 10, *, collision_bit: bool = False) -> None:
@@ -83,9 +78,7 @@ class Cells:
     def find_cells(self, ratios: ArrayLike, collided: ArrayLike | None = None) -> NDArray[np.int64]:
         """Index of the reachable cell of each row of ratios, shape (batch,).
 
-        Args:
-            ratios: Float64 ratios, each row not negative and summing to 1, shape (batch, num_ratios).
-            collided: The collision bit, shape (batch,); needed where there is one.
+        Rows of the float64 ratios, (batch, num_ratios), sum to 1; ``collided`` is the collision bit, if there is one.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
         if ratios.ndim != 2 or ratios.shape[1] != self.num_ratios:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
-from qd.search.checkpoint import load_checkpoint, save_checkpoint
+from qd.search.checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from qd.search.settings import SearchCfg, as_settings, differences, from_settings
 from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
 from sim.robots.robot import RobotCfg, check_robot_identity
@@ -28,8 +28,6 @@ METRICS_FILE = "metrics.jsonl"
 SUMMARY_FILE = "archive.json"
 ROUNDS_FILE = "rounds.json"
 """Rounds of search and training, in the directory that holds the runs of both."""
-_REMEDY = "put a copy of it back, or start a new run"
-
 Metrics = list[dict[str, Any]]
 """One row an iteration."""
 
@@ -49,23 +47,19 @@ def find_run(
     """
     if named is not None:
         if published == "never" and _is_published(named):
-            raise ValueError(
-                f"{named} is published and stays as it is: copy its directory below {RUNS}/, and name that"
-            )
+            raise ValueError(f"{named} is published and stays as it is: copy it below {RUNS}/, and name that")
         return named
     folder = results_folder() / robot.name / "archive"
-    runs = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
     files = sorted(RUNS.glob(f"*/{ARCHIVE_FILE}"), key=lambda file: file.stat().st_mtime, reverse=True)
-    newest = next((file.parent for file in files if _read_robot(file) == robot.name), None)
-    if newest is not None:
-        runs.insert(len(runs) if published == "first" else 0, newest)
-    if not runs:
+    runs = (file.parent for file in files if _read_robot(file) == robot.name)
+    shipped = [folder] if (folder / ARCHIVE_FILE).exists() and published != "never" else []
+    run = next(itertools.chain(*((shipped, runs) if published == "first" else (runs, shipped))), None)
+    if run is None:
         searched = f"{RUNS}/" if published == "never" else f"{RUNS}/ or in {folder} (a clone of the project has it)"
-        raise FileNotFoundError(
-            f"no archive of {robot.name} under {searched}: search one with `faultline archive`, or name a run"
-        )
-    print(f"Run: {runs[0]}", flush=True)
-    return runs[0]
+        remedy = "search one with `faultline archive`, or name a run"
+        raise FileNotFoundError(f"no archive of {robot.name} under {searched}: {remedy}")
+    print(f"Run: {run}", flush=True)
+    return run
 
 
 def _is_published(path: Path) -> bool:
@@ -110,22 +104,18 @@ def check_space(archive: Archive, named: str | None) -> None:
     """Loads the terrain space that the command line names; refuses an archive whose space is not known then."""
     if named is not None:
         load_space(named)
-    expected = get_space(archive.space, archive.space_sha256).num_genes
-    got = archive.genes.shape[1]
+    expected, got = get_space(archive.space, archive.space_sha256).num_genes, archive.genes.shape[1]
     if got != expected:
-        raise ValueError(
-            f"the archive must have {expected} genes a terrain of {archive.space}, got {got}: put a copy of it back"
-        )
+        rule = f"must have {expected} genes a terrain of {archive.space}"
+        raise ValueError(f"the archive {rule}, got {got}: put a copy of it back")
 
 
 def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
     """Refuses an archive that is not of the settings beside it."""
     stored = archive.robot, archive.space_sha256 or archive.space, archive.penalties, archive.scales
     if stored != (cfg.robot, cfg.space_sha256 or cfg.space, cfg.fitness.penalties, cfg.fitness.scales):
-        raise ValueError(
-            f"{folder / ARCHIVE_FILE} must have robot, space, penalties and scales of {CONFIG_FILE}, got "
-            f"{', '.join(map(str, stored))}: put back the one that is not this run's"
-        )
+        rule = f"must have robot, space, penalties and scales of {CONFIG_FILE}, got {', '.join(map(str, stored))}"
+        raise ValueError(f"{folder / ARCHIVE_FILE} {rule}: put back the one that is not this run's")
 
 
 def output_folder(run: Path, robot: str) -> Path:
@@ -136,8 +126,7 @@ def output_folder(run: Path, robot: str) -> Path:
     folder = find_directory(run)
     if not _is_published(folder):
         return folder
-    name = folder.resolve().name
-    return RUNS / (f"{robot}-published" + ("" if name == "archive" else f"-{name}"))
+    return RUNS / f"{robot}-published-{folder.resolve().name}".removesuffix("-archive")
 
 
 def free_path(name: str) -> Path:
@@ -183,7 +172,7 @@ class RunDirectory:
         config = read_json(file)
         kinds = {"settings": dict, "iterations": int, "device": str, "sessions": list}
         if any(type(config.get(name)) is not kind for name, kind in kinds.items()):
-            raise ValueError(f"{file} must hold {', '.join(kinds)}, got {', '.join(config)}; {_REMEDY}")
+            raise ValueError(f"{file} must hold {', '.join(kinds)}, got {', '.join(config)}; {REMEDY}")
         return config
 
     def read_cfg(self) -> SearchCfg:
@@ -192,9 +181,8 @@ class RunDirectory:
         try:
             return from_settings(config["settings"], config["iterations"])
         except ValueError as error:
-            raise ValueError(
-                f"{self.path / CONFIG_FILE} is damaged or of another version: {error}; {_REMEDY}"
-            ) from None
+            text = f"{self.path / CONFIG_FILE} is damaged or of another version: {error}; {REMEDY}"
+            raise ValueError(text) from None
 
     def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
         """Writes what the run is asked to do from now on, after ``done`` iterations.
@@ -208,10 +196,8 @@ class RunDirectory:
         write_atomically(self.path / CONFIG_FILE, to_json(config))
 
     def save(self, cfg: SearchCfg, scheduler: Any, metrics: Metrics, archive: Archive) -> None:
-        """Saves an iteration; killed anywhere in here, the run is either before or after it.
-
-        The settings let a checkpoint that strayed here be noticed.
-        """
+        """Saves an iteration; killed anywhere in here, the run is either before or after it."""
+        # By the settings a checkpoint that strayed here is noticed.
         state = {"settings": as_settings(cfg), "metrics": metrics, "scheduler": scheduler}
         save_checkpoint(self.path / CHECKPOINT_FILE, state)
         self.write_derived(metrics, archive)
@@ -222,45 +208,35 @@ class RunDirectory:
         write_atomically(self.path / METRICS_FILE, rows.encode())
         write_archive(self.path / ARCHIVE_FILE, archive)
 
-    def load(self, cfg: SearchCfg) -> tuple[Any, Metrics] | None:
+    def load(self, cfg: SearchCfg) -> tuple[Any, Metrics]:
         """Scheduler and metrics of the search that is to go on, as its checkpoint has them.
 
-        None if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
+        (None, []) if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
         something else in the directory, is a ValueError.
         """
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):
                 raise ValueError(f"{self.path} is not empty and holds no run: give another --run-dir")
-            return None
-        self._check_settings(self.path, as_settings(self.read_cfg()), cfg)
+            return None, []
+        self.check_settings(cfg)
         file = self.path / CHECKPOINT_FILE
         if not file.exists():
             if (self.path / ARCHIVE_FILE).exists():
-                raise ValueError(f"{file} is lost: expected it beside {ARCHIVE_FILE}; {_REMEDY}")
-            return None
+                raise ValueError(f"{file} is lost: expected it beside {ARCHIVE_FILE}; {REMEDY}")
+            return None, []
         state = load_checkpoint(file)
         settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
         if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
-            raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {_REMEDY}")
-        self._check_settings(file, settings, cfg)
+            raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {REMEDY}")
+        _refuse_differences(file, settings, cfg)
         if len(metrics) > cfg.iterations:
-            raise ValueError(
-                f"iterations must be at least {len(metrics)}, as many as {self.path} has done, got {cfg.iterations}"
-            )
+            done = f"{len(metrics)}, as many as {self.path} has done"
+            raise ValueError(f"iterations must be at least {done}, got {cfg.iterations}")
         return scheduler, metrics
 
-    def read_finished(self, cfg: SearchCfg) -> Archive | None:
-        """What a search found that has done its iterations, and whose checkpoint was taken away; None of any other."""
-        if not (self.path / ARCHIVE_FILE).exists() or (self.path / CHECKPOINT_FILE).exists() or not self.exists():
-            return None
-        self._check_settings(self.path, as_settings(self.read_cfg()), cfg)
-        archive = read_archive(self.path)
-        return archive if archive.iterations == self.read_summary().get("iterations") == cfg.iterations else None
-
-    @staticmethod
-    def _check_settings(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
-        if different := differences(settings, as_settings(cfg)):
-            raise ValueError(f"{file} is of other settings: {', '.join(different)}: start a new run for those")
+    def check_settings(self, cfg: SearchCfg) -> None:
+        """Refuses the run of another search."""
+        _refuse_differences(self.path, as_settings(self.read_cfg()), cfg)
 
     def read_summary(self) -> dict[str, Any]:
         """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
@@ -275,7 +251,12 @@ class RunDirectory:
         try:
             rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
         except ValueError as error:
-            raise ValueError(f"{file} is damaged: {error}; {_REMEDY}") from None
+            raise ValueError(f"{file} is damaged: {error}; {REMEDY}") from None
         if not rows or not all(isinstance(row, dict) for row in rows):
-            raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {_REMEDY}")
+            raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {REMEDY}")
         return rows
+
+
+def _refuse_differences(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
+    if different := differences(settings, as_settings(cfg)):
+        raise ValueError(f"{file} is of other settings: {', '.join(different)}: start a new run for those")

@@ -52,30 +52,30 @@ class FitnessCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Evaluations of T terrains; statistics are over valid episodes, penalties are scaled."""
+    """Evaluations of T terrains; statistics are over valid episodes, penalties are scaled.
+
+    Shapes are (T, P) for what each of P penalties has, ratios, means and standard deviations, and else (T,).
+    """
 
     fitness: NDArray[np.float64]
-    """Shape (T,)."""
     ratios: NDArray[np.float64]
-    """Shape (T, P); each row sums to 1."""
+    """Each row sums to 1."""
     cell: NDArray[np.int64]
-    """Reachable cell of the ratios, shape (T,)."""
+    """Reachable cell of the ratios."""
     penalty_mean: NDArray[np.float64]
-    """Shape (T, P)."""
-    penalty_std: NDArray[np.float64]
-    """Shape (T, P), ddof 0."""
+    penalty_std: NDArray[np.float64]  # ddof 0
     collision_rate: NDArray[np.float64]
-    """Share of episodes with a base collision, shape (T,)."""
+    """Share of episodes with a base collision."""
     goal_rate: NDArray[np.float64]
-    """Share of episodes that reached the goal, shape (T,)."""
+    """Share of episodes that reached the goal."""
     fallen_rate: NDArray[np.float64]
-    """Share of episodes that ended tilted by more than 60 degrees, shape (T,)."""
+    """Share of episodes that ended tilted by more than 60 degrees."""
     end_position: NDArray[np.float32]
     """Where the typical episode ended (:func:`typical_ends`), world-local x and y [m], shape (T, 2)."""
     invalid_episodes: NDArray[np.int64]
-    """Episodes left out, shape (T,)."""
+    """Episodes left out."""
     episodes: NDArray[np.int64]
-    """Episodes run, the invalid ones included, shape (T,)."""
+    """Episodes run, the invalid ones included."""
 
     @property
     def counted(self) -> NDArray[np.int64]:
@@ -121,8 +121,7 @@ def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Ev
 
     The fitness is the paper's: sum of means - alpha * sum of standard deviations - lambda * u. u is the share of
     episodes without a base collision, and 0 where no episode has one. An invalid terrain has fitness -20, and the
-    statistics of its valid episodes: it may turn out to be valid when it is crossed again. Without a valid episode
-    there are equal ratios, no end position (NaN) and otherwise zeros.
+    statistics of its valid episodes. Without any there are equal ratios, no end position (NaN) and otherwise zeros.
     """
     columns = [result.penalty_names.index(name) for name in cfg.penalties]
     penalties = np.asarray(result.penalties, dtype=np.float64)[:, :, columns] / np.asarray(cfg.scales)
@@ -176,9 +175,8 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Where the typical episode of each terrain ended: the median, by coordinate, over episodes of its typical outcome.
 
-    That is the goal where at least half reach it. Else it is the commonest other outcome: a base collision, the end of
-    the time, or leaving the terrain. ``counted`` says which episodes count, shape (T, R). World-local x and y [m],
-    shape (T, 2); NaN where none does.
+    That is the goal where at least half reach it, else the commonest other outcome. ``counted`` says which episodes
+    count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
     outcome = np.where(counted, result.outcome, Outcome.INVALID)
     alike = counted & (outcome == typical_outcome(outcome)[:, None])

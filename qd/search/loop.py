@@ -5,33 +5,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from qd.check import ensure_ready
 from qd.search.archive import Archive
 from qd.search.directory import Metrics, RunDirectory, claimed
-from qd.search.fitness import evaluate_rollout
-from qd.search.progress import Bar, describe_iteration, describe_search
+from qd.search.fitness import evaluate_rollout, join_evaluations
+from qd.search.progress import Bar
 from qd.search.results import (
     build_archive,
     compute_last_tenth,
     describe_metrics,
     find_last_iteration,
-    read_written,
+    read_finished,
     write_results,
 )
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg, preset
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import open_pipeline
-from qd.workers.invalid import refuse_all_invalid
+from qd.workers.invalid import WARNED_SHARE, format_reasons, refuse_all_invalid
 from qd.workers.pipeline import Pipeline, PipelineCfg
 from qd.workers.seeds import episode_seeds
-from sim.controllers.spec import ControllerSpec, resolve_policy
+from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.command import Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
+from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import at_height, get_space, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
@@ -64,10 +62,9 @@ def search(
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
     It ends earlier once its last tenth brought a share of the elites below ``until``
-    (:func:`qd.search.results.compute_last_tenth`); robots then still cross what it asked for, and it settles. Nothing
-    is written before the simulation is built. Whatever stops a search, all finished iterations are saved. ``robot`` is
-    given if it is not shipped, ``policy`` if the controller lies elsewhere than ``cfg`` says. The archive is a judged
-    one if it was judged and nothing was left to do.
+    (:func:`qd.search.results.compute_last_tenth`), crosses what it asked for, and settles. Nothing is written before
+    the simulation is built; all finished iterations are saved. ``robot`` is given if it is not shipped, ``policy`` if
+    the controller lies elsewhere than ``cfg`` says. The archive is a judged one if nothing was left to do after it.
     """
     robot = robot or get_robot(cfg.robot)
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):
@@ -87,20 +84,18 @@ def search(
         space=space.name,  # where its code is now
     )
     with claimed(path):
-        if (finished := run.read_finished(cfg)) is not None:
-            say(describe_search(cfg, path, cfg.iterations, compute.device, crossing.num_workers))
-            return finished
-        scheduler, metrics = run.load(cfg) or (
-            Scheduler(cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed),
-            [],
-        )
-        scheduler.compute_on(compute.device)
-        done = len(metrics)
-        last = find_last_iteration(cfg, metrics, until)
-        say(describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
+        archive = read_finished(run, cfg, until)
+        scheduler: Any
+        scheduler, metrics = run.load(cfg) if archive is None else (None, run.read_metrics())
+        done, last = len(metrics), find_last_iteration(cfg, metrics, until)
+        say(_describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
         if note := scaled_by_another(robot, policy):
             print(note)
         if done < last:
+            scheduler = scheduler or Scheduler(
+                cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed
+            )
+            scheduler.compute_on(compute.device)
             try:
                 with open_pipeline(crossing) as pipeline:
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
@@ -111,11 +106,21 @@ def search(
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
         if len(metrics) < cfg.iterations:
             say(f"Ended by --until {until:g} after {len(metrics)} of {cfg.iterations} iterations.")
-        archive = build_archive(cfg, scheduler, len(metrics))
-        if (stored := read_written(run, archive)) is not None:
-            return stored
-        write_results(run, archive, metrics)
+        if archive is None:
+            archive = build_archive(cfg, scheduler, len(metrics))
+            write_results(run, archive, metrics)
     return archive
+
+
+def _describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
+    """What a search is about to do after ``done`` iterations, by so many processes or GPUs."""
+    left, controller = cfg.iterations - done, "its own controller" if cfg.policy == SHIPPED else cfg.policy
+    return (
+        f"{path}: {left:,} of {cfg.iterations:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
+        f"{cfg.replicas} episodes of {cfg.robot} with {controller} on {cfg.space}; in all "
+        f"{left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
+        f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
+    )
 
 
 def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, until: float | None) -> str:
@@ -134,19 +139,17 @@ def _run_iterations(
     """Runs the iterations that are left, and saves each.
 
     A group of emitters asks again as soon as it was told, and its next terrains wait in the pipeline while robots cross
-    those of the other groups. The order is fixed, and a checkpoint holds what each group has asked for: a search that
-    goes on where it was stopped is the same as one that was not.
+    other groups' terrains. The order is fixed, and a checkpoint holds what each group has asked for: a search that was
+    stopped and goes on is the same as one that was not.
     """
     space = get_space(cfg.space, cfg.space_sha256)
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 
-    def ask(group: int, iteration: int) -> NDArray[np.float32]:
-        # Behind the last iteration, too: if more follow, they begin with new terrains.
+    def ask(group: int, iteration: int) -> None:
+        """Puts a group's next terrains into the pipeline."""
         settles = last - cfg.scheduler.settling < iteration <= last
-        return scheduler.ask(group, new=not settles)
-
-    def put(genes: NDArray[np.float32], group: int, iteration: int) -> None:
+        genes = scheduler.ask(group, new=not settles)  # after the last iteration too: more would begin with new ones
         if iteration <= last:
             seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.group_rows(group)]
             pipeline.put(Terrains(genes=genes, seeds=seeds[: len(genes)], space=space))
@@ -154,32 +157,38 @@ def _run_iterations(
     pipeline.clear()
     began = time.perf_counter()
     for group in range(num_groups):
-        put(ask(group, len(metrics) + 1), group, len(metrics) + 1)
+        ask(group, len(metrics) + 1)
     while (iteration := len(metrics) + 1) <= last:
         results, evaluations = [], []
         num_new, search_s = 0, 0.0
         for group in range(num_groups):
-            result = pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups))
-            refuse_all_invalid(result)
-            evaluation = evaluate_rollout(result, cfg.cells, cfg.fitness)
+            results.append(pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups)))
+            refuse_all_invalid(results[-1])
+            evaluations.append(evaluate_rollout(results[-1], cfg.cells, cfg.fitness))
             emitters_began = time.perf_counter()
-            num_new += scheduler.tell(evaluation, iteration, group)
-            genes = ask(group, iteration + 1)
+            num_new += scheduler.tell(evaluations[-1], iteration, group)
+            ask(group, iteration + 1)
             search_s += time.perf_counter() - emitters_began
-            put(genes, group, iteration + 1)
-            results.append(result)
-            evaluations.append(evaluation)
         archive = build_archive(cfg, scheduler, iteration)
-        row = describe_metrics(archive, results, evaluations)
-        ended = time.perf_counter()
-        wall_s = ended - began  # from the end of the iteration before, so saving counts
-        began = ended
-        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s}
-        row["episodes_per_s"] = row["episodes"] / wall_s
-        if (status := pipeline.status()) is not None:
-            row |= status._asdict()
-        metrics.append(row)
-        row["last_tenth"] = compute_last_tenth(archive, metrics)
+        row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
+        wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
+        began += wall_s
+        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
+        status = pipeline.status()
+        metrics.append(row if status is None else row | status._asdict())
+        metrics[-1]["last_tenth"] = compute_last_tenth(archive, metrics)
         run.save(cfg, scheduler, metrics, archive)
         last = find_last_iteration(cfg, metrics, until)
-        bar.move_to(iteration, describe_iteration(row, last, status))
+        bar.move_to(iteration, _describe_iteration(metrics[-1], last, status))
+
+
+def _describe_iteration(row: dict[str, Any], iterations: int, workers: object = None) -> str:
+    """Where a search stands after an iteration, and how its workers fare if there are any."""
+    invalid = row["invalid_episodes"] / row["episodes"]
+    why = f"{invalid:.0%} invalid ({format_reasons(row['invalid_reasons'])}), " if invalid > WARNED_SHARE else ""
+    by = f" by {workers}" if workers else ""
+    return (
+        f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites "
+        f"({row['expected_same_cell']:,.0f} to stay), {why}{row['episodes_per_s']:.0f} episodes/s{by}, "
+        f"fitness {row['mean_fitness']:.2f}"
+    )

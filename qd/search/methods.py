@@ -24,8 +24,6 @@ Columns = dict[str, NDArray[Any]]
 """Arrays with one row a terrain."""
 Sigma = Annotated[float, Meta(ge=0, le=1e3)]
 """A standard deviation of changes of genes."""
-Step = Annotated[float, Meta(ge=1e-6, le=1e3)]
-"""A first step size that evolution strategies can reckon with; genes are float32 in [-1, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,28 +73,22 @@ class Setup:
 
 
 class Method:
-    """A source of new terrains for some of a search's emitters; a checkpoint holds it as it is.
-
-    Attributes:
-        Cfg: Its settings. They are fields of :class:`qd.search.presets.SchedulerCfg`, and flags of the command.
-        text: What it is, for ``--help``.
-        emitters: Numbers of its emitters, ascending.
-        sources: pyribs' emitters by these numbers, if it asks by such.
-    """
+    """A source of new terrains for some of a search's emitters; a checkpoint holds it as it is."""
 
     Cfg: ClassVar[type[MethodCfg]] = MethodCfg
+    """Its settings. They are fields of :class:`qd.search.presets.SchedulerCfg`, and flags of the command."""
     text: ClassVar[str]
+    """What it is, for ``--help``."""
 
     def __init__(self, cfg: Any, setup: Setup) -> None:
         """``cfg`` has all settings of the search, those of :attr:`Cfg` among them."""
         self.batch_size, self.emitters = int(cfg.batch_size), setup.emitters
-        self.sources: dict[int, Any] = {}
+        self.sources: dict[int, Any] = {}  # pyribs' emitters by their numbers, if it asks by such
 
     def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
-        """New terrains of some of its emitters, in their order.
+        """Unclipped genes of new terrains of some of its emitters in turn, (len(emitters) * batch_size, num_genes).
 
         ``pending`` are clipped genes of new terrains that were asked for and not told yet, shape (U, num_genes).
-        Returns unclipped genes, shape (len(emitters) * batch_size, num_genes).
         """
         return np.concatenate([self.sources[emitter].ask() for emitter in emitters])
 
@@ -164,24 +156,19 @@ class MapElites(Method):
         from ribs.emitters import IsoLineEmitter
 
         super().__init__(cfg, setup)
+        settings = {name: getattr(cfg, name) for name in ("iso_sigma", "line_sigma", "batch_size")}
+        settings["bounds"] = [(-1.0, 1.0)] * setup.space.num_genes
         for number, stream in setup.streams.items():
             first, later = stream.spawn(2)
-            self.sources[number] = IsoLineEmitter(
-                setup.archive,
-                iso_sigma=cfg.iso_sigma,
-                line_sigma=cfg.line_sigma,
-                initial_solutions=setup.space.hard_random(cfg.batch_size, np.random.default_rng(first)),
-                bounds=[(-1.0, 1.0)] * setup.space.num_genes,
-                batch_size=cfg.batch_size,
-                seed=later,
-            )
+            hard = setup.space.hard_random(cfg.batch_size, np.random.default_rng(first))
+            self.sources[number] = IsoLineEmitter(setup.archive, **settings, initial_solutions=hard, seed=later)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CmaMeCfg(MethodCfg):
     """Settings of evolution strategies."""
 
-    sigma0: Step | None = None
+    sigma0: Annotated[float, Meta(ge=1e-6, le=1e3)] | None = None
     """First step size of an evolution strategy; genes live in [-1, 1]. The terrain space's own if None."""
 
 
@@ -262,10 +249,8 @@ class SurrogateCfg(IsoLineCfg):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.explore_share + self.disagree_share > 1.0:
-            raise ValueError(
-                f"explore_share and disagree_share must be at most 1 together, got {self.explore_share} and "
-                f"{self.disagree_share}"
-            )
+            given = f"{self.explore_share} and {self.disagree_share}"
+            raise ValueError(f"explore_share and disagree_share must be at most 1 together, got {given}")
 
 
 class SurrogateSearch(Method):

@@ -80,20 +80,13 @@ class Pool:
     def __len__(self) -> int:
         return len(self.number)
 
-    def get_solutions(self, number: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Unclipped genes of terrains by their numbers."""
-        return self.solutions[np.searchsorted(self.number, number)]
-
     def tell(
         self, solutions: NDArray[np.float32], number: NDArray[np.int64], crossed: Evaluation, iteration: int
     ) -> Evaluation:
-        """Takes in crossings of T terrains, and returns what is known of these now.
+        """Takes in what crossings of T terrains showed, and returns what is known of these now.
 
-        Args:
-            solutions: Unclipped genes, shape (T, num_genes).
-            number: Of those that were crossed again, perhaps several times; -1 of new ones, shape (T,).
-            crossed: What the crossings showed.
-            iteration: In which they were, from 1.
+        Solutions are unclipped genes, shape (T, num_genes); ``number`` is -1 of new terrains, and of those that were
+        crossed again, perhaps several times, theirs, shape (T,). Iterations are numbered from 1.
         """
         merged = crossed.rows(np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)

@@ -1,6 +1,6 @@
 """What a search has found, when it ends by that, and what it leaves: metrics, archive, numbers, figures, last lines."""
 
-from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from qd.faults.families import rank, summarise_search
 from qd.faults.numbers import fault_numbers, found_numbers, read_minimal
 from qd.search.archive import Archive, Subject, no_outcomes, read_archive
 from qd.search.directory import SUMMARY_FILE, Metrics, RunDirectory
-from qd.search.fitness import Evaluation, join_evaluations
+from qd.search.fitness import Evaluation
 from qd.search.pool import chance_to_stay
 from qd.search.progress import clock
 from qd.search.scheduler import Scheduler
@@ -49,11 +49,8 @@ def build_archive(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Arch
     )
 
 
-def describe_metrics(
-    archive: Archive, results: Sequence[RolloutResult], evaluations: Sequence[Evaluation]
-) -> dict[str, Any]:
-    """The metrics of the archive's last iteration without the search's times, by what its groups crossed."""
-    result, evaluation = RolloutResult.join(results), join_evaluations(evaluations)
+def describe_metrics(archive: Archive, result: RolloutResult, evaluation: Evaluation) -> dict[str, Any]:
+    """The metrics of the archive's last iteration without the search's times, by what all groups crossed."""
     return {
         "iteration": archive.iterations,
         "elites": len(archive),
@@ -77,15 +74,11 @@ def describe_metrics(
 def find_last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -> int:
     """The iteration that ends a search, by the metrics alone: so a search that goes on ends where it would have.
 
-    Behind the one whose last tenth brought too little, robots cross what it asked for, and then all settles. A search
-    that went on past that end is judged anew.
+    After the one whose last tenth brought too little, robots cross what it asked for, and then all settles.
     """
-    ends = (
-        row["iteration"] + 1 + cfg.scheduler.settling
-        for row in metrics
-        if until is not None and row["last_tenth"] is not None and row["last_tenth"] < until
-    )
-    return min(cfg.iterations, next((end for end in ends if end >= len(metrics)), cfg.iterations))
+    shares = {row["iteration"]: row["last_tenth"] for row in metrics if row["last_tenth"] is not None}
+    ends = [number + 1 + cfg.scheduler.settling for number, share in shares.items() if share < (until or 0.0)]
+    return min([cfg.iterations, *(end for end in ends if end >= len(metrics))])
 
 
 def compute_last_tenth(archive: Archive, metrics: Metrics) -> float | None:
@@ -102,14 +95,15 @@ def compute_last_tenth(archive: Archive, metrics: Metrics) -> float | None:
     return float(chance[late].sum() / chance.sum())
 
 
-def read_written(run: RunDirectory, archive: Archive) -> Archive | None:
-    """The archive of a run's file if it has the same elites, judged or not, and its numbers lie beside it."""
-    try:
-        stored = read_archive(run.path)
-    except (OSError, ValueError):
-        return None  # it is made again
-    is_whole = stored.has_same_elites(archive) and run.read_summary().get("iterations") == archive.iterations
-    return stored if is_whole else None
+def read_finished(run: RunDirectory, cfg: SearchCfg, until: float | None) -> Archive | None:
+    """The archive of a search that has done its iterations, judged or not; None of others. It needs no checkpoint."""
+    if run.exists():
+        run.check_settings(cfg)
+        with suppress(OSError, ValueError):  # files are made again
+            archive, last = read_archive(run.path), find_last_iteration(cfg, run.read_metrics(), until)
+            if archive.iterations == run.read_summary().get("iterations") == last:
+                return archive
+    return None
 
 
 def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
@@ -129,11 +123,9 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
         "gpus": 0 if origin["device"].startswith("CPU") else max(row.get("workers", 1) for row in metrics),
     }
     write_atomically(run.path / SUMMARY_FILE, to_json(numbers))
-    say(
-        f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, QD score "
-        f"{archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}, after {numbers['episodes']:,} episodes "
-        f"in {clock(numbers['wall_s'])}"
-    )
+    score = f"QD score {archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}"
+    effort = f"after {numbers['episodes']:,} episodes in {clock(numbers['wall_s'])}"
+    say(f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, {score}, {effort}")
     if (share := metrics[-1]["last_tenth"]) is not None:
         print(f"Its last tenth brought {share:.0%} of the elites that can be expected to stay.")
     print(f"Figures: {', '.join(map(str, figures))}")

@@ -45,9 +45,6 @@ class Scheduler:
 
     Emitters take the methods in turn. Groups of emitters ask and are told one after the other. Where terrains are
     crossed again, the archive has those that hold the cells of a pool.
-
-    Attributes:
-        methods: The methods that have emitters.
     """
 
     def __init__(
@@ -59,7 +56,7 @@ class Scheduler:
         # Not learning_rate=1 with a threshold: told two terrains of a cell at once, that keeps the better one but sets
         # the threshold to their mean, and a later, worse one may replace it.
         self._archive = make_archive(np.random.SeedSequence(seed, spawn_key=(1,)))
-        self.methods: list[Method] = []
+        self.methods: list[Method] = []  # those that have emitters
         for first, name in enumerate(cfg.methods[: cfg.emitters]):
             numbers = tuple(range(first, cfg.emitters, len(cfg.methods)))
             self.methods.append(METHODS[name](cfg, Setup(space, cells, self._archive, make_archive, seed, numbers)))
@@ -82,10 +79,9 @@ class Scheduler:
         return slice(emitters.start * self._terrains_per_emitter, emitters.stop * self._terrains_per_emitter)
 
     def ask(self, group: int = 0, *, new: bool = True) -> NDArray[np.float32]:
-        """The next terrains of a group of emitters; the same ones until the group is told their results.
+        """Clipped genes, (T, num_genes), of a group's next terrains; the same ones until it is told their results.
 
-        Behind the emitters' come those that are crossed again, as soon as there are any. Without ``new`` ones all are
-        crossed again. Clipped genes, shape (at most emitters of the group * (batch_size + again), num_genes).
+        Behind the emitters' come those that are crossed again; without ``new`` ones all are crossed again.
         """
         asked = self._asked[group]
         if asked is None:
@@ -94,7 +90,7 @@ class Scheduler:
             if self._pool is not None:
                 rows = self.group_rows(group)
                 again = self._pool.least_known(rows.stop - rows.start - len(number), self._pending_numbers())
-                solutions.append(self._pool.get_solutions(again))
+                solutions.append(self._pool.solutions[np.searchsorted(self._pool.number, again)])
                 number = np.append(number, again)
             asked = self._asked[group] = Asked(np.concatenate(solutions), number)
         return clipped(asked.solutions)
@@ -170,8 +166,6 @@ def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, 
         ranges=[(0, cells.num_cells)],
         seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
         solution_dtype=np.float32,
-        objective_dtype=np.float64,
-        measures_dtype=np.float64,
         extra_fields=extra_fields,
         **learning,
     )

@@ -15,7 +15,7 @@ from sim.files.settings import NonNegativeInt, PositiveInt, check_settings, from
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg, robot_identity
 
-_MOST_EPISODES = 10_000_000
+_MAX_EPISODES = 10_000_000  # of an iteration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +35,9 @@ class SearchCfg(Subject):
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if self.episodes_per_iteration > _MOST_EPISODES:
-            raise ValueError(
-                f"an iteration must have at most {_MOST_EPISODES:,} episodes, got {self.episodes_per_iteration:,}: "
-                "give fewer replicas or terrains"
-            )
+        if self.episodes_per_iteration > _MAX_EPISODES:
+            limit = f"at most {_MAX_EPISODES:,} episodes, got {self.episodes_per_iteration:,}"
+            raise ValueError(f"an iteration must have {limit}: give fewer replicas or terrains")
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
         self.scheduler.check_iterations(self.iterations)
 
@@ -116,16 +114,14 @@ def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
     Code runs only if the command line names it, so a controller that is code is refused here.
     """
     if ControllerSpec.parse(cfg.policy).runs_code:
-        raise ValueError(
-            f"{path} was searched with the controller {cfg.policy}, which is code: name it again "
-            f"(--policy {shlex.quote(cfg.policy)}), since no code runs that the command line does not name"
-        )
+        remedy = f"name it again (--policy {shlex.quote(cfg.policy)})"
+        reason = "since no code runs that the command line does not name"
+        raise ValueError(f"{path} was searched with the controller {cfg.policy}, which is code: {remedy}, {reason}")
     policy = resolve_policy(cfg.policy, robot)
     if not is_searched(cfg, policy, robot):
         digest = controller_hash(policy)
         state = "lost" if digest is None else "another one now"
-        raise ValueError(
-            f"{path} was searched with the controller in {policy}, which is {state} (expected SHA-256 "
-            f"{cfg.policy_sha256}, got {digest}): put it back, or say with --policy where it is"
-        )
+        hashes = f"(expected SHA-256 {cfg.policy_sha256}, got {digest})"
+        remedy = "put it back, or say with --policy where it is"
+        raise ValueError(f"{path} was searched with the controller in {policy}, which is {state} {hashes}: {remedy}")
     return policy

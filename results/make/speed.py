@@ -55,9 +55,7 @@ def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> t
     shutil.rmtree(path, ignore_errors=True)
     cfg = replace(cfg, iterations=iterations + WARM_UP)
     search(cfg, path, script.compute)
-    saved = RunDirectory(path).load(cfg)
-    assert saved is not None
-    scheduler, metrics = saved
+    scheduler, metrics = RunDirectory(path).load(cfg)
     return metrics[WARM_UP:], np.concatenate([scheduler.ask(group) for group in range(cfg.scheduler.num_groups)])
 
 

@@ -1,7 +1,6 @@
-"""What a program does to the files under a folder, step by step, and a fault at any of them.
+"""What a program does to the files under a folder, step by step, and a fault before any of them.
 
-A step is what the system sees: a file opened for writing, the second half of what is written, a rename, a new folder. A
-fault strikes before its step is done, so that all of them together leave every state of the disk that a kill can leave.
+A step is a file opened for writing, the second half of what is written, a rename, or a new folder.
 """
 
 import builtins
@@ -32,27 +31,19 @@ def fill(name: str, path: str) -> None:
 
 
 class Steps:
-    """Watches a folder from its construction to the end of the process.
-
-    Args:
-        folder: What is watched.
-        log: File that gets a line a step; None for none.
-        fault: Called with name and path of a step, before it.
-        at: Number of the step at which ``fault`` strikes, and at every later one; None for never.
-    """
+    """Watches a folder to the end of the process: ``log`` gets a line a step, ``fault`` is called at one and later."""
 
     def __init__(
         self, folder: Path, *, log: Path | None = None, fault: Callable[[str, str], None] = kill, at: int | None = None
     ) -> None:
         self._folder, self._log, self._fault, self._at, self._count = str(folder), log, fault, at, 0
-        self._open, self._os_open = io.open, os.open
+        self._open = io.open
         io.open = builtins.open = self._watched_open
-        os.open = self._watched_os_open
-        for name, place in (("replace", 1), ("mkdir", 0)):
-            setattr(os, name, self._watched(name, getattr(os, name), place))
+        for name, index in (("replace", 1), ("mkdir", 0), ("open", 0)):
+            setattr(os, name, self._watched(getattr(os, name), name, index))
 
     def take(self, name: str, path: str | bytes) -> None:
-        """Counts a step on a path of the folder and lets the fault strike where it is due."""
+        """Counts a step on a path of the folder and lets the fault come where it is due."""
         path = os.fsdecode(path)
         if not path.startswith(self._folder):
             return
@@ -63,9 +54,10 @@ class Steps:
         if self._at is not None and number >= self._at:
             self._fault(name, path)
 
-    def _watched(self, name: str, function: Callable[..., Any], place: int) -> Callable[..., Any]:
+    def _watched(self, function: Callable[..., Any], name: str, index: int) -> Callable[..., Any]:
         def watched(*arguments: Any, **named: Any) -> Any:
-            self.take(name, os.fspath(arguments[place]))
+            if name != "open" or arguments[1] & os.O_CREAT:
+                self.take(name, os.fspath(arguments[index]))
             return function(*arguments, **named)
 
         return watched
@@ -76,11 +68,6 @@ class Steps:
         self.take("open", os.fspath(file))
         opened = self._open(file, mode, *rest, **named)
         return _File(opened, file, self) if os.fsdecode(file).startswith(self._folder) else opened
-
-    def _watched_os_open(self, path: Any, flags: int, *rest: Any, **named: Any) -> int:
-        if flags & os.O_CREAT:
-            self.take("open", os.fspath(path))
-        return self._os_open(path, flags, *rest, **named)
 
 
 class _File:
@@ -108,11 +95,7 @@ class _File:
 
 
 def run_child(log: Path, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> tuple[int | None, str]:
-    """Runs a function in a process of its own, forked from one that has everything imported.
-
-    Returns:
-        What the function returned, None if the process ended before; and the process's output.
-    """
+    """What a function returns in a forked process, None if that ends before; and the process's output."""
     code = log.with_name(f"{log.name}.code")
     code.unlink(missing_ok=True)
     process = _CONTEXT.Process(target=_run_here, args=(log, code, function, arguments, named))

@@ -42,21 +42,15 @@ def task() -> CommandTask:
 def search(path: Path, *, iterations: int, **watched: Any) -> int:
     """Begins a search over the stand-in evaluator or goes on with it; returns the command's exit code.
 
-    Args:
-        path: The run directory.
-        iterations: Iterations in all.
-        watched: As of :class:`tests.kills.faults.Steps`; the folder is watched if there are some.
+    The run directory is watched by :class:`tests.kills.faults.Steps` if it is said how.
     """
     results.write_figures = lambda folder, archive, metrics: []  # which would take a second
-    words = _SEARCH.split()
-    if (path / CONFIG_FILE).exists():
-        words = [*words[:5], "--resume", str(path)]
-    else:
-        words += ["--run-dir", str(path)]
+    argv = _SEARCH.split()
+    argv = [*argv[:5], "--resume"] if (path / CONFIG_FILE).exists() else [*argv, "--run-dir"]
     if watched:
         Steps(path, **watched)
     with crossing_by(open_stand_in):
-        return faultline.main([*words, "--iterations", str(iterations)])
+        return faultline.main([*argv, str(path), "--iterations", str(iterations)])
 
 
 def search_outcome(path: Path) -> tuple[Any, ...]:

@@ -49,10 +49,7 @@ class Networks(nn.Module):
         self.register_buffer("_positions", positions[0], persistent=False)
 
     def forward(self, maps: Tensor) -> Tensor:
-        """Outputs of each network for maps of its own, (MEMBERS, batch, *SHAPE, num_maps).
-
-        Shape (batch, MEMBERS, num_out).
-        """
+        """Outputs of each network, (batch, MEMBERS, num_out), for its maps of (MEMBERS, batch, *SHAPE, num_maps)."""
         if maps.is_cuda:
             return self._through(maps.movedim(0, 3).flatten(3), *self._layers(MEMBERS))
         # One by one, since channels that no weight joins cost time on the CPU.
@@ -98,10 +95,7 @@ def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, i
 
 
 def _block_diagonal(weight: Tensor) -> Tensor:
-    """Weights of networks, (networks, out, in, *size), as those of one convolution, whose groups would be slower.
-
-    Shape (networks * out, networks * in, *size).
-    """
+    """Weights of networks as those of one convolution, whose groups would be slower."""
     count = len(weight)
     if count == 1:
         return weight[0]
@@ -112,9 +106,9 @@ def _block_diagonal(weight: Tensor) -> Tensor:
 class Trainer:
     """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
 
-    The graph holds the memory of weights and moments. So networks that are moved need a new trainer, which captures
-    anew. On CUDA all steps must be taken on one stream, other than the default one. ``loss`` takes outputs and targets,
-    both of shape (batch, MEMBERS, num_out). ``moments`` are what Adam remembered of each tensor of weights.
+    The graph holds the memory of weights and moments, so networks that are moved need a new trainer. On CUDA all steps
+    must be taken on one stream, other than the default one. ``loss`` takes outputs and targets, both of shape (batch,
+    MEMBERS, num_out). ``moments`` are what Adam remembered of each tensor of weights.
     """
 
     def __init__(

@@ -20,14 +20,10 @@ from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_ma
 from sim.terrains.spaces.base import TerrainSpace, clipped
 from sim.terrains.spaces.registry import get_space
 
-BATCH = 64
-"""Terrains of a step of training, for each network, or as many as an iteration has if those are fewer."""
-MIN_TERRAINS = 64
-"""Valid terrains that must be known before the networks are asked."""
-MAX_TERRAINS = 200_000
-"""Terrains that are learned from, the newest ones; fewer where their maps would take more than 8 GB."""
+BATCH = 64  # terrains of a step of training, for each network, or as many as an iteration has if those are fewer
+MIN_TERRAINS = 64  # valid ones that must be known before the networks are asked
+MAX_TERRAINS = 200_000  # that are learned from, the newest ones; fewer where their maps would take more memory
 MAX_MAP_BYTES = 8 << 30
-"""Memory of the maps of these."""
 _CHUNK = {"cpu": 1024, "cuda": 8192}  # terrains that are judged in one pass
 _GENE_UNITS = 32767  # genes are remembered as whole numbers of 16 bits, which keep a course's kinds apart
 _HEIGHT_SCALE = 0.25  # m, of a bump at its limit
@@ -40,15 +36,14 @@ _ERROR_STEP = 0.1  # of the known error of ratios toward that of the latest terr
 
 
 class Prediction(NamedTuple):
-    """Predictions of each of the networks for N terrains, on their device."""
+    """Predictions of each of the networks for N terrains, on their device, shape (MEMBERS, N, columns)."""
 
     ratios: Tensor
-    """Shape (MEMBERS, N, P), each row summing to 1."""
+    """Each row sums to 1."""
     numbers: Tensor
-    """Logarithms of the penalties' means and standard deviations, and the fitness' area hyperbolic sine, shape
-    (MEMBERS, N, 2 P + 1)."""
+    """Logarithms of the penalties' means and standard deviations, and the fitness' area hyperbolic sine."""
     rates: Tensor
-    """Logits of goal rate, collision rate and collision bit, shape (MEMBERS, N, 3)."""
+    """Logits of goal rate, collision rate and collision bit."""
 
     @property
     def fitness(self) -> Tensor:
@@ -65,10 +60,6 @@ class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
     ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`.
-
-    Attributes:
-        squared_error: Mean squared error of predicted ratios so far, the noise of their episodes included, shape (P,);
-            None before the networks are asked.
     """
 
     def __init__(self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
@@ -77,20 +68,17 @@ class Surrogate:
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
-        self._targets = np.zeros((0, 3 * cells.num_ratios + 1 + _NUM_RATES), np.float16)
-        self._scale = np.stack([np.zeros(self._regressed), np.ones(self._regressed)]).astype(np.float32)
+        num_numbers = 2 * cells.num_ratios + 1
+        self._targets = np.zeros((0, cells.num_ratios + num_numbers + _NUM_RATES), np.float16)
+        self._scale = np.stack([np.zeros(num_numbers), np.ones(num_numbers)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
+        """Of predicted ratios, their episodes' noise included, shape (P,); None before the networks are asked."""
         self._networks = Networks(1 + num_maps(space), self._targets.shape[1])
         for weights in self._networks.parameters():
             drawn = self._rng.normal(size=weights.shape) * np.sqrt(2.0 / max(1, weights[0].numel()))
-            values = drawn if weights.ndim > 1 else np.zeros(weights.shape)
-            weights.data.copy_(torch.from_numpy(values))
+            if weights.ndim > 1:  # biases stay zero
+                weights.data.copy_(torch.from_numpy(drawn))
         self._work_on("cpu")
-
-    @property
-    def _regressed(self) -> int:
-        """Numbers that are regressed: logarithms of the penalties' means and stds, and the fitness."""
-        return 2 * self.cells.num_ratios + 1
 
     @property
     def space(self) -> TerrainSpace:
@@ -125,34 +113,30 @@ class Surrogate:
             self._trainer = Trainer(self._networks.to(device), self._loss, device, moments)
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
-        """Remembers terrains, of genes (N, num_genes), and trains for their share of an iteration's steps.
-
-        Invalid ones are left out; each step draws from all that it remembers.
-        """
-        valid = evaluation.valid
-        if valid.any():
-            self._compare(clipped(genes[valid]), evaluation.ratios[valid])
-            self._remember(clipped(genes[valid]), _make_targets(evaluation)[valid])
-        if len(self) >= MIN_TERRAINS:
-            with on_stream(self._stream):
-                self._train(max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains)))
-
-    def _compare(self, genes: NDArray[np.float32], ratios: NDArray[np.float64]) -> None:
-        """Updates the squared error by ratios that were crossed, before the networks learn from them."""
-        if len(self) < MIN_TERRAINS:
-            return
+        """Remembers the valid ones of terrains, (N, num_genes), and trains for their share of an iteration's steps."""
+        valid, count = evaluation.valid, len(genes)
+        genes = clipped(genes[valid])
         with on_stream(self._stream):
-            predicted = self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
-        squared_error = ((predicted - ratios) ** 2).mean(axis=0).astype(np.float32)
-        before = squared_error if self.squared_error is None else self.squared_error
-        self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
+            if len(genes) and len(self) >= MIN_TERRAINS:
+                predicted = self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
+                squared_error = ((predicted - evaluation.ratios[valid]) ** 2).mean(axis=0).astype(np.float32)
+                before = squared_error if self.squared_error is None else self.squared_error
+                self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
+            if len(genes):
+                self._remember(genes, evaluation.rows(valid))
+            if len(self) >= MIN_TERRAINS:
+                self._train(max(1, round(self.cfg.training_steps * count / self.cfg.num_terrains)))
 
-    def _remember(self, genes: NDArray[np.float32], targets: NDArray[np.float32]) -> None:
+    def _remember(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         units = np.rint(genes * _GENE_UNITS).astype(np.int16)
         self._genes = np.concatenate([self._genes, units])[-self._capacity :]
-        self._targets = np.concatenate([self._targets, targets.astype(np.float16)])[-self._capacity :]
+        logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
+        rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
+        targets = np.column_stack([evaluation.ratios, *logarithms, np.arcsinh(evaluation.fitness), *rates])
+        targets = targets.astype(np.float32).astype(np.float16)
+        self._targets = np.concatenate([self._targets, targets])[-self._capacity :]
         self._num_unmapped = min(self._num_unmapped + len(units), len(self))
-        numbers = self._targets[:, self.cells.num_ratios :][:, : self._regressed].astype(np.float32)
+        numbers = self._split(self._targets)[1].astype(np.float32)
         self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
 
     def _map_genes(self, genes: Tensor) -> Tensor:
@@ -160,40 +144,34 @@ class Surrogate:
         heights = corridor_heights(genes, self.space) / _HEIGHT_SCALE
         return torch.cat([heights[..., None], corridor_maps(genes, self.space).movedim(1, -1)], dim=-1)
 
-    def _map_new(self) -> tuple[Tensor, Tensor]:
-        """The ring of maps, once it has those of all terrains, and the row of each terrain in it."""
+    def _train(self, steps: int) -> None:
+        """Adds the maps of new terrains to the ring, and takes steps on all."""
         self._num_mapped += self._num_unmapped
         size = len(self._maps)
         while size < min(self._num_mapped, self._capacity):
             size = min(max(MIN_TERRAINS, 2 * size), self._capacity)
         if size > len(self._maps):  # nothing was overwritten yet, so that maps stay in their rows
-            grown = self._maps.new_empty(size, *self._maps.shape[1:])
-            grown[: len(self._maps)] = self._maps
-            self._maps = grown
+            self._maps = torch.cat([self._maps, self._maps.new_empty(size - len(self._maps), *self._maps.shape[1:])])
         rows = torch.arange(self._num_mapped - len(self), self._num_mapped, device=self.device) % len(self._maps)
         new = slice(len(self) - self._num_unmapped, None)
         units = torch.from_numpy(self._genes[new]).to(self.device)
         for chunk, chunk_rows in zip(units.split(_CHUNK["cpu"]), rows[new].split(_CHUNK["cpu"]), strict=True):
             self._maps[chunk_rows] = self._map_genes(chunk / _GENE_UNITS).half()
         self._num_unmapped = 0
-        return self._maps, rows
-
-    def _train(self, steps: int) -> None:
-        maps, rows = self._map_new()
         middle, spread = torch.from_numpy(self._scale).to(self.device)
         ratios, numbers, rates = self._split(torch.from_numpy(self._targets).to(self.device).float())
         targets = torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
         shape = steps, min(BATCH, self.cfg.num_terrains), MEMBERS
         drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
-        ordered = targets.new_empty(len(maps), targets.shape[1])
+        ordered = targets.new_empty(len(self._maps), targets.shape[1])
         ordered[rows] = targets
-        self._trainer.run(maps, ordered, rows[drawn], turned)
+        self._trainer.run(self._maps, ordered, rows[drawn], turned)
 
     def _split(self, columns: Any) -> tuple[Any, Any, Any]:
         """Columns of ratios, numbers and rates."""
-        first, last = self.cells.num_ratios, self.cells.num_ratios + self._regressed
-        return columns[..., :first], columns[..., first:last], columns[..., last:]
+        first = self.cells.num_ratios
+        return columns[..., :first], columns[..., first:-_NUM_RATES], columns[..., -_NUM_RATES:]
 
     def _loss(self, outputs: Tensor, targets: Tensor) -> Tensor:
         """Sum over the networks, none of which learns from another; both of shape (batch, MEMBERS, columns)."""
@@ -226,8 +204,8 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
-        Genes of the ``elites`` have shape (E, num_genes), their cells and fitness (E,). ``pending`` are genes of
-        terrains that robots are to cross already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes).
+        Genes of the ``elites`` have shape (E, num_genes), and of ``pending`` terrains, which robots are to cross
+        already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes).
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
@@ -237,21 +215,17 @@ class Surrogate:
             if len(self) < MIN_TERRAINS:
                 return self._vary(parents, count, draw).cpu().numpy()
             explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
-            best = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
-            np.maximum.at(best, cell, fitness.astype(np.float32))
+            fittest = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
+            np.maximum.at(fittest, cell, fitness.astype(np.float32))
+            best = torch.from_numpy(fittest).to(self.device)
             expected = torch.cat([torch.from_numpy(pending).to(self.device), explored])
-            best_expected = self._add_expected(torch.from_numpy(best).to(self.device), expected)
-            searched = self._search(count - len(explored), parents, best_expected, count, draw)
+            if len(expected):  # what robots are to cross already
+                prediction = self.predict(expected)
+                cells = self._expected_cells(prediction)
+                inside = cells >= 0
+                best = best.scatter_reduce(0, cells[inside], prediction.fitness.mean(0)[inside], "amax")
+            searched = self._search(count - len(explored), parents, best, count, draw)
             return torch.cat([explored, searched]).cpu().numpy()
-
-    def _add_expected(self, best: Tensor, expected: Tensor) -> Tensor:
-        """Fitness in each cell once robots have crossed what they are to cross already, shape (num_cells,)."""
-        if not len(expected):
-            return best
-        prediction = self.predict(expected)
-        cells = self._expected_cells(prediction)
-        inside = cells >= 0
-        return best.scatter_reduce(0, cells[inside], prediction.fitness.mean(0)[inside], "amax")
 
     def _search(self, num_proposals: int, elites: Tensor, best: Tensor, count: int, draw: torch.Generator) -> Tensor:
         """The inner loop: what adds most to the predicted archive, and what the networks disagree about."""
@@ -277,9 +251,8 @@ class Surrogate:
     def _expected_gain(self, prediction: Prediction, best: Tensor, draw: torch.Generator) -> Tensor:
         """What terrains are expected to add to the QD score, shape (N,), given the best fitness in each cell."""
         ratios = prediction.ratios.mean(0)
-        if self.squared_error is None:
-            drawn = ratios.expand(1, MEMBERS, -1, -1)
-        else:
+        drawn = ratios.expand(1, MEMBERS, -1, -1)
+        if self.squared_error is not None:
             error = torch.from_numpy(self.squared_error).to(self.device).sqrt()
             noise = torch.randn((_DRAWS, MEMBERS, *ratios.shape), generator=draw, device=self.device)
             drawn = (ratios + error * noise).clamp_min(1e-6)
@@ -328,11 +301,10 @@ class Surrogate:
 
 
 def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
-    """Children beside the lines between elites (iso+line, Vassiliades and Mouret 2018), clipped.
+    """Children, (count, num_genes), beside the lines between elites, (E, num_genes), of iso+line; in [-1, 1].
 
     Where the space has parts (:attr:`sim.terrains.spaces.base.TerrainSpace.genes_per_part`), a share of the children
-    takes each part from a third elite with a chance of a half. Elites' genes have shape (E, num_genes), children's
-    (count, num_genes), in [-1, 1]; ``draw`` is on their device.
+    takes each part from a third elite with a chance of a half.
     """
     options = {"generator": draw, "device": pool.device}
     first, second, third = pool[torch.randint(len(pool), (3, count), **options)]
@@ -346,20 +318,6 @@ def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, 
         width = swapped.shape[1]
         children[:, :width] = torch.where(swapped, third[:, :width], children[:, :width])
     return children.clamp(-1.0, 1.0)
-
-
-def _make_targets(evaluation: Evaluation) -> NDArray[np.float32]:
-    """What the networks are to predict, shape (N, 3 P + 4)."""
-    columns = (
-        evaluation.ratios,
-        np.log(evaluation.penalty_mean + _MIN_PENALTY),
-        np.log(evaluation.spread + _MIN_PENALTY),
-        np.arcsinh(evaluation.fitness)[:, None],
-        evaluation.goal_rate[:, None],
-        evaluation.collision_rate[:, None],
-        evaluation.collides[:, None],
-    )
-    return np.concatenate(columns, axis=1).astype(np.float32)
 
 
 def _best_of_each(cells: Tensor, gain: Tensor, num_cells: int) -> Tensor:

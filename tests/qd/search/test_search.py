@@ -1,19 +1,29 @@
-"""The search over the stand-in evaluator: what it finds, what it leaves behind, and what a kill costs."""
+"""The search over the stand-in evaluator: what it finds, leaves behind and says; and over the real simulation."""
 
-import contextlib
 import dataclasses
 import json
 import os
+import re
+import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from qd.faults.judge import judge
+from qd.search import progress
 from qd.search.archive import read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.fitness import FitnessCfg, evaluate_rollout
+from qd.search.presets import SchedulerCfg
+from qd.search.progress import Bar
+from qd.workers.compute import Compute
+from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import AllInvalidError
+from sim.crossing import CrossingCfg
 from sim.files.command import Interrupted
+from sim.robots.find import get_robot
+from sim.rollout import Rollout
 from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.robots import Robots
@@ -40,15 +50,13 @@ def test_files_agree_with_each_other(tmp_path, monkeypatch):
     stored = read_archive(path)
     assert np.array_equal(stored.genes, archive.genes)
     numbers = json.loads((path / "archive.json").read_text())
-    assert [row["iteration"] for row in rows_of(path)] == [1, 2, 3, 4]
-    last = rows_of(path, timed=True)[-1]
+    rows = rows_of(path, timed=True)
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     for key in ("elites", "reachable_coverage", "qd_score", "mean_fitness"):
-        assert numbers[key] == last[key]
-    assert numbers["terrains_evaluated"] == 4 * 12
-    assert numbers["episodes"] == 4 * 12 * 4
-    assert numbers["reachable_cells"] == 4795
-    assert numbers["gpus"] == numbers["invalid_episodes"] == 0
-    assert numbers["wall_s"] == pytest.approx(sum(row["wall_s"] for row in rows_of(path, timed=True)))
+        assert numbers[key] == rows[-1][key]
+    counts = {"terrains_evaluated": 4 * 12, "episodes": 4 * 12 * 4, "reachable_cells": 4795, "gpus": 0}
+    assert numbers | counts | {"invalid_episodes": 0} == numbers
+    assert numbers["wall_s"] == pytest.approx(sum(row["wall_s"] for row in rows))
     assert numbers["with_collision"] == (archive.collision_rate > 0.0).sum()
     assert numbers["with_collision"] + numbers["without_collision"] == numbers["elites"]
     assert numbers["elites_reproduced"] is numbers["failing"] is numbers["faults"] is None
@@ -61,8 +69,8 @@ def test_a_search_of_four_penalties_and_five_intervals_is_extended_as_if_it_had_
     fitness = CFG.fitness.with_penalties(("yaw_rate", "vel_x", "contact_force", "collision"))
     settings = {"fitness": fitness, "intervals": 5}
     archive = run(tmp_path / "whole", iterations=5, **settings)
-    run(tmp_path / "pieces", iterations=2, **settings)
-    run(tmp_path / "pieces", iterations=5, **settings)
+    for iterations in (2, 5):
+        run(tmp_path / "pieces", iterations=iterations, **settings)
     assert (tmp_path / "whole/archive.npz").read_bytes() == (tmp_path / "pieces/archive.npz").read_bytes()
     # Of 4 indices of 0 to 4, those that sum to 2, 3 and 4: C(5, 3) + C(6, 3) + C(7, 3) = 10 + 20 + 35.
     assert json.loads((tmp_path / "whole/archive.json").read_text())["reachable_cells"] == 65
@@ -109,14 +117,12 @@ def test_a_finished_search_crosses_nothing_writes_what_is_lost_and_keeps_what_wa
     judged = (path / "archive.npz").read_bytes()
     assert run(path, opener=never).fresh is not None
     assert (path / "archive.npz").read_bytes() == judged
-    saved = (path / "checkpoint.bin").read_bytes()
-    (path / "checkpoint.bin").unlink()  # the largest file by far, which only more iterations need
+    (path / "checkpoint.bin").rename(tmp_path / "saved")  # the largest file by far, which only more iterations need
     assert run(path, opener=never).fresh is not None
-    with pytest.raises(ValueError, match=r"checkpoint\.bin"):
-        run(path, iterations=3)
-    with pytest.raises(ValueError, match="seed"):
-        run(path, seed=4)
-    (path / "checkpoint.bin").write_bytes(saved)
+    for name, changes in ((r"checkpoint\.bin", {"iterations": 3}), ("seed", {"seed": 4})):
+        with pytest.raises(ValueError, match=name):
+            run(path, **changes)
+    (tmp_path / "saved").rename(path / "checkpoint.bin")
     assert run(path, iterations=3).fresh is None  # there are other elites now
 
 
@@ -143,15 +149,14 @@ def test_what_a_run_is_not_gone_on_with_leaves_it_alone(tmp_path):
         assert {name: (path / name).read_bytes() for name in os.listdir(path)} == before
 
     refused("iterations", iterations=2)
-    fitness = FitnessCfg(penalties=("yaw_rate", "wobble"), scales=(1.0, 1.0))
-    refused("wobble", fitness=fitness)
+    refused("wobble", fitness=FitnessCfg(penalties=("yaw_rate", "wobble"), scales=(1.0, 1.0)))
     state = load_checkpoint(path / "checkpoint.bin")
     for name in state:
         save_checkpoint(path / "checkpoint.bin", {key: value for key, value in state.items() if key != name})
         before["checkpoint.bin"] = (path / "checkpoint.bin").read_bytes()
         refused(name, iterations=5)
     before["checkpoint.bin"] = (tmp_path / "other/checkpoint.bin").read_bytes()
-    (path / "checkpoint.bin").write_bytes(before["checkpoint.bin"])  # one that strayed here
+    shutil.copy(tmp_path / "other/checkpoint.bin", path)  # one that strayed here
     refused(r"checkpoint\.bin.*seed", iterations=5)
     del before["checkpoint.bin"]
     (path / "checkpoint.bin").unlink()
@@ -204,12 +209,9 @@ AGAIN = dataclasses.replace(CFG.scheduler, method="map_elites", again=6, settlin
 def test_the_last_iterations_settle_what_was_found(tmp_path):
     path = tmp_path / "run"
     archive = run(path, scheduler=AGAIN, iterations=6)
-    rows = rows_of(path)
-    assert [row["terrains"] for row in rows] == [12, 12, 12, 12, 0, 0]
-    assert [row["episodes"] for row in rows] == [48, *[96] * 5]
+    assert [(row["terrains"], row["episodes"]) for row in rows_of(path)] == [(12, 48), *[(12, 96)] * 3, *[(0, 96)] * 2]
     assert json.loads((path / "archive.json").read_text())["terrains_evaluated"] == 48
-    assert archive.iteration.max() <= 4
-    assert np.median(archive.episodes) > 8
+    assert archive.iteration.max() <= 4 and np.median(archive.episodes) > 8
     run(path, scheduler=AGAIN, iterations=10)  # begins with new terrains again
     assert [row["terrains"] for row in rows_of(path)][6:] == [12, 12, 0, 0]
 
@@ -257,10 +259,7 @@ def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
         draws = [np.random.default_rng(int(seed)).lognormal(0.0, 0.5, (count, 6)) for seed in seeds]
         return stand_in.make_result(400.0 * hardness[:, None] * np.stack(draws) * stand_in.SCALES)
 
-    @contextlib.contextmanager
-    def opener(cfg):
-        yield stand_in.Stub(lambda genes, seeds: noisy(genes, seeds, cfg.replicas))
-
+    opener = Robots(lambda cfg, genes, seeds: noisy(genes, seeds, cfg.replicas))
     scheduler = dataclasses.replace(CFG.scheduler, method="map_elites", emitters=4, batch_size=15)
     once = run(tmp_path / "once", opener=opener, scheduler=scheduler, iterations=20)
     scheduler = dataclasses.replace(scheduler, batch_size=8, again=7, settling=3)
@@ -271,3 +270,65 @@ def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
         return (fresh.cell == archive.cell).mean()
 
     assert share_in_the_same_cell(again) > 1.3 * share_in_the_same_cell(once)
+
+
+def test_a_terminal_has_one_line_that_fits_with_the_time_left_first(monkeypatch, capsys):
+    for name, value in {"FORCE_COLOR": "1", "NO_COLOR": "1", "COLUMNS": "50", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    with Bar("crossing" + 30 * " terrains", total=4, done=2) as bar:
+        bar.move_to(3)
+    text = capsys.readouterr().err
+    assert "\x1b[36m" not in text  # no colour where NO_COLOR is set
+    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text))
+    assert any(re.match(r" +\d+ s left  75% ━━━━━━━━── crossing terrains .*…$", line) for line in lines)
+    assert max(map(len, lines)) == 50
+
+
+def test_elsewhere_a_plain_line_every_half_minute(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with Bar("iteration 3/4", total=4, done=2) as bar:
+        for now[0], share in ((10, 0.2), (60, 0.5), (80, 0.9)):
+            bar.within(2, 1)(share)
+    # Half an iteration took a minute: one and a half take three.
+    assert capsys.readouterr().err == " 3 min left  62% ━━━━━━──── iteration 3/4\n"
+    with Bar("quick") as bar:
+        bar.move_to(1.0)
+    assert capsys.readouterr().err == ""
+
+
+ROBOT = get_robot("anymal")
+
+
+def short_rollout(cfg, num_terrains):
+    return Rollout(
+        dataclasses.replace(ROBOT, max_duration_s=1.6),
+        cfg.policy, num_terrains=num_terrains, replicas=cfg.replicas, num_envs=4, device=cfg.compute.device,
+        cfg=CrossingCfg(start=(12.5, 4.0), poll_every_s=0.2),
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_search_in_groups_that_is_extended_equals_the_one_in_one_go_by_any_number_of_processes(tmp_path, device):
+    """Robots go on with the terrains of other groups; three emitters make groups of one and two."""
+    settings = {
+        "replicas": 3,
+        "fitness": FitnessCfg(penalties=ROBOT.penalties, scales=(1.0, 2.0, 1.0, 300.0, 0.05, 0.3)),
+        "scheduler": SchedulerCfg(method="cma_mae+map_elites", emitters=3, batch_size=2, sigma0=1.0, groups=2),
+    }
+
+    def searched(path, iterations, *, workers="1"):
+        def opened(cfg):
+            compute = Compute(device, workers=workers if device == "cpu" else None)
+            return open_pipeline(dataclasses.replace(cfg, compute=compute), build=short_rollout)
+
+        return run(path, iterations=iterations, **settings, opener=opened)
+
+    whole = searched(tmp_path / "whole", 3)
+    searched(tmp_path / "pieces", 1, workers="2")
+    pieces = searched(tmp_path / "pieces", 3, workers="1")
+    assert len(whole) > 1
+    assert all(0.0 <= row["idle_share"] <= 1.0 for row in rows_of(tmp_path / "pieces"))
+    if device == "cpu":  # a GPU adds in any order
+        for name in ("genes", "cell", "fitness", "iteration", "ratios"):
+            np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name), err_msg=name)

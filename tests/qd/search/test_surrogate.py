@@ -1,5 +1,6 @@
 """The surrogate over a stand-in whose penalties follow from heights, as a robot's do."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -46,22 +47,20 @@ def small_steps():
 def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
     """What each network says, on the host in double precision."""
     prediction = search.predict(torch.from_numpy(genes).to(search.device))
-    names = ("ratios", "fitness", "collided")
-    return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in names}
+    return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in ("ratios", "fitness", "collided")}
 
 
-def make_surrogate(cfg: SchedulerCfg = CFG) -> Surrogate:
-    return Surrogate(cfg, CELLS, SUPER_GAUSSIAN, np.random.SeedSequence(0))
+def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, **settings) -> Surrogate:
+    return Surrogate(dataclasses.replace(CFG, **settings), cells, space, np.random.SeedSequence(0))
 
 
 @pytest.fixture(scope="module")
 def learned() -> Surrogate:
     """A surrogate that knows 400 random terrains."""
-    surrogate = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=6))
+    surrogate = make_surrogate(training_steps=6)
     for seed in range(4):
         genes = SUPER_GAUSSIAN.hard_random(100, seed)
-        evaluation = crossed(genes, seed)
-        surrogate.learn(genes, evaluation)
+        surrogate.learn(genes, crossed(genes, seed))
     return surrogate
 
 
@@ -71,7 +70,7 @@ def test_what_it_learned_holds_for_other_terrains(learned):
     prediction = predicted(learned, genes)
     assert len(learned) == 400
     mean = prediction["ratios"].mean(axis=0)
-    assert np.abs(mean.sum(axis=1) - 1.0).max() < 1e-6
+    np.testing.assert_allclose(mean.sum(axis=1), 1.0, atol=1e-6)
     # Against the mean ratios of all, which is what it would say that has learned nothing of heights.
     error, spread = ((mean - truth.ratios) ** 2).sum(), ((truth.ratios - truth.ratios.mean(axis=0)) ** 2).sum()
     assert error < 0.7 * spread
@@ -82,7 +81,7 @@ def test_what_it_learned_holds_for_other_terrains(learned):
 def test_it_learns_from_a_payload_alone():
     """On one terrain for all, penalties follow from the payload."""
     space = get_space("super_gaussian+payload")
-    search = Surrogate(CFG, CELLS, space, np.random.SeedSequence(0))
+    search = make_surrogate(space)
 
     def loaded(count, seed):
         genes = np.tile(space.hard_random(1, 0), (count, 1))
@@ -126,14 +125,12 @@ def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeyp
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     same = lambda genes, space: corridor_heights(genes.cpu(), space).to(genes.device)  # noqa: E731
     monkeypatch.setattr(module, "corridor_heights", same)
-    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2)
-    straight, moved = make_surrogate(cfg), make_surrogate(cfg)
+    straight, moved = (make_surrogate(training_steps=2) for _ in range(2))
     moved.compute_on(device)
     for seed in range(3):
         genes = SUPER_GAUSSIAN.hard_random(100, seed)
-        evaluation = crossed(genes, seed)
-        straight.learn(genes, evaluation)
-        moved.learn(genes, evaluation)
+        for search in (straight, moved):
+            search.learn(genes, crossed(genes, seed))
         moved = pickle.loads(pickle.dumps(moved))  # on the CPU
         moved.compute_on("cpu" if seed == 1 else device)
     genes = SUPER_GAUSSIAN.hard_random(50, 9)
@@ -145,8 +142,7 @@ def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeyp
 @pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness+push+delay"])
 def test_it_learns_and_proposes_on_every_device(device, name, tmp_path):
     space = load_space(name.format(own=write_ridges(tmp_path)))
-    cfg = SchedulerCfg(emitters=2, batch_size=16, training_steps=2, candidates=8, generations=2)
-    search = Surrogate(cfg, CELLS, space, np.random.SeedSequence(0))
+    search = make_surrogate(space, training_steps=2)
     search.compute_on(device)
     elites = space.hard_random(80, 0)
     evaluation = crossed(elites, 0, space)
@@ -159,15 +155,13 @@ def test_it_learns_and_proposes_on_every_device(device, name, tmp_path):
     assert np.median(apart) < 0.005  # devices may round an element of a course to another node
 
 
-def archive_cells(ratios: torch.Tensor) -> np.ndarray:
+def archive_cells(ratios: np.ndarray) -> np.ndarray:
     """By the archive's own rule, in double precision."""
-    ratios = ratios.double().numpy()
     return CELLS.find_cells(ratios / ratios.sum(axis=-1, keepdims=True))
 
 
 def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
-    cfg = SchedulerCfg(emitters=2, batch_size=16, explore_share=0.0, disagree_share=0.0, candidates=20, generations=2)
-    learned.cfg = cfg
+    learned.cfg = dataclasses.replace(CFG, explore_share=0.0, disagree_share=0.0, candidates=20)
     elites = SUPER_GAUSSIAN.hard_random(60, 0)
     evaluation = crossed(elites, 0)
     under_way = SUPER_GAUSSIAN.hard_random(8, 9)
@@ -175,25 +169,24 @@ def test_what_it_proposes_is_new_by_its_own_word_one_a_cell(learned):
     assert genes.shape == (6, 64) and np.abs(genes).max() <= 1.0
 
     def predict(genes):
-        prediction = learned.predict(torch.from_numpy(genes))
-        return prediction, prediction.fitness.numpy(), archive_cells(prediction.ratios.mean(0))
+        """Mean ratios and fitness."""
+        prediction = predicted(learned, genes)
+        return prediction["ratios"].mean(axis=0), prediction["fitness"].mean(axis=0)
 
     def gains(genes):
         """The fitness above the best of the cell where a terrain may fall; the mean over 50 draws of ratios."""
-        prediction, fitness, _ = predict(genes)
-        error = np.sqrt(learned.squared_error)
-        noise = error * np.random.default_rng(0).normal(size=(50, len(genes), 6))
-        drawn = np.maximum(prediction.ratios.mean(0).numpy() + noise, 1e-6)
-        cells = [archive_cells(torch.from_numpy(ratios)) for ratios in drawn]
-        return np.mean([np.maximum(fitness.mean(axis=0) - best[cell], 0.0) for cell in cells], axis=0)
+        ratios, fitness = predict(genes)
+        noise = np.sqrt(learned.squared_error) * np.random.default_rng(0).normal(size=(50, len(genes), 6))
+        cells = map(archive_cells, np.maximum(ratios + noise, 1e-6))
+        return np.mean([np.maximum(fitness - best[cell], 0.0) for cell in cells], axis=0)
 
-    assert len(set(predict(genes)[2])) == 6
+    assert len(set(archive_cells(predict(genes)[0]))) == 6
     best = np.full(CELLS.num_cells, -20.0, np.float32)
     np.maximum.at(best, evaluation.cell, evaluation.fitness.astype(np.float32))
-    _, expected_fitness, cells = predict(under_way)
-    np.maximum.at(best, cells, expected_fitness.mean(axis=0))
+    ratios, fitness = predict(under_way)
+    np.maximum.at(best, archive_cells(ratios), fitness.astype(np.float32))
     assert (gains(genes) > 0.0).all()
-    chance = vary_elites(torch.from_numpy(elites), 60, cfg, 8, torch.Generator().manual_seed(0))
+    chance = vary_elites(torch.from_numpy(elites), 60, learned.cfg, 8, torch.Generator().manual_seed(0))
     assert gains(genes).mean() > gains(chance.numpy()).mean()
 
 
@@ -209,7 +202,7 @@ def test_it_knows_how_far_its_ratios_are_off(learned):
 
 @pytest.mark.parametrize("cells", [Cells(6, 10), Cells(5, 10, collision_bit=True)])
 def test_cells_are_the_archives(cells):
-    search = Surrogate(CFG, cells, SUPER_GAUSSIAN, np.random.SeedSequence(0))
+    search = make_surrogate(cells=cells)
     rng = np.random.default_rng(1)
     ratios, collided = rng.dirichlet(np.full(cells.num_ratios, 0.5), 3000), rng.random(3000) < 0.5
     numbers = search.find_cells(torch.from_numpy(ratios), torch.from_numpy(collided)).numpy()
@@ -233,7 +226,7 @@ def test_before_it_knows_enough_it_draws_and_varies():
 @pytest.mark.parametrize(("name", "value"), [("MAX_TERRAINS", 70), ("MAX_MAP_BYTES", 70 * 41 * 121 * 2 + 1)])
 def test_invalid_terrains_are_not_learned_and_the_newest_stay(monkeypatch, name, value):
     monkeypatch.setattr(module, name, value)
-    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=1))
+    search = make_surrogate(training_steps=1)
     for seed, length in ((0, 38), (1, 70)):
         genes = SUPER_GAUSSIAN.hard_random(40, seed)
         invalid = np.zeros((40, 4), bool)
@@ -247,12 +240,9 @@ def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(m
     """By what training is given: 60 terrains at a time up to 300, and then in place of the oldest."""
     monkeypatch.setattr(module, "MAX_TERRAINS", 300)
     given = []
-
-    def run(self, maps, targets, drawn, turned):
-        given.append((maps.clone(), targets, drawn))
-
+    run = lambda self, maps, targets, drawn, turned: given.append((maps.clone(), targets, drawn))  # noqa: E731
     monkeypatch.setattr(Trainer, "run", run)
-    search = make_surrogate(SchedulerCfg(emitters=2, batch_size=16, training_steps=60))
+    search = make_surrogate(training_steps=60)
     genes = SUPER_GAUSSIAN.hard_random(420, 0)
     evaluation = crossed(genes, 0)
     ratios = torch.from_numpy(evaluation.ratios)
@@ -261,11 +251,11 @@ def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(m
         part = slice(first, first + 60)
         search.learn(genes[part], evaluation.rows(part))
     assert [len(maps) for maps, _, _ in given] == [128, 256, 256, 300, 300, 300]
-    for told, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
-        places = drawn.unique()
-        terrain = torch.cdist(maps[places].float().flatten(1), heights).argmin(1)  # genes of 16 bits move maps a little
-        assert sorted(terrain.tolist()) == [*range(max(0, told - 300), told)]
-        torch.testing.assert_close(targets[places, :6].double(), ratios[terrain], rtol=0.0, atol=1e-3)
+    for count, (maps, targets, drawn) in zip(range(120, 421, 60), given, strict=True):
+        rows = drawn.unique()
+        terrain = torch.cdist(maps[rows].float().flatten(1), heights).argmin(1)  # genes of 16 bits move maps a little
+        assert sorted(terrain.tolist()) == [*range(max(0, count - 300), count)]
+        torch.testing.assert_close(targets[rows, :6].double(), ratios[terrain], rtol=0.0, atol=1e-3)
 
 
 PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))
