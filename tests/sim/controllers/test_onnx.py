@@ -169,7 +169,5 @@ def test_an_exported_file_is_the_controller(tmp_path, normalised):
 def test_only_a_checkpoint_can_be_exported_and_to_an_onnx_file(tmp_path, anymal):
     with pytest.raises(ValueError, match=r"policy\.pt"):
         export_onnx(MlpPolicy(rsl_rl_actor(48, 3).state_dict()), tmp_path / "policy.pt")
-    assert not list(tmp_path.iterdir())
-    export_onnx(load_actor(anymal.policy_file, anymal), tmp_path / "a.onnx")
     with pytest.raises(ValueError, match=r"a\.onnx"):
-        load_actor(tmp_path / "a.onnx", anymal)
+        load_actor(save(tmp_path / "a.onnx", linear()), anymal)
