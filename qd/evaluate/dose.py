@@ -133,18 +133,23 @@ def all_doses() -> dict[str, Dose]:
 def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     """Some of :func:`all_doses`, in their order, as a command line names them; without ``texts`` all but conditions.
 
-    A word is ``stairs_up``, or with other values ``ditch=0.2,0.4``; a text may hold several, with spaces. ``at`` are
-    other quantities of those that have them, ``tread=0.25``.
+    A text holds words ``stairs_up``, or with other values ``ditch=0.2,0.4``; ``at`` are other quantities of those that
+    have them, ``tread=0.25``.
     """
-    doses, chosen = all_doses(), dict[str, Sequence[float] | None]()
-    for word in " ".join(texts).split():
-        name, equals, values = word.partition("=")
-        chosen[name] = [_parse_number(value, word) for value in values.split(",")] if equals else None
+    doses, chosen, others = all_doses(), dict[str, Sequence[float] | None](), dict[str, float]()
+    word = ""
+    try:
+        for word in " ".join(texts).split():
+            name, equals, values = word.partition("=")
+            chosen[name] = [float(value) for value in values.split(",")] if equals else None
+        for word in " ".join(at).split():
+            name, _, value = word.partition("=")
+            others[name] = float(value)
+    except ValueError:
+        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None
     chosen = chosen or {name: None for name in doses if name not in CONDITIONS}
     if unknown := chosen.keys() - doses.keys():
         raise ValueError(f"elements must be some of {', '.join(doses)}, got {', '.join(sorted(unknown))}")
-    pairs = (word.partition("=") for word in " ".join(at).split())
-    others = {name: _parse_number(value, f"{name}={value}") for name, _, value in pairs}
     doses = {name: dose for name, dose in doses.items() if name in chosen}
     allowed = sorted({name for dose in doses.values() for name in dose.others})
     if wrong := others.keys() - set(allowed):
@@ -155,16 +160,9 @@ def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     return {name: dose.changed(chosen[name], others) for name, dose in doses.items()}
 
 
-def _parse_number(text: str, word: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"expected NAME=NUMBER, as in tread=0.25, got {word}") from None
-
-
 def measure_dose(
     robot: RobotCfg,
-    controllers: Mapping[str, str],
+    controllers: dict[str, str],
     doses: Mapping[str, Dose],
     *,
     compute: Compute,

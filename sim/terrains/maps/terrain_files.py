@@ -15,6 +15,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.stl import export_stl
 from trimesh.visual import interpolate
 
 from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
@@ -67,7 +69,7 @@ class ExportedTerrain:
         return x, y, float(self.heights[round(y / SPACING), round(x / SPACING)])
 
 
-def png_of(terrain: ExportedTerrain) -> bytes:
+def _encode_png(terrain: ExportedTerrain) -> bytes:
     """A 16-bit grayscale PNG seen from above: x to the right, y up, so that the topmost row is the highest y."""
     scale, offset = terrain.gray_scale
     gray = np.rint((np.asarray(terrain.heights, dtype=np.float64) - offset) / scale).astype(np.uint16)
@@ -76,11 +78,8 @@ def png_of(terrain: ExportedTerrain) -> bytes:
     return buffer.getvalue()
 
 
-def npz_of(terrain: ExportedTerrain) -> bytes:
-    """``heights`` [m] float32 (nrow, ncol), row along y, ``size_m`` (along x, along y) and, where known, ``genes``.
-
-    With ground of its own also ``friction`` and ``time_constant_s``, float32 (rows, cols), row along y.
-    """
+def _encode_npz(terrain: ExportedTerrain) -> bytes:
+    """What :func:`sim.terrains.maps.heightmap.read_heightmap` reads and, where known, ``genes``; all float32."""
     content = {"heights": np.asarray(terrain.heights, np.float32), "size_m": np.array(terrain.size)}
     if terrain.genes is not None:
         content["genes"] = np.asarray(terrain.genes, np.float32)
@@ -89,7 +88,7 @@ def npz_of(terrain: ExportedTerrain) -> bytes:
     return npz_bytes(content)
 
 
-def npy_of(terrain: ExportedTerrain) -> bytes:
+def _encode_npy(terrain: ExportedTerrain) -> bytes:
     """Heights as the terrain generators of Isaac Lab and legged_gym hold them: int16 [x, y], in steps of 1 mm."""
     steps = np.rint(np.asarray(terrain.heights, dtype=np.float64).T / STEP_M)
     if np.abs(steps).max() > np.iinfo(np.int16).max:
@@ -102,11 +101,10 @@ def npy_of(terrain: ExportedTerrain) -> bytes:
     return buffer.getvalue()
 
 
-def mjcf_of(terrain: ExportedTerrain) -> bytes:
-    """A scene of the terrain alone, in one file: its surface is the simulation's, between the nodes too.
+def _encode_mjcf(terrain: ExportedTerrain) -> bytes:
+    """A scene of the terrain alone: its surface, step and solver are the simulation's; gravity is the earth's.
 
-    The geom stands turned by a quarter; x, y and z of the world are the terrain's. Its friction is below every robot's
-    own: of two MuJoCo takes the larger. Step and solver are the simulation's; gravity is the earth's.
+    The geom's friction is below every robot's own: of two MuJoCo takes the larger.
     """
     field, solver = as_hfield(terrain.heights), SolverCfg()
     root = ET.Element("mujoco", model=terrain.name)
@@ -116,7 +114,7 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     rows, columns = map(str, field.data.shape)
     # The first row of an elevation has the highest y of the asset; MuJoCo scales what it reads to 0..1.
     lines = [" ".join(f"{value:.7g}" for value in row) for row in field.data[::-1]]
-    elevation = {"nrow": rows, "ncol": columns, "size": _words(field.size), "elevation": " ".join(lines)}
+    elevation = {"nrow": rows, "ncol": columns, "size": _join_numbers(field.size), "elevation": " ".join(lines)}
     asset = ET.SubElement(root, "asset")
     ET.SubElement(asset, "hfield", {"name": "terrain", **elevation})
     sky = {"type": "skybox", "builtin": "gradient", "rgb1": "0.72 0.81 0.91", "rgb2": "0.96 0.97 0.98"}
@@ -125,16 +123,16 @@ def mjcf_of(terrain: ExportedTerrain) -> bytes:
     ET.SubElement(world, "light", name="sun", directional="true", pos="8 4 10", dir="0.3 0.4 -1", diffuse="0.8 0.8 0.8")
     shape = {"type": "hfield", "hfield": "terrain", "friction": str(GROUND_FRICTION), "rgba": "0.7 0.66 0.6 1"}
     shape["solmix"] = "0"  # the stiffness of a contact is the robot's
-    shape |= {"pos": _words(field.position), "quat": _words(QUARTER_TURN)}
+    shape |= {"pos": _join_numbers(field.position), "quat": _join_numbers(QUARTER_TURN)}
     ET.SubElement(world, "geom", {"name": "terrain", **shape})
     for name, place, color in (("start", CrossingCfg.start, "1 1 1 1"), ("goal", CrossingCfg.goal, "0 0.62 0.45 1")):
-        position = _words(terrain.on_ground(*place))
+        position = _join_numbers(terrain.on_ground(*place))
         ET.SubElement(world, "site", name=name, type="cylinder", size="0.15 0.01", pos=position, rgba=color)
     ET.indent(root)
     return ET.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
-def _words(numbers: Sequence[float]) -> str:
+def _join_numbers(numbers: Sequence[float]) -> str:
     return " ".join(map(repr, numbers))
 
 
@@ -152,24 +150,18 @@ def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([top, below, below.mean(axis=0, keepdims=True)]), faces, process=False)
 
 
-def glb_of(terrain: ExportedTerrain) -> bytes:
+def _encode_glb(terrain: ExportedTerrain) -> bytes:
     """The block with its heights as colours; a node turns it, since y is up in glTF."""
     block, scene = block_of(terrain.heights), trimesh.Scene()
     colors = interpolate(block.vertices[:, 2].clip(terrain.heights.min()), "viridis")
     mesh = trimesh.Trimesh(block.vertices, block.faces, vertex_colors=colors, process=False)
     scene.add_geometry(mesh, transform=_Y_UP)
-    return _exported(scene, "glb")
-
-
-def _exported(shape: trimesh.Trimesh | trimesh.Scene, ending: str) -> bytes:
-    content = shape.export(file_type=ending)
-    assert isinstance(content, bytes)
-    return content
+    return export_glb(scene)
 
 
 FORMATS: dict[str, Callable[[ExportedTerrain], bytes]] = {
-    "npz": npz_of, "png": png_of, "npy": npy_of, "xml": mjcf_of,
-    "stl": lambda terrain: _exported(block_of(terrain.heights), "stl"), "glb": glb_of,
+    "npz": _encode_npz, "png": _encode_png, "npy": _encode_npy, "xml": _encode_mjcf,
+    "stl": lambda terrain: export_stl(block_of(terrain.heights)), "glb": _encode_glb,
     "sdf": lambda terrain: _SIX_LINES.format(name=escape(terrain.name, {'"': "&quot;"})).encode(),
 }  # fmt: skip
 """Formats by the ending of their files; ``xml`` is MJCF, ``sdf`` a model for Gazebo round the STL beside it."""

@@ -41,8 +41,8 @@ def under_conditions(rows: np.ndarray, seeds: np.ndarray) -> Terrains:
 
 def genes(**values: float) -> np.ndarray:
     """A row of flat ground under some conditions by their names; the others are nominal."""
-    row = [gene.to_gene(values[gene.name]) if gene.name in values else gene.absent for gene in condition_genes()]
-    return np.concatenate([FLAT_GENES, np.float32(row)])
+    rows = [condition.to_genes(values) for condition in CONDITIONS.values()]
+    return np.concatenate([FLAT_GENES, *rows], dtype=np.float32)
 
 
 CASES = {
@@ -56,34 +56,31 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def rollouts(anymal):
-    """Rollouts that have conditions, by the robot's name, each built once."""
-    made = {}
+def shared(anymal):
+    """A rollout that has conditions, built once."""
+    sizes = {"num_terrains": 1, "replicas": EPISODES, "device": "cpu", "space": SPACE}
+    return Rollout(anymal, anymal.policy_file, **sizes)
 
-    def of(robot, policy):
-        if robot.name not in made:
-            sizes = {"num_terrains": 1, "replicas": EPISODES, "device": "cpu", "space": SPACE}
-            made[robot.name] = Rollout(robot, policy, **sizes)
-        return made[robot.name]
 
-    return of
+def begin(rollout, row, seed):
+    """Begins the episodes of a row of genes anew; returns their order among the robots."""
+    rollout.clear()
+    rollout.put(under_conditions(row[None], np.array([seed], np.uint32)))
+    return np.argsort(rollout.episode.numpy())
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, rollouts, case):
+def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, shared, case):
     row, seconds = genes(**CASES[case]), 0.2 if case == "grip" else 0.3  # later each slips in its way
     conditions = SPACE.condition_rows(row[None])[0]
     for name, value in CASES[case].items():
         assert conditions[condition_column(name)] == pytest.approx(value, rel=1e-5)
-    rollout = rollouts(anymal, anymal.policy_file)
-    rollout.clear()
-    rollout.put(under_conditions(row[None], np.array([1000], np.uint32)))
-    heights = rollout.sim.bank.heights.numpy()[0]
+    order = begin(shared, row, 1000)
+    heights = shared.sim.bank.heights.numpy()[0]
     assert not heights.any()
     for _ in range(round(seconds / anymal.control_dt)):
-        rollout.control_step()
-    order = np.argsort(rollout.episode.numpy())
-    ours = rollout.sim.joint_q.numpy()[order]
+        shared.control_step()
+    ours = shared.sim.joint_q.numpy()[order]
     starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
     plain, nominal = (
         cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=under(row))[0].qpos
@@ -133,7 +130,7 @@ def test_an_episode_depends_on_its_own_conditions_alone(anymal, device):
     assert apart.min() > 1e-4  # each condition does something
 
 
-def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts):
+def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal):
     row = genes(payload=0.2, push_x=-0.5, push_time=0.2, friction=0.5)
     seeds, heights = np.array([3], np.uint32), np.zeros((1, NUM_ROWS, NUM_COLS), np.float32)
     short = dataclasses.replace(anymal, max_duration_s=0.5)
@@ -160,19 +157,16 @@ def test_heights_may_come_with_conditions_and_cross_as_genes_do(anymal, rollouts
             under(changed)
 
 
-def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(anymal, rollouts):
+def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(anymal, shared):
     seen = {}
     for name, row in {"none": genes(), "noise": genes(noise=2.0), "lag": genes(lag=0.04)}.items():
-        rollout = rollouts(anymal, anymal.policy_file)
-        rollout.clear()
-        rollout.put(under_conditions(row[None], np.array([7], np.uint32)))
-        order = np.argsort(rollout.episode.numpy())
-        rows = [rollout._observation.numpy()[order].copy()]
+        order = begin(shared, row, 7)
+        rows = [shared._observation.numpy()[order].copy()]
         for _ in range(4):
-            rollout._action.fill_(0.1)  # the same motion, whatever is seen
-            rollout.sim.launch(rollout._step_graph)
-            rollout.sim.launch(rollout._turn_graph)
-            rows.append(rollout._observation.numpy()[order].copy())
+            shared._action.fill_(0.1)  # the same motion, whatever is seen
+            shared.sim.launch(shared._step_graph)
+            shared.sim.launch(shared._turn_graph)
+            rows.append(shared._observation.numpy()[order].copy())
         seen[name] = np.array(rows)
     added, widths = seen["noise"] - seen["none"], 2.0 * noise_widths(anymal)
     assert (np.abs(added) <= widths + 1e-5).all() and not added[..., widths == 0.0].any()
@@ -201,15 +195,15 @@ def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, 
         assert (np.abs(weak) < np.abs(strong)).all()
 
 
-def vary(robot, model, row):
-    """Changes a model of MuJoCo C as a row of conditions does."""
+def vary(robot, model, **values):
+    """Changes a model of MuJoCo C as conditions do."""
+    row = SPACE.condition_rows(genes(**values)[None])[0]
     EpisodeStates(robot, model, Starts(qpos=np.zeros((0, 7)), qvel=np.zeros((0, 6))), row.astype(float))
 
 
 def test_a_payload_is_a_point_mass_on_the_base(anymal):
-    row = SPACE.condition_rows(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0]
     plain, loaded = (crossing_model(anymal, np.zeros((161, 321), np.float32)) for _ in range(2))
-    vary(anymal, loaded, row)
+    vary(anymal, loaded, payload=0.2, payload_x=0.1, payload_y=-0.2)
     mass = plain.body_subtreemass[1]
     assert loaded.body_subtreemass[1] == pytest.approx(1.2 * mass)
     moved = loaded.body_ipos[1] - plain.body_ipos[1]
@@ -217,10 +211,8 @@ def test_a_payload_is_a_point_mass_on_the_base(anymal):
     # Against MuJoCo's own sum: a body of nothing but this mass, fixed to the base.
     spec = robot_spec(anymal)
     base = spec.bodies[1]
-    base.add_body(
-        name="payload", pos=plain.body_ipos[1] + [0.1, -0.2, 0.0], mass=0.2 * mass, ipos=[0.0] * 3,
-        inertia=[1e-9] * 3, explicitinertial=True,
-    )  # fmt: skip
+    point = {"mass": 0.2 * mass, "ipos": [0.0] * 3, "inertia": [1e-9] * 3, "explicitinertial": True}
+    base.add_body(name="payload", pos=plain.body_ipos[1] + [0.1, -0.2, 0.0], **point)
     theirs, inertias = spec.compile(), []
     for model in (loaded, theirs):
         data = mujoco.MjData(model)
@@ -237,7 +229,7 @@ def test_a_payload_is_where_it_is_on_a_base_whose_inertia_lies_at_its_origin(tmp
     robot = get_robot(str(write_dog(tmp_path)))
     model = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
     assert model.body_sameframe[1]
-    vary(robot, model, SPACE.condition_rows(genes(payload=0.2, payload_x=0.1, payload_y=-0.2)[None])[0])
+    vary(robot, model, payload=0.2, payload_x=0.1, payload_y=-0.2)
     data = mujoco.MjData(model)
     data.qpos[3] = 1.0
     mujoco.mj_kinematics(model, data)
@@ -247,16 +239,16 @@ def test_a_payload_is_where_it_is_on_a_base_whose_inertia_lies_at_its_origin(tmp
 
 def test_a_negative_payload_leaves_a_body_that_can_be(robot, device):
     """Less of the base itself, wherever the payload would be, and no less than half of it."""
-    row = genes(payload=-0.05, payload_x=0.2, payload_y=0.2)
+    light = {"payload": -0.05, "payload_x": 0.2, "payload_y": 0.2}
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=1, device=device, space=SPACE)
-    rollout.put(under_conditions(row[None], np.array([1], np.uint32)))
+    begin(rollout, genes(**light), 1)
     tree = rollout.sim.dynamics.tree
     plain = crossing_model(robot, np.zeros((NUM_ROWS, NUM_COLS), np.float32))
     share = 1.0 - min(0.5, 0.05 * plain.body_subtreemass[1] / plain.body_mass[1])
     assert tree.body_mass.numpy()[0, 1] == pytest.approx(share * plain.body_mass[1], rel=1e-5)
     np.testing.assert_allclose(tree.body_inertia.numpy()[0, 1], share * plain.body_inertia[1], rtol=1e-5)
     np.testing.assert_allclose(tree.body_ipos.numpy()[0, 1], plain.body_ipos[1], atol=1e-6)
-    vary(robot, plain, SPACE.condition_rows(row[None])[0])
+    vary(robot, plain, **light)
     np.testing.assert_allclose(plain.body_inertia[1], tree.body_inertia.numpy()[0, 1], rtol=1e-5)
 
 
@@ -273,10 +265,7 @@ def test_a_robot_whose_step_is_not_ours_has_no_conditions(anymal, monkeypatch):
 
 def test_a_kind_of_condition_is_a_part_that_is_absent_where_it_changes_nothing():
     rows = SPACE.uniform_random(3, 1)
-    words = SPACE.parts(rows[0])
-    assert len(words) == 8 + len(CONDITIONS) and SPACE.num_genes == 64 + len(condition_genes())
-    without = SPACE.without(rows, range(8, 8 + len(CONDITIONS)))
-    assert (SPACE.condition_rows(without) == nominal_row()).all() and (without[:, :64] == rows[:, :64]).all()
+    assert len(SPACE.parts(rows[0])) == 8 + len(CONDITIONS) and SPACE.num_genes == 64 + len(condition_genes())
     only = SPACE.without(rows, [8 + list(CONDITIONS).index("push")])
     changed = SPACE.condition_rows(only) != SPACE.condition_rows(rows)
     first = condition_column("push_x")
