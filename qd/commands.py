@@ -85,7 +85,14 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         """The flags' defaults: those of the preset, or of the run to go on with."""
         folder = peek(argv, "--resume")
         if folder is None:
-            preset = peek(argv, "--preset") or default_preset(argv)
+            preset = peek(argv, "--preset")
+            if preset is None:
+                device = peek(argv, "--device")
+                if device is None and not {"-h", "--help"} & {*argv}:
+                    from qd.workers.compute import choose_device
+
+                    device = choose_device(None, peek(argv, "--workers"))
+                preset = "wide" if (device or "").startswith("cuda") else "small"
             return cls(preset=preset, **read_preset(preset))
         from qd.search.directory import RunDirectory
 
@@ -364,13 +371,3 @@ class DoseCommand(RobotFlag, WorkerFlags):
         size: dict[str, Any] = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
         compute = _compute(self)
         measure_dose(robot, controllers, doses, compute=compute, resolved=self.resolved, out=self.out, **size)
-
-
-def default_preset(argv: Sequence[str]) -> str:
-    """The preset that suits the device of a command line: wide on a GPU, small on the CPU."""
-    device = peek(argv, "--device")
-    if device is None and not {"-h", "--help"} & {*argv}:
-        from qd.workers.compute import choose_device
-
-        device = choose_device(None, peek(argv, "--workers"))
-    return "wide" if device is not None and device.startswith("cuda") else "small"

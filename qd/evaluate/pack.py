@@ -316,7 +316,12 @@ def make_pack(
             "terrains": crossed,
         }
 
-    return publish(out / PACK_FILE, make_report, _show_pack)
+    def show(report: dict[str, Any]) -> None:
+        verdicts = Counter(entry["verdict"] for entry in report["terrains"])
+        title = ", ".join(f"{verdict}: {count} terrains" for verdict, count in verdicts.items())
+        show_pack_rates(title, report["rates"])
+
+    return publish(out / PACK_FILE, make_report, show)
 
 
 def _read_judged(search: Search) -> Archive:
@@ -405,10 +410,3 @@ def choose_terrains(entries: Sequence[Entry], size: int) -> list[int]:
         chosen.append(best)
         counts.update((name, entries[best][name]) for name in _SPREAD_OVER)
     return chosen
-
-
-def _show_pack(report: dict[str, Any]) -> None:
-    """Prints the rates of a pack's controllers, as ``pack.json`` has them."""
-    verdicts = Counter(entry["verdict"] for entry in report["terrains"])
-    title = ", ".join(f"{verdict}: {count} terrains" for verdict, count in verdicts.items())
-    show_pack_rates(title, report["rates"])

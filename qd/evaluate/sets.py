@@ -10,6 +10,7 @@ trained on some of them before: the marks of its elites, in its file or in its t
 
 import hashlib
 from collections.abc import Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -278,29 +279,22 @@ def read_trained_on(policy: str) -> set[str]:
     marks: set[str] = set()
     for file in ControllerSpec.parse(policy).files:
         record = file.with_suffix(".train.json")
-        for content in (read_json(record) if record.is_file() else {}, _content_of(file)):
-            recorded = content.get(TRAINED_ON, [])
+        contents: list[Any] = [read_json(record)] if record.is_file() else []
+        with suppress(Exception):  # another kind of file has no marks
+            contents.append(read_weights(file))
+        for content in contents:
+            recorded = content.get(TRAINED_ON, []) if isinstance(content, dict) else []
             if not isinstance(recorded, list) or not all(isinstance(mark, str) for mark in recorded):
                 raise ValueError(f"{file} or the record beside it is damaged at {TRAINED_ON}: put a copy of it back")
             marks.update(recorded)
     return marks
 
 
-def _content_of(file: Path) -> dict[str, Any]:
-    """What a file of weights holds; nothing of another kind of file."""
-    try:
-        content = read_weights(file)
-    except Exception:  # another kind of file, which has no marks
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
 def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], elites: str) -> None:
     """Refuses to test controllers on elites, shape (T, num_genes), that they were trained on."""
     marks = hash_elites(genes)
     for name, policy in controllers.items():
-        count = len(read_trained_on(policy).intersection(marks))
-        if count:
+        if count := len(read_trained_on(policy).intersection(marks)):
             raise ValueError(
                 f"{name} must not be tested on what it was trained on, got {count} of the {len(marks)} elites of "
                 f"{elites}: give the archive as it was when it was trained, or another search"

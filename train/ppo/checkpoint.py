@@ -143,10 +143,8 @@ def plain_layers(network: Any, name: str) -> MlpPolicy:
     for k, layer in enumerate(layers):
         state |= {f"mlp.{2 * k}.{key}": tensors[layer + key] for key in ("weight", "bias") if layer + key in tensors}
     is_complete = len(layers) > 1 and len(state) == 2 * len(layers)
-    for key, value in tensors.items():
-        name_in_module = key.rpartition(".")[2]
-        if name_in_module in ("_mean", "_std"):
-            state[f"obs_normalizer.{name_in_module}"] = value
+    names = {key: key.rpartition(".")[2] for key in tensors}
+    state |= {f"obs_normalizer.{name}": tensors[key] for key, name in names.items() if name in ("_mean", "_std")}
     for activation in ACTIVATIONS if is_complete else ():
         try:
             policy = MlpPolicy(state, activation)
