@@ -8,7 +8,7 @@ import sys
 import sysconfig
 import tomllib
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -172,10 +172,10 @@ def import_object(module: str, name: str) -> Any:
     return target
 
 
-def describe_controllers(controllers: dict[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
+def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dict[str, dict[str, str | None]]:
     """Policy, or ``shipped``, and hash of each controller by its name, as files of results have them."""
     shipped = [name for name, policy in controllers.items() if is_same_controller(policy, str(robot.policy_file))]
-    labels = controllers | dict.fromkeys(shipped, SHIPPED)
+    labels = {**controllers, **dict.fromkeys(shipped, SHIPPED)}
     return {name: {"policy": labels[name], "sha256": controller_hash(controllers[name])} for name in controllers}
 
 
