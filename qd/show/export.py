@@ -1,6 +1,6 @@
 """Elites, or terrains of a pack, as files for other programs: ``faultline export --elite 0`` or ``--elite all``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ from qd.faults.families import VERDICTS, Ranking
 from qd.search.archive import Archive
 from qd.search.directory import RUNS, output_folder
 from qd.search.progress import Bar
-from qd.show.elites import OpenedRun
+from qd.show.elites import EliteTerrain, OpenedRun
 from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.loaders import load_actor
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -43,26 +43,25 @@ def export_elites(
             f"a terrain file holds heights and ground, got terrains of {archive.space}, which are crossed under "
             "conditions: replay or film them instead"
         )
-    terrains = {terrain.stem: terrain for terrain in opened_run.terrains(elite, minimal)}
-    ranking = opened_run.rank(numbers=[terrain.number for terrain in terrains.values()])
+    terrains = opened_run.terrains(elite, minimal)
+    ranking = opened_run.rank(numbers=[terrain.number for terrain in terrains])
 
-    def build(name: str) -> ExportedTerrain:
-        genes = terrains[name].genes
-        (heights,), ground = make_terrains(genes[None], space)
-        shape: Any = {"heights": heights, "genes": genes, "ground": ground}
-        return ExportedTerrain(name=name, timestep=opened_run.robot.physics_dt, **shape)
+    def build(terrain: EliteTerrain) -> ExportedTerrain:
+        (heights,), ground = make_terrains(terrain.genes[None], space)
+        shape: Any = {"heights": heights, "genes": terrain.genes, "ground": ground}
+        return ExportedTerrain(name=terrain.stem, timestep=opened_run.robot.physics_dt, **shape)
 
     about = {
-        name: _describe_elite(ranking, row, archive)
+        terrain.stem: _describe_elite(ranking, row, archive)
         | ({"minimal": terrain.minimal} if terrain.minimal else {})
         | {"terrain": space.describe(terrain.genes)}
-        for row, (name, terrain) in enumerate(terrains.items())
+        for row, terrain in enumerate(terrains)
     }
     origin = {"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256}
     origin |= archive.named()
     name = _FOLDER if minimal is None else f"minimal-{_FOLDER}"
     folder = output_folder(opened_run.path, opened_run.robot.name) / name
-    return _export(about, build, origin, out or folder, **options)
+    return _export(about, map(build, terrains), origin, out or folder, **options)
 
 
 def export_pack(
@@ -81,28 +80,27 @@ def export_pack(
     indices = choose_elites(elite, range(len(pack.terrains)), f"{folder} has no place")
     rows = {pack.terrains[index]["name"]: index for index in indices}
 
-    def build(name: str) -> ExportedTerrain:
-        heights = pack.heights[rows[name]]
-        genes = pack.genes[rows[name]]
-        return ExportedTerrain(heights=heights, name=name, genes=genes, timestep=pack_robot.physics_dt)
-
     about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
     keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")
     origin = {"pack": folder.name} | {key: pack.content[key] for key in keys}
     out = out or RUNS / f"{pack_robot.name}-pack-{_FOLDER}"
-    return _export(about, build, origin, out, formats=formats, overwrite=overwrite)
+    terrains = (
+        ExportedTerrain(name=name, heights=pack.heights[row], genes=pack.genes[row], timestep=pack_robot.physics_dt)
+        for name, row in rows.items()
+    )
+    return _export(about, terrains, origin, out, formats=formats, overwrite=overwrite)
 
 
 def _export(
     about: dict[str, dict[str, Any]],
-    build: Callable[[str], ExportedTerrain],
+    terrains: Iterable[ExportedTerrain],
     origin: dict[str, Any],
     folder: Path,
     *,
     formats: Sequence[str] = tuple(FORMATS),
     overwrite: bool = False,
 ) -> list[Path]:
-    """Writes terrains by the names of their files, an index and how to use them."""
+    """Writes terrains with what is known of them by their names, an index and how to use them."""
     formats = list(dict.fromkeys(formats))
     check_formats(formats)
     shared = (INDEX_FILE, README_FILE)
@@ -115,8 +113,8 @@ def _export(
     del origin["seed"]  # nothing is drawn
     files = []
     with Bar("exporting", len(about)) as bar:
-        for done, (name, facts) in enumerate(about.items(), start=1):
-            files += write_terrain(folder, build(name), formats=formats, about={**facts, **origin})
+        for done, terrain in enumerate(terrains, start=1):
+            files += write_terrain(folder, terrain, formats=formats, about=about[terrain.name] | origin)
             bar.move_to(done)
     readme = _TEMPLATES.get_template("export.md").render(stem=next(iter(about)))
     write_atomically(folder / README_FILE, f"{readme}\n".encode())

@@ -133,9 +133,9 @@ class Recordings:
         missing = [k for k in range(len(requests)) if k not in recordings]
         if not missing:
             return [*recordings.values()]
-        lots: dict[Any, list[int]] = {}
+        lots = defaultdict[Any, list[int]](list)
         for k in missing:
-            lots.setdefault(requests[k].lot_key, []).append(k)
+            lots[requests[k].lot_key].append(k)
         text = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {requests[missing[0]].replicas} times each"
         done = 0
         with Bar(f"crossing {text}", len(missing)) as bar:

@@ -13,7 +13,7 @@ import viser
 from qd.show.recordings import Recordings
 from qd.show.view.panels import PlayerBar
 from qd.show.view.recorder import Recorder, TaskProgress
-from qd.show.view.scene import SKY, compute_first_view, robot_parts
+from qd.show.view.scene import SKY, compute_first_view, robot_shapes
 from qd.show.view.tab import Shared, Tab
 from qd.show.view.viewed import ViewedRun
 from sim.files.atomic import prepare_output
@@ -48,8 +48,8 @@ class App:
         if request is not None and recordings.read(request) is None:
             recorder.request(request, key="first")  # before a page is open
         skeleton = Skeleton(show.robot)
-        parts = robot_parts(skeleton, show.robot)
-        self._shared = Shared(show, skeleton, parts, recordings, recorder, self.post)
+        shapes = robot_shapes(skeleton, show.robot)
+        self._shared = Shared(show, skeleton, shapes, recordings, recorder, self.post)
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")

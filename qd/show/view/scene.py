@@ -1,4 +1,4 @@
-"""The 3-D part of a tab: terrain, start and goal, robot, what touches, arrows and paths.
+"""The 3-D view of a tab: terrain, start and goal, robot, what touches, arrows and paths.
 
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
@@ -54,7 +54,7 @@ _SEGMENTS = 20  # round an arrow
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class BodyShape:
     """Shapes of one body that show the same touch, in its frame."""
 
     body: int
@@ -112,16 +112,16 @@ def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[
     return trimesh.transformations.quaternion_from_matrix(turn), float(np.linalg.norm(end - begin))
 
 
-def robot_parts(skeleton: Skeleton, robot: RobotCfg) -> list[Part]:
+def robot_shapes(skeleton: Skeleton, robot: RobotCfg) -> list[BodyShape]:
     """The visible shapes of a robot."""
     groups = dict[tuple[int, tuple[int, ...]], list[trimesh.Trimesh]]()
     for geom, touches in skeleton.touches.items():
         body = int(skeleton.model.geom_bodyid[geom]) - 1
-        shape, color = skeleton.shape(geom)
-        groups.setdefault((body, touches), []).append(_mesh(shape.vertices, shape.faces, np.rint(255.0 * color)))
+        mesh, color = skeleton.shape(geom)
+        groups.setdefault((body, touches), []).append(_mesh(mesh.vertices, mesh.faces, np.rint(255.0 * color)))
     first_foot = len(robot.geom_names) - len(robot.foot_geoms)
     return [
-        Part(body=body, touches=touches, is_foot=max(touches, default=0) >= first_foot, mesh=_joined(meshes))
+        BodyShape(body=body, touches=touches, is_foot=max(touches, default=0) >= first_foot, mesh=_joined(meshes))
         for (body, touches), meshes in groups.items()
     ]
 
@@ -145,23 +145,23 @@ def compute_first_view(width: int, height: int) -> View:
 class Scene:
     """The 3-D view of a tab: at first an invisible robot."""
 
-    def __init__(self, client: viser.ClientHandle, parts: Sequence[Part], num_bodies: int, num_feet: int) -> None:
+    def __init__(self, client: viser.ClientHandle, shapes: Sequence[BodyShape], num_bodies: int, num_feet: int) -> None:
         self._client = client
-        self._parts = parts
+        self._shapes = shapes
         self._num_bodies = num_bodies
         scene = client.scene
         self.robot, self.bodies = self._add_bodies("/robot")
-        self.parts: list[Any] = []
+        self.shapes: list[Any] = []
         self.touched: list[Any] = []
-        """Coloured copies of the parts, visible in their place while they touch."""
-        for k, part in enumerate(parts):
-            name = f"/robot/{part.body}/{k}"
-            self.parts.append(scene.add_mesh_trimesh(name, part.mesh, receive_shadow=False))
-            color = FOOT_TOUCH if part.is_foot else TOUCH
-            self.touched.append(self._add_mesh(f"{name}-touched", part.mesh, color, cast_shadow=True))
+        """Coloured copies of the shapes, visible in their place while they touch."""
+        for k, shape in enumerate(shapes):
+            name = f"/robot/{shape.body}/{k}"
+            self.shapes.append(scene.add_mesh_trimesh(name, shape.mesh, receive_shadow=False))
+            color = FOOT_TOUCH if shape.is_foot else TOUCH
+            self.touched.append(self._add_mesh(f"{name}-touched", shape.mesh, color, cast_shadow=True))
         self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
         self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
-        self._ghost_parts: list[Any] = []  # from when there is a ghost
+        self._ghost_shapes: list[Any] = []  # from when there is a ghost
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
         self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(num_feet)]
@@ -233,8 +233,8 @@ class Scene:
         with self._client.atomic():
             self.robot.visible = True
             _move_bodies(self.bodies, crossing, frame)
-            for part, alone, touched in zip(self._parts, self.parts, self.touched, strict=True):
-                touched.visible = bool(crossing.touching[frame, list(part.touches)].any())
+            for shape, alone, touched in zip(self._shapes, self.shapes, self.touched, strict=True):
+                touched.visible = bool(crossing.touching[frame, list(shape.touches)].any())
                 alone.visible = not touched.visible
             _set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
@@ -250,11 +250,11 @@ class Scene:
     def show_ghost(self, crossing: Crossing, frame: int, label: str = "") -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""
         with self._client.atomic():
-            if not self._ghost_parts:
-                for k, part in enumerate(self._parts):
-                    name = f"/ghost/{part.body}/{k}"
+            if not self._ghost_shapes:
+                for k, shape in enumerate(self._shapes):
+                    name = f"/ghost/{shape.body}/{k}"
                     look = {"opacity": _GHOST_OPACITY, "visible": True}
-                    self._ghost_parts.append(self._add_mesh(name, part.mesh, OTHER_CONTROLLER, **look))
+                    self._ghost_shapes.append(self._add_mesh(name, shape.mesh, OTHER_CONTROLLER, **look))
             self.ghost.visible = True
             _move_bodies(self.ghost_bodies, crossing, frame)
             self._ghost_name.text = label

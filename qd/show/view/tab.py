@@ -19,7 +19,7 @@ from qd.show.view.address import MINIMAL, Address, read_address
 from qd.show.view.panels import TERRAINS, ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
 from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
 from qd.show.view.recorder import Recorder, TaskProgress
-from qd.show.view.scene import Part, Scene, View, compute_first_view, compute_overview
+from qd.show.view.scene import BodyShape, Scene, View, compute_first_view, compute_overview
 from qd.show.view.viewed import SEARCHED, ViewedRun, count_endings
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
@@ -41,7 +41,7 @@ class Shared:
 
     show: ViewedRun
     skeleton: Skeleton
-    parts: list[Part]
+    shapes: list[BodyShape]
     recordings: Recordings
     recorder: Recorder
     post: Callable[..., None]
@@ -108,12 +108,12 @@ class Tab:
         self.address = Address()
         """What the browser's address says."""
         self._film: partial[None] | None = None
-        self._bar_at = 0.0  # when they were updated last
-        self._address_at = time.perf_counter()
-        self._settled_at = 0.0
+        self._bar_time = 0.0  # when they were updated last
+        self._address_time = time.perf_counter()
+        self._settled_time = 0.0
         self.robot = ShownController(shared, client.client_id)
         self.ghost = ShownController(shared, (client.client_id, "ghost"))
-        self.scene = Scene(client, shared.parts, shared.skeleton.num_bodies, len(show.robot.foot_geoms))
+        self.scene = Scene(client, shared.shapes, shared.skeleton.num_bodies, len(show.robot.foot_geoms))
         title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
         self.list = ArchivePanel(client, self.selection, title, self)
         self.panel = CrossingPanel(client, list(show.controllers), self)
@@ -177,7 +177,7 @@ class Tab:
         self.selection.picked = elite
         self.list.show()
         self._show_elite()
-        self._settled_at = time.perf_counter() + _SETTLE_S
+        self._settled_time = time.perf_counter() + _SETTLE_S
         self.set_follow(address.follow or (address.time_s is None and not has_camera))
 
     @property
@@ -191,17 +191,17 @@ class Tab:
         if self.playing:
             self.clock.tick(real_s)
             self._show_frame()
-            if self.scene.follow and now < self._settled_at:
+            if self.scene.follow and now < self._settled_time:
                 self.scene.set_follow(True)
-            if now - self._bar_at > _BAR_S:
-                self._bar_at = now
+            if now - self._bar_time > _BAR_S:
+                self._bar_time = now
                 self._show_time()
-        if now - self._address_at > _ADDRESS_S:
+        if now - self._address_time > _ADDRESS_S:
             self.show_address()
 
     def show_address(self) -> None:
         """Change the browser's address to what the tab shows."""
-        self._address_at = time.perf_counter()
+        self._address_time = time.perf_counter()
         camera = self.client.camera
         position, look_at = (",".join(f"{x:.2f}" for x in point) for point in (camera.position, camera.look_at))
         time_s = self.clock.time_s if self.robot.crossing is not None else self._begin_s

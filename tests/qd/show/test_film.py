@@ -35,8 +35,8 @@ def recording():
     return replace(made, heights=np.zeros((1, 161, 321), np.float32))
 
 
-def shot_of(recording, episode=4, **fields):
-    return Shot(recording=recording, episode=episode, **fields)
+def shot_of(recording, episode=4):
+    return Shot(recording=recording, episode=episode)
 
 
 def test_the_typical_episode_ends_like_most_and_costs_the_middle(recording):
@@ -142,11 +142,15 @@ def film(*argv):
     return run_command(FilmCommand, [*argv, "--device", "cpu", "--no-shadows"], name="film")
 
 
-def test_films_of_elites_and_of_a_map(run, capsys):
+@pytest.fixture
+def opengl():
     try:
         open_context(16, 16).free()
     except ValueError as error:
         pytest.skip(str(error))
+
+
+def test_films_of_elites_and_of_a_map(run, opengl, capsys):
     crossing = ("--replicas", "4", "--seed", "3", "--policy", "tests.sim.policies:stand")
     assert film("--elite", "0 2", *crossing) == 0
     name = "tests.sim.policies-stand"  # not the search's
@@ -180,11 +184,7 @@ def test_mistakes_are_refused_before_anything_is_crossed(run, capsys, flags, nam
     assert not list(run.glob("*.mp4"))
 
 
-def test_a_ghost_that_is_not_there_is_refused_with_its_remedy(run, capsys):
-    try:
-        open_context(16, 16).free()
-    except ValueError as error:
-        pytest.skip(str(error))
+def test_a_ghost_that_is_not_there_is_refused_with_its_remedy(run, opengl, capsys):
     remedies = ("faultline finetune --robot anymal --specialist", f"`faultline judge --robot anymal --run {run}`")
 
     def name_remedies(name):

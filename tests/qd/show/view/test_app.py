@@ -193,8 +193,8 @@ def test_a_frame_has_the_robot_in_its_place_what_touches_in_colour_and_forces(sh
     pushed = (forces[:, :, 1] != forces[:, :, 0]).any(axis=2)
     for frame in (np.argmax(shank), np.argmin(shank), np.argmax(pushed.any(axis=1))):
         shown.do((tab.seek, 0.02 * frame))
-        parts = zip(tab.shared.parts, tab.scene.parts, tab.scene.touched, strict=True)
-        columns = {column for part, _, touched in parts if touched.visible for column in part.touches}
+        shapes = zip(tab.shared.shapes, tab.scene.shapes, tab.scene.touched, strict=True)
+        columns = {column for shape, _, touched in shapes if touched.visible for column in shape.touches}
         assert columns == set(np.flatnonzero(touching[frame]).tolist())
         np.testing.assert_allclose(tab.scene.bodies[0].position, tab.robot.recording.base_position[0, 0, frame])
         assert [arrow.visible for arrow in tab.scene.forces] == pushed[frame].tolist()

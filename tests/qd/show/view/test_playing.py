@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from kernels.episode import Outcome
 from qd.show.view.playing import find_marks, group_episodes, trace_crossing, trace_paths
-from qd.show.view.scene import arrow_mesh, arrow_pose, robot_parts
+from qd.show.view.scene import arrow_mesh, arrow_pose, robot_shapes
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
@@ -95,10 +95,10 @@ def test_episodes_are_offered_by_how_they_ended():
 
 
 def test_each_part_of_a_robot_shows_one_touch(robot):
-    parts = robot_parts(Skeleton(robot), robot)
-    assert len({(part.body, part.touches) for part in parts}) == len(parts)
-    assert {column for part in parts for column in part.touches} == set(range(len(robot.geom_names)))
-    foot = next(part.mesh for part in parts if part.is_foot)
+    shapes = robot_shapes(Skeleton(robot), robot)
+    assert len({(shape.body, shape.touches) for shape in shapes}) == len(shapes)
+    assert {column for shape in shapes for column in shape.touches} == set(range(len(robot.geom_names)))
+    foot = next(shape.mesh for shape in shapes if shape.is_foot)
     # Of ANYmal's 0.19, 0.19, 0.20 of 1, sRGB 0.19 is (.19 + .055 over 1.055) ** 2.4 = .030 of the light: 8 of 255.
     if robot.name == "anymal":
         assert foot.visual.vertex_colors[0].tolist() == [8, 8, 8, 255]
