@@ -56,7 +56,7 @@ class Judging:
         return Terrains(genes=archive.genes[rows], seeds=seeds[rows], space=self.search.space)
 
     def count(self, policy: str, terrains: Terrains, label: str, **settings: Any) -> NDArray[np.int64]:
-        """Outcomes (num_terrains, 4) of a controller in 20 episodes each, or as :meth:`Crosser.cross` is told."""
+        """Outcomes on terrains, (num_terrains, 4), of 20 episodes each unless ``settings`` of Crosser.cross differ."""
         settings = {"replicas": EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
         return count_outcomes(self.crosser.cross(policy, terrains, **settings))
 

@@ -6,7 +6,7 @@ import os
 import re
 import socket
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from sim.controllers.loaders import load_policy
 from sim.device import resolve_device
@@ -17,24 +17,15 @@ _WORKERS = re.compile(r"(?P<ray>ray)(:(?P<actors>[1-9]\d{0,5}))?|(?P<processes>[
 _CONNECT_LIMIT_S = 10.0
 
 
-class Workers(NamedTuple):
-    """Who crosses terrains."""
-
-    on_ray: bool
-    """Ray actors, a GPU or a CPU core each, or processes of this machine."""
-    count: int | None
-    """How many; None: one a device of the cluster, or a core of this machine."""
-
-
-def parse_workers(text: str | None) -> Workers:
-    """Reads ``--workers``: ``4`` processes, ``ray``, or ``ray:4``; None for one process a core."""
+def parse_workers(text: str | None) -> tuple[bool, int | None]:
+    """Reads ``--workers``: whether Ray actors cross terrains, or processes, and how many; None: one a GPU or core."""
     if text is None:
-        return Workers(on_ray=False, count=None)
+        return False, None
     match = _WORKERS.fullmatch(text)
     if match is None:
         raise ValueError(f"workers must be a number of processes from 1 on, ray, or ray:N, got '{text}'")
     number = match["actors"] or match["processes"]
-    return Workers(on_ray=match["ray"] is not None, count=None if number is None else int(number))
+    return match["ray"] is not None, None if number is None else int(number)
 
 
 def available_cores() -> int:
@@ -64,9 +55,14 @@ class Compute:
         """Whether a GPU crosses them."""
         return self.device.startswith("cuda")
 
+    @property
+    def on_ray(self) -> bool:
+        """Whether Ray actors cross them, a GPU or a CPU core each."""
+        return parse_workers(self.workers)[0]
+
     def origin(self, seed: int) -> dict[str, Any]:
         """Provenance of what is crossed; on a cluster the device is ``cuda`` or ``cpu`` alone."""
-        return provenance(self.device, seed) | ({"device": self.device} if parse_workers(self.workers).on_ray else {})
+        return provenance(self.device, seed) | ({"device": self.device} if self.on_ray else {})
 
 
 def choose_device(name: str | None, workers: str | None = None) -> str:

@@ -52,15 +52,15 @@ def invalid_iterations(metrics: Sequence[Mapping[str, Any]]) -> str | None:
     """What to say of the invalid episodes of a search's iterations; None where none had over 5 % of them."""
     bad = [row for row in metrics if row["invalid_episodes"] > WARNED_SHARE * row["episodes"]]
     reasons: Counter[str] = sum((Counter(row["invalid_reasons"]) for row in bad), Counter())
-    words = explain_invalid(dict(reasons.most_common()), sum(row["episodes"] for row in bad)) if bad else None
-    return words and f"In {len(bad)} of {len(metrics)} iterations over {WARNED_SHARE:.0%} are invalid: {words}."
+    text = explain_invalid(dict(reasons.most_common()), sum(row["episodes"] for row in bad)) if bad else None
+    return text and f"In {len(bad)} of {len(metrics)} iterations over {WARNED_SHARE:.0%} are invalid: {text}."
 
 
 def refuse_all_invalid(result: RolloutResult) -> None:
     """Raises AllInvalidError if no episode is valid."""
     if result.invalid.size and result.invalid.all():
-        words = explain_invalid(invalid_reasons(result), result.invalid.size)
-        raise AllInvalidError(f"no episode is valid, expected some: {words}")
+        text = explain_invalid(invalid_reasons(result), result.invalid.size)
+        raise AllInvalidError(f"no episode is valid, expected some: {text}")
 
 
 def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -> None:

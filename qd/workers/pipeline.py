@@ -74,7 +74,7 @@ class PipelineCfg:
     @property
     def on_ray(self) -> bool:
         """Whether Ray workers cross."""
-        return parse_workers(self.compute.workers).on_ray and not self.on_mujoco_c
+        return self.compute.on_ray and not self.on_mujoco_c
 
     @property
     def in_process(self) -> bool:

@@ -104,7 +104,7 @@ class RayWorkers(Pipeline):
         super().__init__(cfg.num_terrains)
         gpus = int(cfg.compute.on_gpu)
         self._cfg = cfg
-        self._count = parse_workers(cfg.compute.workers).count
+        _, self._count = parse_workers(cfg.compute.workers)
         self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
         space = PackedCode.of(split_name(cfg.space)[0]) if is_user_space(cfg.space) else None
@@ -244,7 +244,7 @@ def _find_reason(error: BaseException) -> str:
 @contextmanager
 def open_ray_workers(cfg: PipelineCfg, build: Build) -> Iterator[RayWorkers]:
     """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.crosser.open_pipeline`."""
-    connect(parse_workers(cfg.compute.workers).count)
+    connect(parse_workers(cfg.compute.workers)[1])
     workers = RayWorkers(cfg, build)
     try:
         workers.open()
