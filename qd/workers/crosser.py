@@ -146,7 +146,9 @@ class Crosser(ExitStack):
         if not len(terrains):
             return
         count = max(len(terrains), room)
-        lot = _lot_size(replace(cfg, num_terrains=count))
+        each = min(_LOT_EPISODES["cuda" if cfg.compute.on_gpu else "cpu"] // cfg.replicas, _LOT_TERRAINS)
+        each = _MUJOCO_C_LOT if cfg.on_mujoco_c else max(1, each)
+        lot = each * replace(cfg, num_terrains=count).num_workers
         try:
             pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
             if progress is not None:
@@ -195,14 +197,6 @@ def cross(
             )
             for name, policy in controllers.items()
         }  # fmt: skip
-
-
-def _lot_size(cfg: PipelineCfg) -> int:
-    """Terrains that are crossed between two writes; two lots are under way."""
-    if cfg.on_mujoco_c:
-        return _MUJOCO_C_LOT * cfg.num_workers
-    episodes = _LOT_EPISODES["cuda" if cfg.compute.on_gpu else "cpu"]
-    return max(1, min(episodes // cfg.replicas, _LOT_TERRAINS)) * cfg.num_workers
 
 
 def _empty_result(cfg: PipelineCfg, penalty_names: tuple[str, ...]) -> RolloutResult:

@@ -25,14 +25,12 @@ def make_result(penalties, *, base_collision=None, invalid=None, late=None, name
     """A result with given penalties, shape (T, R, P); all others reach the goal unless they are late."""
     penalties = np.asarray(penalties, dtype=np.float64)
     never = np.zeros(penalties.shape[:2], dtype=bool)
-    collided = never if base_collision is None else np.asarray(base_collision, dtype=bool)
-    excluded = never if invalid is None else np.asarray(invalid, dtype=bool)
-    cases = [excluded, collided, never if late is None else np.asarray(late, dtype=bool)]
+    cases = [never if case is None else np.asarray(case, dtype=bool) for case in (invalid, base_collision, late)]
     return RolloutResult(
         penalties=penalties,
         penalty_names=tuple(names[: penalties.shape[2]]),
         outcome=np.select(cases, [BAD, HIT, LATE], GOAL).astype(np.uint8),
-        invalidity=np.where(excluded, np.uint8(2), np.uint8(0)),  # Invalidity.STATE
+        invalidity=np.where(cases[0], np.uint8(2), np.uint8(0)),  # Invalidity.STATE
         fallen=never,
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
         final_position=np.zeros((*never.shape, 3), dtype=np.float32),
@@ -102,7 +100,6 @@ def open_stand_in(cfg: PipelineCfg) -> Iterator:
 
 def compute_by(opener, compute: Compute = Compute(workers="1")) -> Compute:  # noqa: B008 - frozen
     """Where terrains are crossed by what this opens."""
-
     return StandInCompute(**vars(compute), opener=opener)
 
 

@@ -109,13 +109,6 @@ def numbers_in(path):
     return json.loads((path / "archive.json").read_text())
 
 
-def test_bars_count_the_stages(path, monkeypatch):
-    bars = []
-    monkeypatch.setattr("qd.workers.crosser.Bar", lambda text: bars.append(text) or Bar(text))
-    judged(path)
-    assert bars == ["1 of 2: contact resolved", "2 of 2: C-G", "2 of 2: C-G, contact resolved"]
-
-
 def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_path):
     path, robots = Path(shutil.copytree(made / "found", tmp_path / "run")), Robots(cross_by_genes)
     searched = read_archive(path)
@@ -131,9 +124,11 @@ def test_fresh_episodes_are_forty_of_each_elite_and_order_the_archive(made, tmp_
     assert 1 <= numbers["families"] <= len(archive) and numbers["faults"] is None
 
 
-def test_a_run_is_confirmed_and_certified_from_end_to_end(path):
-    before, robots = read_archive(path), Robots(cross_by_genes)
+def test_a_run_is_confirmed_and_certified_from_end_to_end(path, monkeypatch):
+    before, robots, bars = read_archive(path), Robots(cross_by_genes), []
+    monkeypatch.setattr("qd.workers.crosser.Bar", lambda text: bars.append(text) or Bar(text))
     archive = judged(path, robots)
+    assert bars == ["1 of 2: contact resolved", "2 of 2: C-G", "2 of 2: C-G, contact resolved"]
     failing, again = before.failing, ~crosses("searched", True, before.genes)
     once = crosses("C-G", False, before.genes)
     other = once & crosses("C-G", True, before.genes)
