@@ -45,13 +45,23 @@ class Toy:
             exec(compile("def called_from_c():\n kill()\n reached = True", "/x/llvmlite/engine.py", "exec"), compiled)
             compiled["called_from_c"]()
             time.sleep(30)
-        elif self.how:
+        elif self.how in ERRORS:
             raise ERRORS[self.how][0]
+        elif self.how == "broken":
+            read, write = os.pipe()
+            os.close(read)
+            os.write(write, b"x")
+        print("a word", flush=self.how == "now")
         return self.status
 
 
 def run(*argv):
     return run_command(Toy, argv, name="toy")
+
+
+def run_apart(*argv, **options):
+    script = "import sys; from tests.sim.files.test_command import run; sys.exit(run(*sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", script, *argv], text=True, stderr=subprocess.PIPE, **options)
 
 
 @pytest.mark.parametrize("how", [how for how in ERRORS if how != "bug"])
@@ -111,36 +121,15 @@ def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatc
         run("--how", "value")
 
 
-TALKS = """
-import os, sys
-from dataclasses import dataclass
-from sim.files.command import run_command
-
-@dataclass(frozen=True, kw_only=True)
-class Talks:
-    'Say something.'
-    how: str = 'end'
-
-    def execute(self):
-        if self.how == 'other':
-            read, write = os.pipe()
-            os.close(read)
-            os.write(write, b'x')
-        print('a word', flush=self.how == 'now')
-
-sys.exit(run_command(Talks, sys.argv[1:], name='talks'))
-"""
-
-
 @pytest.mark.parametrize("flag", ["--how=end", "--how=now", "--help"])
 def test_where_nobody_reads_its_output_any_more_a_command_ends_without_a_word(flag):
     """As in ``faultline ... | head -1``, whether it notices at once or when it ends."""
     read, write = os.pipe()
     os.close(read)
-    done = subprocess.run([sys.executable, "-c", TALKS, flag], stdout=write, stderr=subprocess.PIPE, text=True)
+    done = run_apart(flag, stdout=write)
     os.close(write)
     assert done.returncode == 1 and not done.stderr
-    another = subprocess.run([sys.executable, "-c", TALKS, "--how=other"], capture_output=True, text=True)
+    another = run_apart("--how=broken", stdout=subprocess.DEVNULL)
     assert another.returncode == 2 and another.stderr.startswith("error: ")
 
 
