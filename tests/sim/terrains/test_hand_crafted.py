@@ -23,9 +23,6 @@ def square(heights):
     return heights[:, col(4) : col(12) + 1]
 
 
-# Crossings
-
-
 def test_crossing_types_have_equal_shares_and_levels_are_uniform(crossings):
     heights, types, levels = crossings
     assert heights.shape == (300, *GRID) and heights.dtype == np.float32 and np.isfinite(heights).all()
@@ -110,9 +107,6 @@ def test_a_terrain_depends_on_the_seed_and_its_place_alone(crossings):
     rng = np.random.default_rng(5)
     first, second = (terrain.hand_crafted_crossings(12, rng)[0] for _ in range(2))
     assert not np.array_equal(first, second)
-
-
-# Training tiles
 
 
 def test_tiles_are_laid_out_by_level_and_column():

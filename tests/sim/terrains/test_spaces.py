@@ -1,18 +1,28 @@
-"""Terrain spaces: random draws, texts, what is refused, terrains without some of their parts, and code of a user."""
+"""Terrain spaces: draws, texts, refusals, terrains without some parts, code of a user; all entries of registries."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from kernels.course import GENES_PER_ELEMENT
+from qd.commands import ArchiveCommand, DoseCommand
+from qd.evaluate.dose import all_doses, parse_doses
+from qd.faults.causes import find_effects
+from sim.rollout import Rollout
 from sim.terrains.bank import make_heights, make_terrains
+from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_texts, nominal_row
+from sim.terrains.corridor import corridor_maps, num_maps
 from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.spaces import registry
 from sim.terrains.spaces.base import clipped
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import SPACES, get_space, is_user_space, load_space, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.wider import varied_space
+from sim.terrains.terrains import Terrains
 from tests.kernels import oracle
 from tests.kernels.course_oracle import course, element
 from tests.sim.scenes import NODE_X, NODE_Y
@@ -90,28 +100,30 @@ def test_a_course_in_words():
     assert len(COURSE.parts(genes)) == 6 and COURSE.parts(genes)[3] == "nothing"
 
 
-def test_every_kind_in_words():
-    def words(kind, **values):
-        return COURSE.describe(course(element(kind, **values))[0])
+OVER = "over a ditch 1.20 m wide and 0.50 m deep"
+TEXTS = {
+    "flat ground": element("flat", length=20),
+    "ramp of 1:4.0 up, 1.20 m long": element("ramp", size=0.25, length=24, turn=1),
+    "cross slope of 1:5.0 right side up, 2.00 m long": element("cross_slope", size=0.2, length=40, turn=-1),
+    "sill 0.100 m high and 0.10 m wide": element("sill", size=0.1, length=2),
+    "rail 0.050 m high": element("rail", size=0.05, length=0),
+    "rail 0.050 m high and 0.05 m wide": element("rail", size=0.05, length=1),
+    "step 0.30 m down": element("step", size=0.3, turn=-1),
+    "pallet 0.14 m high and 0.80 m long": element("pallet", size=0.144, length=16, detail=1),
+    "2 pallets, 0.29 m high and 1.20 m long": element("pallet", size=0.144, length=24, detail=2),
+    f"beam 0.40 m wide {OVER}, 0.20 m right of the way": element("bridge", size=0.5, length=24, detail=8, turn=-4),
+    "stones of 0.25 m, 0.15 m apart, in a ditch 1.00 m wide and 0.30 m deep": element(
+        "stones", size=0.3, length=20, detail=5, turn=3
+    ),
+    "rubble of blocks of 0.20 m up to 0.15 m high, 1.50 m long": element(
+        "rubble", size=0.15, length=30, detail=4, turn=0
+    ),
+}
 
-    assert words("flat", length=20) == "flat ground"
-    assert words("ramp", size=0.25, length=24, turn=1) == "ramp of 1:4.0 up, 1.20 m long"
-    assert words("cross_slope", size=0.2, length=40, turn=-1) == "cross slope of 1:5.0 right side up, 2.00 m long"
-    assert words("sill", size=0.1, length=2) == "sill 0.100 m high and 0.10 m wide"
-    assert words("rail", size=0.05, length=0) == "rail 0.050 m high"
-    assert words("rail", size=0.05, length=1) == "rail 0.050 m high and 0.05 m wide"
-    assert words("step", size=0.3, turn=-1) == "step 0.30 m down"
-    assert words("pallet", size=0.144, length=16, detail=1) == "pallet 0.14 m high and 0.80 m long"
-    assert words("pallet", size=0.144, length=24, detail=2) == "2 pallets, 0.29 m high and 1.20 m long"
-    assert words("bridge", size=0.5, length=24, detail=8, turn=-4) == (
-        "beam 0.40 m wide over a ditch 1.20 m wide and 0.50 m deep, 0.20 m right of the way"
-    )
-    assert words("stones", size=0.3, length=20, detail=5, turn=3) == (
-        "stones of 0.25 m, 0.15 m apart, in a ditch 1.00 m wide and 0.30 m deep"
-    )
-    assert words("rubble", size=0.15, length=30, detail=4, turn=0) == (
-        "rubble of blocks of 0.20 m up to 0.15 m high, 1.50 m long"
-    )
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_every_kind_has_a_text(text):
+    assert COURSE.describe(course(TEXTS[text])[0]) == text
 
 
 def test_words_are_of_what_was_cut_to_fit():
@@ -376,3 +388,69 @@ def test_a_space_is_known_by_the_hash_of_its_code(ridges, tmp_path):
 def test_what_is_no_space(name):
     with pytest.raises(ValueError, match="nowhere"):
         load_space(name)
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_a_condition_appears_wherever_conditions_do(name):
+    condition, space = CONDITIONS[name], load_space(f"super_gaussian+{name}")
+    genes, part = space.hard_random(1, 0), len(SUPER_GAUSSIAN.parts(np.zeros(64)))
+    assert space.num_genes == 64 + len(condition.genes) and space.conditions == (name,)
+    (row,) = space.condition_rows(genes)
+    (text,) = condition_texts(row, [name])
+    assert space.parts(genes[0])[part] == text == space.condition_text(genes[0]) != ""
+    without = space.without(genes, [part])
+    np.testing.assert_array_equal(space.condition_rows(without), nominal_row()[None])
+    assert space.parts(without[0])[part] == f"no {name}"
+    effects = find_effects(genes[0], [part], space)
+    assert effects.shape(0, 0.3).kind == condition.cause
+    assert num_maps(space) == len(condition.genes) == corridor_maps(torch.as_tensor(genes), space).shape[1]
+    assert f"+{name}" in ArchiveCommand.help_values()["conditions"]
+    assert (name in varied_space(SUPER_GAUSSIAN).conditions) == (condition.varied is not None)
+    if condition.dose:
+        assert name in DoseCommand.help_values()["conditions"]
+        dose = parse_doses([name], [])[name]
+        rows = get_space(dose.space).condition_rows(dose.terrains(1, np.random.default_rng(0)))
+        column = condition_column(condition.dose.parameter)
+        np.testing.assert_allclose(rows[:, column], dose.values, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ELEMENTS)
+def test_an_element_appears_wherever_elements_do(name):
+    element = ELEMENTS[name]
+    space = next(space for space in SPACES.values() if name in getattr(space, "kinds", ()))
+    assert all(dose in DoseCommand.help_values()["obstacles"] for dose in element.doses)
+    for dose in element.doses:
+        grids = all_doses()[dose].terrains(1, np.random.default_rng(0))
+        assert np.ptp(grids, axis=(1, 2)).min() > 0.0 and (grids[1:] != grids[:-1]).any(axis=(1, 2)).all()
+    kind = space.kinds.index(name)
+    genes = np.full((1, space.num_genes), 0.9, np.float32)
+    genes[:, ::6] = (2 * kind + 1) / len(space.kinds) - 1
+    records = space.elements(genes)[0]
+    assert {list(ELEMENTS)[number] for number in records["kind"][:1]} == {name}
+    assert space.parts(genes[0])[0] == element.text(records[0])
+    assert make_heights(genes, space).any() == (name != "flat")
+
+
+def test_a_toy_condition_blows_the_robot_forward(anymal):
+    space, robot = get_space("super_gaussian+wind"), dataclasses.replace(anymal, max_duration_s=0.4)
+    genes = np.zeros((2, 65), np.float32)
+    genes[1, 64] = 1.0
+    rollout = Rollout(robot, anymal.policy_file, num_terrains=2, replicas=2, device="cpu", space=space)
+    result = rollout.evaluate(Terrains(genes=genes, seeds=np.array([1, 1], np.uint32), space=space))
+    # 5 m/s^2 for 0.4 s without friction would be 0.4 m.
+    gain = result.final_position[1, :, 0] - result.final_position[0, :, 0]
+    assert (gain > 0.05).all() and (gain < 0.5).all()
+
+
+@pytest.mark.parametrize(
+    "name", [*SPACES, "super_gaussian@0.1", "course+friction+softness+grip+push", "ridges", "ridges+wind"]
+)
+def test_a_terrain_without_all_of_its_parts_is_flat_and_nominal(name, tmp_path):
+    space = load_space(name.replace("ridges", write_ridges(tmp_path)))
+    genes = space.uniform_random(20, 1) * 1.5
+    parts = space.parts(genes[0])
+    heights, ground = make_terrains(space.without(genes, range(len(parts))), space)
+    assert not heights.any() and make_heights(genes, space).any()
+    if ground is not None:
+        assert (ground.friction == 1.0).all() and not ground.time_constant_s.any()
+        np.testing.assert_array_equal(ground.rows, np.tile(nominal_row(), (20, 1)))
