@@ -42,20 +42,15 @@ def test_a_controller_is_tried_before_anything_is_simulated(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_shipped_controller_walks_alike_in_both_simulators_and_gets_over_kerbs(monkeypatch, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("policy", "goals", "text"), [(None, 8, "kerb of "), ("tests.sim.policies:stand", 0, "not walk")]
+)
+def test_both_simulators_agree_whether_a_controller_walks(tmp_path, monkeypatch, capsys, policy, goals, text):
     monkeypatch.chdir(tmp_path)
-    assert check_robot(get_robot("anymal"), compute=Compute.resolve("cpu", "1", None))
-    text = capsys.readouterr().out
-    assert text.count("8 of 8 reach the goal") == 2 and "get over a kerb of " in text
-
-
-@pytest.mark.slow
-def test_a_controller_that_stands_still_does_not_walk(monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    compute = Compute.resolve("cpu", "1", None)
-    assert not check_robot(get_robot("anymal"), "tests.sim.policies:stand", compute=compute)
-    text = capsys.readouterr().out
-    assert text.count("0 of 8 reach the goal") == 2 and "It does not walk" in text and "kerb" not in text
+    walks = check_robot(get_robot("anymal"), policy, compute=Compute.resolve("cpu", "1", None))
+    output = capsys.readouterr().out
+    assert output.count(f"{goals} of 8 reach the goal") == 2 and text in output
+    assert walks == ("kerb" in output) == (goals == 8)
 
 
 def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monkeypatch, tmp_path, capsys):
@@ -78,21 +73,16 @@ def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monk
         assert space_at(get_space(name), height, robot).name == expected
 
 
-def crossed(penalties, late, invalid=None):
-    """Episodes on one terrain; (R, P), (R,) and (R,)."""
-    return make_result([penalties], late=[late], invalid=None if invalid is None else [invalid])
-
-
 def test_scales_are_means_over_failing_episodes_or_over_all_if_under_200_fail():
     # 100 episodes fail with 1, 4 and 100 with 3, 0: means 2 and 2. That 300 reach the goal with 9, 8 changes nothing.
     rows = [[1, 4]] * 100 + [[3, 0]] * 100 + [[9, 8]] * 300
-    numbers = measure_scales(crossed(rows, [True] * 200 + [False] * 300))
+    numbers = measure_scales(make_result([rows], late=[[True] * 200 + [False] * 300]))
     assert numbers["scales"] == {"yaw_rate": 2.0, "vel_x": 2.0} and numbers["scaled_by"] == "failing"
     assert numbers["share_of_episodes_with"] == {"yaw_rate": 1.0, "vel_x": 0.5}
     # One of the 200 is invalid: 199 of 1, 4 fail, 199 reach the goal with 3, 8. Means (1 + 3) / 2 and (4 + 8) / 2.
     rows = [[1, 4]] * 199 + [[np.nan, np.nan]] + [[3, 8]] * 199
     invalid = [False] * 199 + [True] + [False] * 199
-    numbers = measure_scales(crossed(rows, [True] * 200 + [False] * 199, invalid))
+    numbers = measure_scales(make_result([rows], late=[[True] * 200 + [False] * 199], invalid=[invalid]))
     assert numbers["scales"] == {"yaw_rate": 2.0, "vel_x": 6.0} and numbers["scaled_by"] == "all"
     assert (numbers["episodes"], numbers["invalid_episodes"], numbers["failing_episodes"]) == (399, 1, 199)
 
