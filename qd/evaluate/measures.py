@@ -36,11 +36,6 @@ class Performance:
     episodes: NDArray[np.int64]
     """Valid episodes, shape (T,); 0 on an invalid terrain."""
 
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Whether a terrain's numbers mean anything, shape (T,)."""
-        return self.episodes > 0
-
 
 Families = NDArray[np.int64] | None
 """Number of each terrain's family of kin, shape (T,); None of independent terrains."""
@@ -71,17 +66,11 @@ def kind_mean(
 ) -> dict[str, Any] | None:
     """The mean of a measure for one kind of controller, or the difference of two kinds, the first minus the second.
 
-    Args:
-        values: The measure for each kind, shape (num_trainings, num_terrains).
-        families: Family of each terrain; None of independent terrains.
-        seed: Seed of the bootstrap.
-        measure: Its name in :data:`qd.evaluate.labels.MEASURES` or ``CERTIFIED``.
-
-    Returns:
-        ``mean``, its 95 % ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain
-        that is valid for all. The variance is that over families, by the bootstrap, and that over the trainings of each
-        kind; the interval is Student's with Satterthwaite's degrees of freedom (1946), and no narrower than the
-        bootstrap's. One training says nothing of others.
+    ``values`` has the measure for each kind, shape (num_trainings, num_terrains); ``seed`` is that of the bootstrap.
+    Returns ``mean``, its 95 % ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain
+    that is valid for all. The variance is that over families, by the bootstrap, and that over the trainings of each
+    kind; the interval is Student's with Satterthwaite's degrees of freedom (1946), and no narrower than the
+    bootstrap's. One training says nothing of others.
     """
     valid = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
     if not valid.any():
@@ -97,10 +86,11 @@ def kind_mean(
     spread = sum(value**2 / freedom for value, freedom in variances)
     freedom = variance**2 / spread if spread > 0.0 else np.inf
     mean = float(by_terrain.mean())
-    half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
-    intervals = [[mean - half, mean + half]] if variances else []
-    intervals += [] if bootstrap is None else [bootstrap]
-    interval = [min(low for low, _ in intervals), max(high for _, high in intervals)] if intervals else None
+    interval = bootstrap
+    if variances:
+        half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+        low, high = bootstrap or (mean, mean)
+        interval = [min(mean - half, low), max(mean + half, high)]
     if interval and bounds:
         interval = np.clip(interval, *bounds).tolist()
     return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in kinds]}

@@ -145,27 +145,28 @@ def _count_certified(
 ) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
-        if terrains.certified is None or terrains.elites is None:
-            continue
         elites = terrains.elites
+        if elites is None or not elites.certifiers:
+            continue
         certificates = elites.certificates & elites.failing[:, None]
         certifiers = dict(zip(elites.certifiers, certificates.sum(axis=0).tolist(), strict=True))
+        hashes = dict(zip(elites.certifiers, elites.certifier_sha256, strict=True))
         roles: dict[str | None, str] = {elites.policy_sha256: "searched"}
-        for sha256, certifier in zip(elites.certifier_sha256, elites.certifiers, strict=True):
-            if certifiers[certifier]:
-                roles[sha256] = "certifier"
-        hashes = {controller: about["sha256"] for controller, about in controllers.items()}
+        roles |= {hashes[certifier]: "certifier" for certifier, count in certifiers.items() if count}
+        roles.pop(None, None)
         certified[name] = {
-            "terrains": int(terrains.certified.sum()),
+            "terrains": int(elites.certified.sum()),
             "certifiers": certifiers,
-            "chosen_by": {controller: roles[sha] for controller, sha in hashes.items() if sha and sha in roles},
+            "chosen_by": {
+                name: roles[about["sha256"]] for name, about in controllers.items() if about["sha256"] in roles
+            },
         }
     return certified
 
 
 def difference(before: Performance, after: Performance, terrains: TerrainSet, seed: int) -> dict[str, Any]:
     """What became of each terrain of a set from one controller to another, and the mean gain of the second."""
-    valid = before.valid & after.valid
+    valid = (before.episodes > 0) & (after.episodes > 0)
     failed, fails = (valid & (controller.values["goal"] < FAILING_GOAL_RATE) for controller in (before, after))
     limits = _wilson_limits(before)
     then_limits = _wilson_limits(after)
@@ -214,22 +215,17 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
     for name, policy in controllers.items():
         if not re.fullmatch("[^@]+(@[^@]+)?", name):
             raise ValueError(f"a controller must be named KIND or KIND@SEED, as C-G@1, got '{name}'")
-        key = (_get_kind(name), controller_hash(policy) or policy)
+        key = (name.partition("@")[0], controller_hash(policy) or policy)
         if key in names:
             raise ValueError(f"{names[key]} and {name} must be different trainings, got the same controller twice")
         names[key] = name
 
 
-def _get_kind(name: str) -> str:
-    """The kind of a controller by its name: ``C-G`` for C-G, C-G@1 and C-G@2, which differ in their seeds."""
-    return name.partition("@")[0]
-
-
 def by_kind(row: Mapping[str, Value]) -> dict[str, list[Value]]:
-    """Groups values of controllers, by name, by the controllers' kinds."""
+    """Groups values of controllers, by name, by their kinds: C-G, C-G@1 and C-G@2 differ in their seeds alone."""
     kinds: dict[str, list[Value]] = {}
     for name, value in row.items():
-        kinds.setdefault(_get_kind(name), []).append(value)
+        kinds.setdefault(name.partition("@")[0], []).append(value)
     return kinds
 
 

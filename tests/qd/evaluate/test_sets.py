@@ -24,7 +24,7 @@ from qd.search.settings import as_settings
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import fresh_values, make_archive, write_run
+from tests.builders import judged_archive, make_archive, write_run
 from tests.qd.searches import CFG
 from tests.train.conftest import write_actor, write_trained
 
@@ -112,17 +112,11 @@ def test_generated_terrains_are_those_held_out_with_the_families_of_their_kin():
 
 
 def test_elites_carry_the_certificates_of_their_rows():
-    # The controller fails all of 30 elites, a certifier crosses the first 20.
-    ends = np.repeat([[[20, 0, 0, 0]], [[0, 20, 0, 0]]], [20, 10], axis=0)
-    counts = {"certifier_outcomes": ends, "certifier_resolved_outcomes": ends}
-    archive = replace(
-        make_archive(30), fresh=fresh_values(make_archive(30)), certifiers=("C-G",), certifier_sha256=("a" * 64,),
-        policy_sha256="f" * 64, **counts,
-    )  # fmt: skip
+    archive = judged_archive().rows(np.array([2, 2, 3, 3] * 6))
     generated = generated_set(archive, 300, 0)
-    certified = split_elites(archive).test < 20
-    np.testing.assert_array_equal(generated.certified, certified)
-    np.testing.assert_array_equal(generated.rows(np.array([1, 5])).certified, certified[[1, 5]])
+    certified = archive.certified[generated.numbers]
+    assert generated.certified.tolist() == certified.tolist() and len(set(certified)) == 2
+    np.testing.assert_array_equal(generated.rows(np.array([1, 3])).certified, certified[[1, 3]])
     assert generated_set(make_archive(30), 300, 0).certified is None
 
 

@@ -199,7 +199,6 @@ def test_everything_is_a_mean_over_valid_episodes():
         assert measured.values[name] == pytest.approx([expected, np.nan], nan_ok=True), name
     assert measured.penalties["vel_x"] == pytest.approx([1.5, np.nan], nan_ok=True)  # (1 + 2 + 6) / 3 by the scale of 2
     assert measured.episodes.tolist() == [3, 0] and measured.goals.tolist() == [2, 0]
-    assert measured.valid.tolist() == [True, False]
     summary = summarise_crossings(result, 0)
     assert summary["success_rate"] == pytest.approx(2 / 3)
     assert (summary["terrains"], summary["invalid_terrains"], summary["outcomes"]["invalid"]) == (2, 1, 3)
