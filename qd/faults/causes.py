@@ -177,34 +177,25 @@ def _find_cause(genes: NDArray[np.float32], end: NDArray[np.floating], space: Te
     alone = [raised.without(row, [other for other in parts if other != part]) for part in parts] or [row]
     every = _COARSE if space.any_spacing else 1
     maps = make_heights(np.concatenate(alone), raised, every=every)
-    differences = [np.ptp(heights[_around(end, every * SPACING, heights.shape)]) for heights in maps]
+    x, y = end.tolist()
+    limits = np.array([[y - _BESIDE, y + _BESIDE], [x - _BEHIND, x + _AHEAD]]) / (every * SPACING)
+    nodes = np.clip(np.rint(limits), 0, np.array(maps.shape[1:])[:, None] - 1).astype(int)
+    rows, columns = (slice(first, last + 1) for first, last in nodes.tolist())  # near the end, or nearest to it
+    differences = np.ptp(maps[:, rows, columns], axis=(1, 2))
     part = int(np.argmax(differences))
     if differences[part] < _LEAST_HEIGHT:
-        return _find_ground(genes, end, space) if space.ground else UNCLEAR
+        _, ground = make_terrains(genes[None], space) if space.ground else (None, None)
+        if ground is None:
+            return UNCLEAR
+        patch_row = patch_index(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
+        patch_column = patch_index(x, SPACING * (NUM_COLS - 1), PATCHES[1])
+        if ground.friction[0, patch_row, patch_column] < 1.0:
+            return SLIPPERY
+        return SOFT if ground.time_constant_s[0, patch_row, patch_column] != FIRM else UNCLEAR
     heights = maps[part] if every == 1 else make_heights(alone[part], raised)[0]
     at_end = np.roll(heights, round((CrossingCfg.start[1] - float(end[1])) / SPACING), axis=0)
     kinds = (measure_shape(field, half_width).kind for field in (heights, at_end))  # robots may leave the straight way
     return next((kind for kind in kinds if kind != OFF_THE_WAY), UNCLEAR)
-
-
-def _around(end: NDArray[np.floating], spacing: float, shape: tuple[int, ...]) -> tuple[slice, ...]:
-    """Rows and columns of the nodes near a place, or nearest to it at the edge."""
-    x, y = end.tolist()
-    limits = np.array([[y - _BESIDE, y + _BESIDE], [x - _BEHIND, x + _AHEAD]])
-    nodes = np.clip(np.rint(limits / spacing), 0, np.array(shape)[:, None] - 1).astype(int)
-    return tuple(slice(first, last + 1) for first, last in nodes.tolist())
-
-
-def _find_ground(genes: NDArray[np.float32], end: NDArray[np.floating], space: TerrainSpace) -> str:
-    """What the ground at a place is like if it is unlike other ground."""
-    _, ground = make_terrains(genes[None], space)
-    assert ground is not None
-    x, y = end.tolist()
-    row = patch_index(y, SPACING * (NUM_ROWS - 1), PATCHES[0])
-    column = patch_index(x, SPACING * (NUM_COLS - 1), PATCHES[1])
-    if ground.friction[0, row, column] < 1.0:
-        return SLIPPERY
-    return SOFT if ground.time_constant_s[0, row, column] != FIRM else UNCLEAR
 
 
 def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
@@ -218,15 +209,23 @@ def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
     met = np.argwhere(steepness >= _FIRST_MET * steepness.max())
     met = met[met[:, 0] == met[0, 0]]
     steepest = (int(met[0, 0]), int(met[np.argmax(steepness[*met.T]), 1]))
-    left, right = _reach(heights, column, row, half_width)
+    # How far it has half of its height to either side of the way, near where it is highest.
+    middle = _CENTRE - round(half_width / SPACING) + int(row)
+    first = round(CrossingCfg.start[0] / SPACING) + int(column)
+    near = round(_NEAR / SPACING)
+    window = heights[:, max(first - near, 0) : first + near + 1]
+    low = (window * np.sign(height) < abs(height) / 2).all(axis=1)
+    low = np.pad(low, 1, constant_values=True)  # the grid's edge ends it
+    left = middle + int(low[middle + 1 :].argmax())
+    right = middle - int(low[middle + 1 :: -1].argmax())
     slopes = {"slope_deg": steepness, "along_deg": along, "across_deg": across}
     numbers = {
         "height_m": height,
         **{name: float(np.rad2deg(np.arctan(float(values[steepest])))) for name, values in slopes.items()},
         "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[steepest]), abs(along[steepest])))),
         "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
-        "left_m": left,
-        "right_m": right,
+        "left_m": SPACING * (left - _CENTRE),
+        "right_m": SPACING * (_CENTRE - right),
     }
     return Shape(kind=_classify(numbers), **{name: round(value, 3) for name, value in numbers.items()})
 
@@ -255,17 +254,3 @@ def _under(values: NDArray[Any], half_width: float) -> NDArray[Any]:
     first, last = (round(x / SPACING) for x, _ in (CrossingCfg.start, CrossingCfg.goal))
     reach = round(half_width / SPACING)
     return values[_CENTRE - reach : _CENTRE + reach + 1, first : last + 1].T
-
-
-def _reach(field: NDArray[np.float64], column: np.intp, row: np.intp, half_width: float) -> tuple[float, float]:
-    """How far a part has half of its height to the left and to the right of the way, near where it is highest [m]."""
-    middle = _CENTRE - round(half_width / SPACING) + int(row)
-    first = round(CrossingCfg.start[0] / SPACING) + int(column)
-    near = round(_NEAR / SPACING)
-    highest = field[middle, first]
-    window = field[:, max(first - near, 0) : first + near + 1]
-    low = (window * np.sign(highest) < abs(highest) / 2).all(axis=1)
-    low = np.pad(low, 1, constant_values=True)  # the grid's edge ends it
-    left = middle + int(low[middle + 1 :].argmax())
-    right = middle - int(low[middle + 1 :: -1].argmax())
-    return SPACING * (left - _CENTRE), SPACING * (_CENTRE - right)

@@ -142,13 +142,10 @@ class Ranking(Evaluation):
         severity = self.by_severity()
         if by == "fault":
             return severity
-        if by == "cause":
-            return self._leading_first(severity)
-        values = self.families if by == "family" else np.asarray(getattr(self, by))
-        sign = 1 if by in ("family", "goal_rate") else -1
-        return severity[np.argsort(sign * values[severity], kind="stable")]
-
-    def _leading_first(self, severity: NDArray[np.int64]) -> NDArray[np.int64]:
+        if by != "cause":
+            values = self.families if by == "family" else np.asarray(getattr(self, by))
+            sign = 1 if by in ("family", "goal_rate") else -1
+            return severity[np.argsort(sign * values[severity], kind="stable")]
         families = self.families.tolist()
         leading: dict[int, int] = {}  # families by row
         for rows in self.by_cause().values():

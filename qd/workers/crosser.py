@@ -105,7 +105,13 @@ class Crosser(ExitStack):
             with_conditions=terrains.has_conditions,
         )  # fmt: skip
         if not len(terrains):
-            return _empty_result(cfg, self.robot.penalties)
+            shape = (0, replicas)
+            return RolloutResult(
+                penalties=np.zeros((*shape, len(self.robot.penalties))), penalty_names=self.robot.penalties,
+                outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
+                duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
+                reward=np.zeros(shape) if reward else None,
+            )  # fmt: skip
         stored = None if record else self._stored_crossings(cfg, terrains)
         results = list(stored.read(terrains)) if stored else []
         done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in results)])
@@ -197,13 +203,3 @@ def cross(
             )
             for name, policy in controllers.items()
         }  # fmt: skip
-
-
-def _empty_result(cfg: PipelineCfg, penalty_names: tuple[str, ...]) -> RolloutResult:
-    shape = (0, cfg.replicas)
-    return RolloutResult(
-        penalties=np.zeros((*shape, len(penalty_names))), penalty_names=penalty_names,
-        outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
-        duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
-        reward=np.zeros(shape) if cfg.reward else None,
-    )  # fmt: skip
