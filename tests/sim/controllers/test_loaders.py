@@ -122,9 +122,7 @@ def test_a_checkpoint_of_any_rsl_rl_acts_as_its_training_says(tmp_path, anymal, 
         load_policy(path, anymal, "cpu")
 
 
-@pytest.mark.parametrize(
-    "key", ["student.0.weight", "estimator.0.bias", "actor.1.running_mean", "obs_normalizer.running_mean"]
-)
+@pytest.mark.parametrize("key", ["student.0.weight", "actor.1.running_mean", "obs_normalizer.running_mean"])
 def test_what_is_no_part_of_a_known_network_is_refused_by_name(tmp_path, anymal, key):
     content = old_checkpoints()["2"]
     table = "obs_norm_state_dict" if "normalizer" in key else "model_state_dict"
@@ -226,15 +224,14 @@ def test_a_robots_action_is_the_same_bit_for_bit_beside_any_others(anymal):
     rows = np.random.default_rng(4).normal(size=(100, OBSERVATIONS)).astype(np.float32)
     policy, actions = load_policy(anymal.policy_file, anymal, "cpu"), {}
     prepare_torch("cpu")
-    for count in (*range(1, 40), 100):
+    for count in (100, *range(1, 40)):
         runner, _, action, _ = runner_on(policy, rows[:count])
         runner()
         actions[count] = action.numpy()
+        np.testing.assert_array_equal(actions[count], actions[100][:count], err_msg=f"{count} robots")
         with torch.inference_mode():  # as one that calls it in Python does
             np.testing.assert_array_equal(policy(torch.from_numpy(rows[:count])), actions[count])
     assert len(np.unique(actions[100])) == 100 * ACTIONS
-    for count, action in actions.items():
-        np.testing.assert_array_equal(action, actions[100][:count], err_msg=f"{count} robots")
 
 
 def test_a_controller_may_keep_and_change_its_row():
@@ -242,8 +239,7 @@ def test_a_controller_may_keep_and_change_its_row():
 
     def policy(row):
         rows.append(row)
-        row += 1.0
-        return row[:, :ACTIONS]
+        return row.add_(1.0)[:, :ACTIONS]
 
     runner, observation, action, _ = runner_on(policy, np.full((5, OBSERVATIONS), 0.5))
     runner()
