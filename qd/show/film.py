@@ -3,7 +3,7 @@
 import io
 import itertools
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -136,17 +136,26 @@ def render_pictures(
 ) -> Iterator[Picture]:
     """The pictures of a film, each at a time of the episode [s], of a size [pixels].
 
-    Small ones are rendered twice as fine. ``progress`` is called with the share that is done.
+    Small ones are rendered twice as fine. A map has all paths, the shown one in the colour of how it ended.
+    ``progress`` is called with the share that is done.
     """
     recording = shot.recording
     ghost_name, ghost = shot.beside or ("", None)
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
     poses = recording.qpos(0, shot.episode)
     ghost_poses = None if ghost is None else ghost.qpos(0, shot.episode)
-    chart = draw_map(shot, size[0] // 5)
+    colors = np.rint(255.0 * height_colors(recording.heights[0])[::-1]).astype(np.uint8)
+    side = size[0] // 5
+    chart = Image.fromarray(colors).resize((side, side * colors.shape[0] // colors.shape[1]))
+    draw = ImageDraw.Draw(chart)
+    for k in sorted(range(recording.num_episodes), key=lambda k: k == shot.episode):  # the shown one on top
+        path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
+        shown = k == shot.episode
+        draw.line(_locate(chart, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
+    draw.circle(_locate(chart, np.array([CrossingCfg.goal]))[0], side / 60, "#009e73", "white")
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
-    width, height = (side * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for side in size)
+    width, height = (pixels * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for pixels in size)
     look: Any = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
     with Renderer(robot, recording.heights[0], **look) as renderer:
         for number, (time_s, camera) in enumerate(zip(times.tolist(), cameras, strict=True)):
@@ -189,20 +198,6 @@ def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: i
         write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(outcome).color)
 
 
-def draw_map(shot: Shot, width: int) -> Image.Image:
-    """The terrain from above with all paths, that of the film in the colour of how it ended; ``width`` [pixels]."""
-    recording = shot.recording
-    colors = np.rint(255.0 * height_colors(recording.heights[0])[::-1]).astype(np.uint8)
-    image = Image.fromarray(colors).resize((width, width * colors.shape[0] // colors.shape[1]))
-    draw = ImageDraw.Draw(image)
-    for k in sorted(range(recording.num_episodes), key=lambda k: k == shot.episode):
-        path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
-        shown = k == shot.episode
-        draw.line(_locate(image, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
-    draw.circle(_locate(image, np.array([CrossingCfg.goal]))[0], width / 60, "#009e73", "white")
-    return image
-
-
 def _locate(image: Image.Image, positions: NDArray[np.floating]) -> list[tuple[float, float]]:
     """Pixels of positions [m], shape (count, 2), on a map."""
     pixels = image.width / LENGTH * positions.astype(np.float64)
@@ -235,19 +230,17 @@ def film(
     size = GIF_SIZE if gif else SIZE
     times = shot.times(GIF_FPS if gif else FPS, whole=whole)
     pictures = render_pictures(shot, robot, times, size, shadows=shadows, progress=progress)
-    save(out, as_gif([*pictures]) if gif else as_mp4(pictures, size, FPS), "Film")
-
-
-def as_mp4(pictures: Iterable[Picture], size: tuple[int, int], fps: int) -> bytes:
-    """Pictures whose sides, width and height [pixels], are even as an MP4 (H.264) that plays everywhere."""
-    options: Any = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    if gif:
+        save(out, as_gif([*pictures]), "Film")
+        return
+    options: Any = {"quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}  # H.264 that plays everywhere
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "film.mp4"
-        with closing(imageio_ffmpeg.write_frames(str(draft), size, fps=fps, **options)) as writer:
+        with closing(imageio_ffmpeg.write_frames(str(draft), size, fps=FPS, **options)) as writer:
             writer.send(None)
             for picture in pictures:
                 writer.send(np.ascontiguousarray(picture))
-        return draft.read_bytes()
+        save(out, draft.read_bytes(), "Film")
 
 
 def as_gif(pictures: Sequence[Picture], max_bytes: int = MAX_GIF_BYTES) -> bytes:

@@ -6,14 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from kernels.episode import Outcome
 from qd.search.progress import clock
 from qd.show.crossed import find_failure_time, find_ghost_episode, find_typical_episode
 from qd.show.figures import relief
@@ -23,7 +22,7 @@ from sim.files.atomic import prepare_output
 from sim.files.figures import as_image
 from sim.files.templates import open_templates
 from sim.recording.recorder import Recording
-from sim.recording.renderer import Camera, Renderer, open_context
+from sim.recording.renderer import Camera, Renderer
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.spaces.base import TerrainSpace
@@ -110,50 +109,28 @@ def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any
     return {"source": encode_picture(image, _SHEET_QUALITY), "offsets": offsets}
 
 
-class Moment(NamedTuple):
-    """One frame of a recorded episode."""
-
-    recording: Recording
-    """Of one terrain."""
-    episode: int
-    frame: int
-
-    @property
-    def time_s(self) -> float:
-        """Since the episode began [s]."""
-        return self.frame * self.recording.dt
+Moment = tuple[Recording, int, float]
+"""Recording of one terrain, episode, and time since the episode began [s]."""
 
 
-def find_failure(recording: Recording, scales: dict[str, float]) -> Moment | None:
-    """The moment at which the typical episode goes wrong, or its end; None if all episodes are invalid."""
-    if (recording.outcome[0] == Outcome.INVALID).all():
-        return None
+def choose_moments(recording: Recording, ghost: Recording | None, scales: dict[str, float]) -> list[Moment]:
+    """When the typical episode goes wrong, or ends, and that time of another controller's episode beside it."""
     episode = find_typical_episode(recording, scales)
-    return Moment(recording, episode, round(find_failure_time(recording, episode) / recording.dt))
-
-
-def find_same_moment(moment: Moment, ghost: Recording, scales: dict[str, float]) -> Moment:
-    """Another controller on the same terrain at that time, from the same start if it reaches the goal from it."""
-    episode = find_ghost_episode(ghost, moment.episode, scales)
-    return Moment(ghost, episode, min(moment.frame, int(ghost.num_frames[0, episode]) - 1))
-
-
-def explain_missing_pictures() -> str:
-    """Why this machine cannot take close pictures, in a sentence; empty if it can."""
-    try:
-        open_context(8, 8).free()
-    except ValueError as error:
-        return f"Close pictures are left out: {error}."
-    return ""
+    moments = [(recording, episode, find_failure_time(recording, episode))]
+    if ghost is not None:
+        beside = find_ghost_episode(ghost, episode, scales)
+        moments.append((ghost, beside, min(moments[0][2], ghost.dt * (int(ghost.num_frames[0, beside]) - 1))))
+    return moments
 
 
 def render_close_pictures(robot: RobotCfg, moments: Sequence[Moment]) -> list[str]:
     """Pictures of moments on one terrain, each from 3 m away; they need OpenGL."""
     sources = []
-    heights = moments[0].recording.heights[0]
-    ground = moments[0].recording.ground
-    with Renderer(robot, heights, width=_SIZE[0], height=_SIZE[1], ground=ground) as renderer:
-        for recording, episode, frame in moments:
+    first = moments[0][0]
+    heights = first.heights[0]
+    with Renderer(robot, heights, width=_SIZE[0], height=_SIZE[1], ground=first.ground) as renderer:
+        for recording, episode, time_s in moments:
+            frame = round(time_s / recording.dt)
             pose = recording.qpos(0, episode)[frame]
             elevation = clear_elevation(heights, pose[None, :3], _DISTANCE)
             camera = Camera(target=tuple(pose[:3].tolist()), distance=_DISTANCE, elevation=elevation)

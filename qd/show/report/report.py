@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import Outcome
 from qd.evaluate.tables import read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
 from qd.faults.numbers import MinimalTerrains, fault_numbers, further_rates
-from qd.search.archive import Archive
-from qd.search.directory import METRICS_FILE, ROUNDS_FILE, Metrics, RunDirectory, output_folder
+from qd.search.directory import METRICS_FILE, ROUNDS_FILE, RunDirectory, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
 from qd.show.elites import OpenedRun, open_run
@@ -25,6 +25,7 @@ from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
+from sim.recording.renderer import open_context
 
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 _MAX_BARS = 10
@@ -68,14 +69,24 @@ def write_report(
     content = collect_content(opened_run, ranking, controller, is_searched=not suffix)
     heads, others = _choose_elites(ranking, num_elites)
     cases: dict[int, dict[str, Any]] = {}
-    missing = [_explain_no_crossings(opened_run, policy, device)]
-    if not missing[0]:
-        missing = [page.explain_missing_pictures()]
+    missing = []
+    try:
+        check_policy(opened_run.policy(policy), opened_run.robot, choose_device(device))
+    except ValueError as error:
+        if policy is not None:  # one that the user names must be able to cross
+            raise
+        reason = f"since the search's controller cannot be loaded: {error}"
+        missing.append(f"No terrain is crossed, {reason}. Name it with --policy.")
+    else:
+        try:
+            open_context(8, 8).free()
+        except ValueError as error:
+            missing.append(f"Close pictures are left out: {error}.")
         recordings = Recordings(opened_run.robot, device=choose_device(device))
-        cases = cross_cases(opened_run, ranking, controller, heads, others, recordings, pictured=not missing[0])
+        cases = cross_cases(opened_run, ranking, controller, heads, others, recordings, pictured=not missing)
         lost = [number for number in (*heads, *others) if number not in cases]
         missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
-    content |= {"policy": policy, "compared": compared, "missing": [*filter(None, missing)]}
+    content |= {"policy": policy, "compared": compared, "missing": missing}
     content |= {
         name: [cases[number] for number in numbers if number in cases]
         for name, numbers in {"heads": heads, "others": others}.items()
@@ -92,17 +103,6 @@ def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[i
     others = [members[0] for cause, members in ranking.by_cause().items() if cause not in causes][:_OTHER_CAUSES]
     numbers = ranking.numbers
     return numbers[rows].tolist(), [int(numbers[row]) for row in others]
-
-
-def _explain_no_crossings(opened_run: OpenedRun, policy: str | None, device: str | None) -> str:
-    """Why the search's controller cannot cross terrains, empty if it can; a controller of the user must be able to."""
-    try:
-        check_policy(opened_run.policy(policy), opened_run.robot, choose_device(device))
-    except ValueError as error:
-        if policy is not None:
-            raise
-        return f"No terrain is crossed, since the search's controller cannot be loaded: {error}. Name it with --policy."
-    return ""
 
 
 def cross_cases(
@@ -151,15 +151,14 @@ def _make_case(
     pictured: bool,
 ) -> dict[str, Any] | None:
     """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
-    failure = page.find_failure(recording, opened_run.scales)
-    if failure is None:
+    if (recording.outcome[0] == Outcome.INVALID).all():
         return None
-    moments = [failure] if ghost is None else [failure, page.find_same_moment(failure, ghost[1], opened_run.scales)]
+    moments = page.choose_moments(recording, ghost and ghost[1], opened_run.scales)
     sources = page.render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if ghost is not None:
         rate = count_rates(ghost[1])[ARRIVED]
-        beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1].time_s, "rate": rate}
+        beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1][2], "rate": rate}
     row = ranking.find_row(number)
     rate = count_rates(recording)[ARRIVED]
     tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
@@ -171,7 +170,7 @@ def _make_case(
         "name": ranking.name(row),
         "verdict": VERDICTS[int(ranking.verdict[row])],
         "source": sources[0],
-        "time_s": failure.time_s,
+        "time_s": moments[0][2],
         "conditions": opened_run.space.condition_text(opened_run.archive.genes[number]),
         "beside": beside,
         "figure": "",
@@ -188,7 +187,13 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
     run = RunDirectory(opened_run.folder)
     space = opened_run.space
     searched, _ = opened_run.as_searched()
-    metrics = _read_metrics(run, archive)
+    file = run.path / METRICS_FILE  # a run that goes on meanwhile may have some rows more
+    metrics = run.read_metrics()[: archive.iterations] if file.exists() else []
+    if file.exists() and len(metrics) < archive.iterations:
+        raise ValueError(
+            f"{file} must have a row for each of {archive.iterations} iterations, got {len(metrics)}: resume the "
+            "search, which writes it again"
+        )
     controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
     if search is None and opened_run.suffix(resolve_policy(SHIPPED, opened_run.robot)):
         controller = "a controller that is not at hand"
@@ -216,19 +221,6 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         "parallel": page.encode_picture(draw_archive(archive)),
         "origin": page.origin_rows({} if search is None else run.read_config()),
     }
-
-
-def _read_metrics(run: RunDirectory, archive: Archive) -> Metrics:
-    """The rows up to the archive's iteration, if there are some; a run that goes on meanwhile may have some more."""
-    if not (run.path / METRICS_FILE).exists():
-        return []
-    rows = run.read_metrics()[: archive.iterations]
-    if len(rows) < archive.iterations:
-        raise ValueError(
-            f"{run.path / METRICS_FILE} must have a row for each of {archive.iterations} iterations, got {len(rows)}: "
-            "resume the search, which writes it again"
-        )
-    return rows
 
 
 def format_mean(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:

@@ -15,7 +15,7 @@ from qd.faults.families import VERDICTS, rank, summarise_search
 from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.report.evaluation import compare_controllers
-from qd.show.report.page import TILE, draw_sheet, find_failure, find_same_moment, percent
+from qd.show.report.page import TILE, choose_moments, draw_sheet, percent
 from qd.show.report.report import count_causes, write_report
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
@@ -117,13 +117,12 @@ def test_the_controller_that_crosses_a_terrain_is_shown_beside(reported, run):
 
 def test_the_other_controller_is_shown_at_the_same_moment_from_the_same_start():
     ends = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT]
-    failure = find_failure(recording_of(ends, [7.0, 14.0, 7.0]), {})
+    recording, arrives = recording_of(ends, [7.0, 14.0, 7.0]), recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11)
+    failure, beside = choose_moments(recording, arrives, {})
     # from x = 2 m to 7 m in 20 frames of 0.02 s, 0.25 m each: within 0.3 m of the end from the 19th on
-    assert failure is not None and (failure.episode, failure.frame, failure.time_s) == (0, 19, 0.38)
-    beside = find_same_moment(failure, recording_of([Outcome.GOAL] * 3, [14.0] * 3, frames=11), {})
-    assert (beside.episode, beside.frame) == (0, 10)  # it has arrived by then
-    assert find_same_moment(failure, recording_of([ends[0], ends[1], ends[1]], [8.0, 14.0, 14.0]), {}).episode == 1
-    assert find_failure(recording_of([Outcome.INVALID] * 2, [8.0] * 2), {}) is None
+    assert failure == (recording, 0, 0.38) and beside == (arrives, 0, 0.2)  # it has arrived by then
+    other = recording_of([ends[0], ends[1], ends[1]], [8.0, 14.0, 14.0])
+    assert choose_moments(recording, other, {})[1][1] == 1 and len(choose_moments(recording, None, {})) == 1
 
 
 def test_small_pictures_stand_in_one_image():
