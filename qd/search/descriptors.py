@@ -87,26 +87,22 @@ class Cells:
         if not good.all():
             row = int(np.argmin(good))
             raise ValueError(f"ratios must not be negative and must sum to 1, got {ratios[row].tolist()} in row {row}")
-        cells = np.searchsorted(self.codes, self._code(self._find_tuples(ratios)))
+        # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
+        edges = np.arange(self.intervals + 1) / self.intervals
+        tuples = np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
+        # Where the plane only touches a corner of the box, its tuple moves to a reachable neighbour.
+        total = tuples.sum(axis=1)
+        rows = np.flatnonzero(total >= self.intervals)  # every ratio on its lower edge: .2, .2, .2, .2, .2
+        tuples[rows, ratios[rows].argmax(axis=1)] -= 1
+        rows = np.flatnonzero(total + self.num_ratios <= self.intervals)  # every ratio just below its upper edge
+        gap = (tuples[rows] + 1) / self.intervals - ratios[rows]
+        tuples[rows, gap.argmin(axis=1)] += 1
+        cells = np.searchsorted(self.codes, self._code(tuples))
         if not self.collision_bit:
             return cells
         if collided is None:
             raise ValueError("collided must be given, got None: the cells of this robot have a collision bit")
         return cells + len(self.tuples) * np.asarray(collided, dtype=bool)
-
-    def _find_tuples(self, ratios: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The interval of each ratio; moved to a reachable neighbour where the plane only touches a corner of a box."""
-        # By the edges themselves: floor(ratio * intervals) puts some, 1/49 of 49 for one, a whole interval too low.
-        edges = np.arange(self.intervals + 1) / self.intervals
-        tuples = np.clip(np.searchsorted(edges, ratios, side="right") - 1, 0, self.intervals - 1)
-        total = tuples.sum(axis=1)
-        rows = np.flatnonzero(total >= self.intervals)  # every ratio on its lower edge: .2, .2, .2, .2, .2
-        tuples[rows, ratios[rows].argmax(axis=1)] -= 1
-        # Every ratio rounded to just below its upper edge.
-        rows = np.flatnonzero(total + self.num_ratios <= self.intervals)
-        gap = (tuples[rows] + 1) / self.intervals - ratios[rows]
-        tuples[rows, gap.argmin(axis=1)] += 1
-        return tuples
 
     def are_neighbours(self, first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
         """Whether cells agree in their collision bits, and in their intervals up to 1, by their indices (batch,)."""

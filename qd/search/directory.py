@@ -14,8 +14,9 @@ from typing import Any, Literal
 
 from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.search.checkpoint import REMEDY, load_checkpoint, save_checkpoint
-from qd.search.settings import SearchCfg, as_settings, differences, from_settings
+from qd.search.settings import SearchCfg, as_settings, differences
 from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
+from sim.files.settings import from_builtins
 from sim.robots.robot import RobotCfg, check_robot_identity
 from sim.terrains.spaces.registry import get_space, load_space
 
@@ -179,7 +180,7 @@ class RunDirectory:
         """The search as its config has it."""
         config = self.read_config()
         try:
-            return from_settings(config["settings"], config["iterations"])
+            return from_builtins(SearchCfg, config["settings"] | {"iterations": config["iterations"]}, "a search")
         except ValueError as error:
             text = f"{self.path / CONFIG_FILE} is damaged or of another version: {error}; {REMEDY}"
             raise ValueError(text) from None

@@ -87,7 +87,8 @@ def search(
         archive = read_finished(run, cfg, until)
         scheduler: Any
         scheduler, metrics = run.load(cfg) if archive is None else (None, run.read_metrics())
-        done, last = len(metrics), find_last_iteration(cfg, metrics, until)
+        done = len(metrics)
+        last = find_last_iteration(cfg, metrics, until)
         say(_describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
         if note := scaled_by_another(robot, policy):
             print(note)
@@ -102,7 +103,12 @@ def search(
                     with Bar(f"iteration {done + 1}/{last}: compiling and evaluating", last, done) as bar:
                         _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
             except KeyboardInterrupt:
-                again = _command_to_resume(path, robot, policy, space.name, until)
+                code = {  # which must be named again
+                    "robot": robot.spec if robot.settings_file else None,
+                    "policy": policy if ControllerSpec.parse(policy).runs_code else None,
+                    "space": space.name if is_user_space(space.name) else None,
+                }
+                again = command_line("archive", resume=path, until=until, **code)
                 raise Interrupted(f"Stopped; finished iterations are saved: go on with `{again}`") from None
         if len(metrics) < cfg.iterations:
             say(f"Ended by --until {until:g} after {len(metrics)} of {cfg.iterations} iterations.")
@@ -121,16 +127,6 @@ def _describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers
         f"{left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
         f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
     )
-
-
-def _command_to_resume(path: Path, robot: RobotCfg, policy: str, space: str, until: float | None) -> str:
-    """The command that goes on with a search; code that it needs is named."""
-    code = {
-        "robot": robot.spec if robot.settings_file else None,
-        "policy": policy if ControllerSpec.parse(policy).runs_code else None,
-        "space": space if is_user_space(space) else None,
-    }
-    return command_line("archive", resume=path, until=until, **code)
 
 
 def _run_iterations(
@@ -174,21 +170,15 @@ def _run_iterations(
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
         row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
-        status = pipeline.status()
-        metrics.append(row if status is None else row | status._asdict())
-        metrics[-1]["last_tenth"] = compute_last_tenth(archive, metrics)
+        if status := pipeline.status():
+            row |= status._asdict()
+        metrics.append(row)
+        row["last_tenth"] = compute_last_tenth(archive, metrics)
         run.save(cfg, scheduler, metrics, archive)
         last = find_last_iteration(cfg, metrics, until)
-        bar.move_to(iteration, _describe_iteration(metrics[-1], last, status))
-
-
-def _describe_iteration(row: dict[str, Any], iterations: int, workers: object = None) -> str:
-    """Where a search stands after an iteration, and how its workers fare if there are any."""
-    invalid = row["invalid_episodes"] / row["episodes"]
-    why = f"{invalid:.0%} invalid ({format_reasons(row['invalid_reasons'])}), " if invalid > WARNED_SHARE else ""
-    by = f" by {workers}" if workers else ""
-    return (
-        f"iteration {min(row['iteration'] + 1, iterations)}/{iterations}: {row['elites']:,} elites "
-        f"({row['expected_same_cell']:,.0f} to stay), {why}{row['episodes_per_s']:.0f} episodes/s{by}, "
-        f"fitness {row['mean_fitness']:.2f}"
-    )
+        invalid = row["invalid_episodes"] / row["episodes"]
+        why = f"{invalid:.0%} invalid ({format_reasons(row['invalid_reasons'])}), " if invalid > WARNED_SHARE else ""
+        by = f" by {status}" if status else ""
+        elites = f"{row['elites']:,} elites ({row['expected_same_cell']:,.0f} to stay)"
+        speed = f"{row['episodes_per_s']:.0f} episodes/s{by}, fitness {row['mean_fitness']:.2f}"
+        bar.move_to(iteration, f"iteration {min(iteration + 1, last)}/{last}: {elites}, {why}{speed}")

@@ -185,7 +185,8 @@ class CmaMe(Method):
         super().__init__(cfg, setup)
         self.archive = setup.archive if archive is None else archive
         rules = rules or {"ranker": "2imp", "selection_rule": "filter", "restart_rule": "no_improvement"}
-        x0, sigma0 = np.zeros(setup.space.num_genes), setup.space.sigma0 if cfg.sigma0 is None else cfg.sigma0
+        x0 = np.zeros(setup.space.num_genes)
+        sigma0 = setup.space.sigma0 if cfg.sigma0 is None else cfg.sigma0
         for number, stream in setup.streams.items():
             self.sources[number] = EvolutionStrategyEmitter(
                 self.archive, x0=x0, sigma0=sigma0, batch_size=cfg.batch_size, seed=stream, **rules

@@ -100,7 +100,8 @@ def read_finished(run: RunDirectory, cfg: SearchCfg, until: float | None) -> Arc
     if run.exists():
         run.check_settings(cfg)
         with suppress(OSError, ValueError):  # files are made again
-            archive, last = read_archive(run.path), find_last_iteration(cfg, run.read_metrics(), until)
+            archive = read_archive(run.path)
+            last = find_last_iteration(cfg, run.read_metrics(), until)
             if archive.iterations == run.read_summary().get("iterations") == last:
                 return archive
     return None

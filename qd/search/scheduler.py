@@ -85,7 +85,16 @@ class Scheduler:
         """
         asked = self._asked[group]
         if asked is None:
-            solutions = self._ask_methods(group) if new or not self._pool else []
+            solutions: list[NDArray[np.float32]] = []
+            if new or not self._pool:
+                emitters = self._group_emitters(group)
+                no_genes = np.zeros((0, self._num_genes), np.float32)
+                pending = np.concatenate([no_genes, *(clipped(asked.new) for asked in self._asked if asked)])
+                batches: dict[int, NDArray[np.float32]] = {}
+                for method in self.methods:
+                    if chosen := [emitter for emitter in emitters if emitter in method.emitters]:
+                        batches |= zip(chosen, np.split(method.ask(chosen, pending), len(chosen)), strict=True)
+                solutions = [batches[emitter] for emitter in emitters]
             number = np.full(sum(map(len, solutions)), -1)
             if self._pool is not None:
                 rows = self.group_rows(group)
@@ -94,18 +103,6 @@ class Scheduler:
                 number = np.append(number, again)
             asked = self._asked[group] = Asked(np.concatenate(solutions), number)
         return clipped(asked.solutions)
-
-    def _ask_methods(self, group: int) -> list[NDArray[np.float32]]:
-        """Unclipped genes of each of a group's emitters, in their order."""
-        no_genes = np.zeros((0, self._num_genes), np.float32)
-        pending = np.concatenate([no_genes, *(clipped(asked.new) for asked in self._asked if asked)])
-        solutions: dict[int, NDArray[np.float32]] = {}
-        for method in self.methods:
-            emitters = [emitter for emitter in self._group_emitters(group) if emitter in method.emitters]
-            if emitters:
-                batches = np.split(method.ask(emitters, pending), len(emitters))
-                solutions |= zip(emitters, batches, strict=True)
-        return [solutions[emitter] for emitter in self._group_emitters(group)]
 
     def _pending_numbers(self) -> NDArray[np.int64]:
         """Numbers of the terrains that robots are to cross again already."""
@@ -128,8 +125,12 @@ class Scheduler:
         if accepted.any():
             for name, values in self._archive.add(**{name: column[accepted] for name, column in rows.items()}).items():
                 added[name][accepted] = values
-        if self._pool is not None:
-            self._settle(self._pool)
+        if self._pool is not None and self._pool.terrains is not None:
+            held = self._pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
+            self._archive.clear()
+            if len(held):
+                terrains = self._pool.terrains.rows(held)
+                self._archive.add(**_archive_rows(self._pool.solutions[held], terrains, self._pool.iteration[held]))
         num_new = len(asked.new)
         emitters = self._group_emitters(group) if num_new else range(0)
         size = num_new // max(1, len(emitters))
@@ -137,15 +138,6 @@ class Scheduler:
         for method in self.methods:
             method.tell(evaluation, rows, added, batches)
         return num_new
-
-    def _settle(self, pool: Pool) -> None:
-        """Makes the archive anew, of the terrains that hold the cells."""
-        rows = pool.settle(self._pending_numbers())
-        self._archive.clear()
-        if len(rows):
-            assert pool.terrains is not None
-            terrains = pool.terrains.rows(rows)
-            self._archive.add(**_archive_rows(pool.solutions[rows], terrains, pool.iteration[rows]))
 
     def elites(self) -> Columns:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""

@@ -11,7 +11,7 @@ from qd.search.descriptors import Cells
 from qd.search.fitness import FitnessCfg
 from qd.search.presets import SchedulerCfg, read_preset
 from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, resolve_policy
-from sim.files.settings import NonNegativeInt, PositiveInt, check_settings, from_builtins
+from sim.files.settings import NonNegativeInt, PositiveInt, check_settings
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg, robot_identity
 
@@ -80,11 +80,6 @@ def as_settings(cfg: SearchCfg) -> dict[str, Any]:
     settings = json.loads(json.dumps(asdict(cfg)))
     del settings["iterations"]
     return settings
-
-
-def from_settings(settings: dict[str, Any], iterations: int) -> SearchCfg:
-    """The search that :func:`as_settings` was of; other settings are a ValueError."""
-    return from_builtins(SearchCfg, {**settings, "iterations": iterations}, "a search")
 
 
 def differences(stored: dict[str, Any], settings: dict[str, Any], prefix: str = "") -> list[str]:

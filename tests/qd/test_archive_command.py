@@ -70,10 +70,9 @@ def config_of(folder: str) -> dict:
     return json.loads(Path(folder, "config.json").read_text())
 
 
-def change_settings(folder: str, **changes) -> None:
-    config = config_of(folder)
-    config["settings"] |= changes
-    Path(folder, "config.json").write_text(json.dumps(config))
+def change_settings(**changes) -> None:
+    config = config_of("a")
+    Path("a", "config.json").write_text(json.dumps(config | {"settings": config["settings"] | changes}))
 
 
 CANNOT_BE = ["--robot dog", "--space blocks", "--preset huge", "--device tpu", "--policy missing.pt", "--run-dir full"]
@@ -89,10 +88,10 @@ def test_what_cannot_be_is_named_before_there_is_a_run(capsys, flag):
     assert Path("full/thesis.tex").read_text() == "years of work"
 
 
-@pytest.mark.parametrize(("again", "settling", "name"), [("2", "1", "settling"), ("10001", "0", "again")])
-def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch, again, settling, name):
+def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, monkeypatch):
     monkeypatch.setattr(loop, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
-    assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
+    for again, settling, name in (("2", "1", "settling"), ("10001", "0", "again")):
+        assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
     assert os.listdir() == []
 
 
@@ -124,7 +123,8 @@ def test_a_method_of_one_file_is_searched_by_its_name_and_listed_with_its_settin
 
 def test_a_preset_has_its_own_defaults():
     paper = ArchiveCommand.defaults(["--preset", "paper"])
-    assert (paper.iterations, paper.replicas, paper.scheduler.emitters) == (1000, 20, 10)
+    scheduler = paper.scheduler
+    assert (scheduler.emitters, scheduler.batch_size, paper.replicas, paper.iterations) == (10, 20, 20, 1000)
     assert ArchiveCommand.defaults(["--device", "cuda"]).preset == "wide"
     assert ArchiveCommand.defaults(["--device", "cpu"]).preset == "small"
 
@@ -178,13 +178,13 @@ def test_code_runs_only_if_the_command_line_names_it(capsys):
     assert fine in fails(capsys, "--resume", "a", *MORE, "2")
     Path("evil.py").write_text("open('it_ran', 'w').close()\ndef act(row): pass\nclass Space: pass\n")
     evil = f"{Path.cwd()}/evil.py"
-    change_settings("a", policy=f"{evil}:act@a/checkpoint.bin")
+    change_settings(policy=f"{evil}:act@a/checkpoint.bin")
     assert "code" in fails(capsys, "--resume", "a", *MORE, "2")
     with pytest.raises(ValueError, match="code"):
         judge(Path("a"), compute=Compute())
-    change_settings("a", policy=fine, space=f"{evil}:Space", space_sha256="0" * 64)
+    change_settings(policy=fine, space=f"{evil}:Space", space_sha256="0" * 64)
     assert "evil.py" in fails(capsys, "--resume", "a", *MORE, "2", "--policy", fine)
-    change_settings("a", space="super_gaussian", space_sha256=None, robot=evil)
+    change_settings(space="super_gaussian", space_sha256=None, robot=evil)
     assert "evil.py" in fails(capsys, "--resume", "a", *MORE, "2", "--policy", fine)
     assert not Path("it_ran").exists()
     for name, content in whole.items():

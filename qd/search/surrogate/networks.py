@@ -116,8 +116,7 @@ class Trainer:
     ) -> None:
         self._networks, self._loss, self._on_cuda = networks, loss, device.startswith("cuda")
         weights = list(networks.parameters())
-        for tensor in weights:
-            tensor.grad = None
+        networks.zero_grad(set_to_none=True)
         self._optimiser = torch.optim.AdamW(
             weights, lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY, capturable=self._on_cuda, fused=True
         )
@@ -136,10 +135,8 @@ class Trainer:
     def moments(self) -> Moments:
         """What Adam remembers of each tensor of weights."""
         state = self._optimiser.state
-        return [
-            {name: state[tensor][name] for name in _MOMENTS} if tensor in state else {}
-            for tensor in self._networks.parameters()
-        ]
+        weights = self._networks.parameters()
+        return [{name: state[tensor][name] for name in _MOMENTS if tensor in state} for tensor in weights]
 
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
         """Takes a step for each batch that was drawn. All tensors are on the device.
@@ -160,11 +157,12 @@ class Trainer:
             # Outside of the graph, since they are drawn from ever more terrains.
             torch.index_select(maps.flatten(0, 1), 0, step_rows, out=batch_maps.flatten(0, 2))
             torch.index_select(targets, 0, step_terrains, out=batch_targets.flatten(0, 1))
-            self._take_step()
+            self._take_step(batch_maps, batch_targets)
 
-    def _take_step(self) -> None:
+    def _take_step(self, maps: Tensor, targets: Tensor) -> None:
+        """A step on the batch that lies in fixed memory."""
         if not self._on_cuda or self._eager_steps < _EAGER_STEPS:
-            self._learn_batch()
+            self._learn_batch(maps, targets)
             self._eager_steps += 1
             return
         if self._graph is None:
@@ -173,14 +171,11 @@ class Trainer:
             # Other threads may use the device meanwhile.
             stream = torch.cuda.current_stream()
             with recording(), torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-                self._learn_batch()  # is recorded, not done
+                self._learn_batch(maps, targets)  # is recorded, not done
             self._graph = graph
         self._graph.replay()
 
-    def _learn_batch(self) -> None:
-        """A step on the batch that lies in fixed memory."""
-        assert self._batch is not None
-        maps, targets = self._batch
+    def _learn_batch(self, maps: Tensor, targets: Tensor) -> None:
         self._optimiser.zero_grad(set_to_none=True)
         self._loss(self._networks(maps.float()), targets.transpose(0, 1)).backward()
         self._optimiser.step()

@@ -114,7 +114,8 @@ class Surrogate:
 
     def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
         """Remembers the valid ones of terrains, (N, num_genes), and trains for their share of an iteration's steps."""
-        valid, count = evaluation.valid, len(genes)
+        steps = max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains))
+        valid = evaluation.valid
         genes = clipped(genes[valid])
         with on_stream(self._stream):
             if len(genes) and len(self) >= MIN_TERRAINS:
@@ -123,21 +124,18 @@ class Surrogate:
                 before = squared_error if self.squared_error is None else self.squared_error
                 self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
             if len(genes):
-                self._remember(genes, evaluation.rows(valid))
+                units = np.rint(genes * _GENE_UNITS).astype(np.int16)
+                self._genes = np.concatenate([self._genes, units])[-self._capacity :]
+                logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
+                rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
+                targets = np.column_stack([evaluation.ratios, *logarithms, np.arcsinh(evaluation.fitness), *rates])
+                targets = targets[valid].astype(np.float32).astype(np.float16)
+                self._targets = np.concatenate([self._targets, targets])[-self._capacity :]
+                self._num_unmapped = min(self._num_unmapped + len(units), len(self))
+                numbers = self._split(self._targets)[1].astype(np.float32)
+                self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
             if len(self) >= MIN_TERRAINS:
-                self._train(max(1, round(self.cfg.training_steps * count / self.cfg.num_terrains)))
-
-    def _remember(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
-        units = np.rint(genes * _GENE_UNITS).astype(np.int16)
-        self._genes = np.concatenate([self._genes, units])[-self._capacity :]
-        logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
-        rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
-        targets = np.column_stack([evaluation.ratios, *logarithms, np.arcsinh(evaluation.fitness), *rates])
-        targets = targets.astype(np.float32).astype(np.float16)
-        self._targets = np.concatenate([self._targets, targets])[-self._capacity :]
-        self._num_unmapped = min(self._num_unmapped + len(units), len(self))
-        numbers = self._split(self._targets)[1].astype(np.float32)
-        self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
+                self._train(steps)
 
     def _map_genes(self, genes: Tensor) -> Tensor:
         """Heights over their scale, ground and conditions, shape (N, *SHAPE, num_maps)."""
@@ -238,7 +236,16 @@ class Surrogate:
             children = slice(first, first + num_children)
             genes[children] = self._vary(torch.cat([elites, genes[survivors]]), num_children, draw)
             prediction = self.predict(genes[children])
-            gain[children] = self._expected_gain(prediction, best, draw)
+            ratios = prediction.ratios.mean(0)
+            drawn = ratios.expand(1, MEMBERS, -1, -1)
+            if self.squared_error is not None:
+                error = torch.from_numpy(self.squared_error).to(self.device).sqrt()
+                noise = torch.randn((_DRAWS, MEMBERS, *ratios.shape), generator=draw, device=self.device)
+                drawn = (ratios + error * noise).clamp_min(1e-6)
+                drawn = drawn / drawn.sum(-1, keepdim=True)
+            reached = self.find_cells(drawn, prediction.collided)
+            added = torch.where(reached >= 0, (prediction.fitness - best[reached]).clamp_min(0.0), 0.0)
+            gain[children] = added.mean((0, 1))  # to the QD score
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
             rows = torch.cat([survivors, torch.arange(first, first + num_children, device=genes.device)])
@@ -247,18 +254,6 @@ class Surrogate:
         spread[chosen] = -torch.inf
         disputed = spread.argsort(descending=True, stable=True)[: num_proposals - len(chosen)]
         return genes[torch.cat([chosen, disputed])]
-
-    def _expected_gain(self, prediction: Prediction, best: Tensor, draw: torch.Generator) -> Tensor:
-        """What terrains are expected to add to the QD score, shape (N,), given the best fitness in each cell."""
-        ratios = prediction.ratios.mean(0)
-        drawn = ratios.expand(1, MEMBERS, -1, -1)
-        if self.squared_error is not None:
-            error = torch.from_numpy(self.squared_error).to(self.device).sqrt()
-            noise = torch.randn((_DRAWS, MEMBERS, *ratios.shape), generator=draw, device=self.device)
-            drawn = (ratios + error * noise).clamp_min(1e-6)
-            drawn = drawn / drawn.sum(-1, keepdim=True)
-        cells = self.find_cells(drawn, prediction.collided)
-        return torch.where(cells >= 0, (prediction.fitness - best[cells]).clamp_min(0.0), 0.0).mean((0, 1))
 
     def _expected_cells(self, prediction: Prediction) -> Tensor:
         """Cell of each terrain by the networks' mean, and by most of them whether robots collide, shape (N,)."""
