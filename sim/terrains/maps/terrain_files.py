@@ -5,7 +5,7 @@ All lengths are metres; x runs along the course (0 to 16 m), y across it (0 to 8
 
 import io
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.hfield import LEAST_EXTENT, QUARTER_TURN, as_hfield, surface_of
 
+FORMATS = ("npz", "png", "npy", "xml", "stl", "glb", "sdf")
+"""Formats by the ending of their files; ``xml`` is MJCF, ``sdf`` a model for Gazebo round the STL beside it."""
 STEP_M = 1e-3
 """Height of one step of an npy's whole numbers [m], one for all terrains, as a terrain generator takes it."""
 _BASE_BELOW = 0.5  # depth of the block under the lowest point of a mesh [m]
@@ -69,36 +71,43 @@ class ExportedTerrain:
         return x, y, float(self.heights[round(y / SPACING), round(x / SPACING)])
 
 
-def _encode_png(terrain: ExportedTerrain) -> bytes:
-    """A 16-bit grayscale PNG seen from above: x to the right, y up, so that the topmost row is the highest y."""
-    scale, offset = terrain.gray_scale
-    gray = np.rint((np.asarray(terrain.heights, dtype=np.float64) - offset) / scale).astype(np.uint16)
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(gray[::-1])).save(buffer, format="PNG", optimize=True)
-    return buffer.getvalue()
-
-
-def _encode_npz(terrain: ExportedTerrain) -> bytes:
-    """What :func:`sim.terrains.maps.heightmap.read_heightmap` reads and, where known, ``genes``; all float32."""
-    content = {"heights": np.asarray(terrain.heights, np.float32), "size_m": np.array(terrain.size)}
-    if terrain.genes is not None:
-        content["genes"] = np.asarray(terrain.genes, np.float32)
-    if terrain.ground is not None:
-        content |= {"friction": terrain.ground.friction[0], "time_constant_s": terrain.ground.time_constant_s[0]}
-    return npz_bytes(content)
-
-
-def _encode_npy(terrain: ExportedTerrain) -> bytes:
-    """Heights as the terrain generators of Isaac Lab and legged_gym hold them: int16 [x, y], in steps of 1 mm."""
-    steps = np.rint(np.asarray(terrain.heights, dtype=np.float64).T / STEP_M)
-    if np.abs(steps).max() > np.iinfo(np.int16).max:
-        raise ValueError(
-            f"heights of an npy must lie within 32.767 m of 0, got {np.abs(terrain.heights).max():g} m: leave npy out "
-            "of the formats"
-        )
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(steps.astype(np.int16)))
-    return buffer.getvalue()
+def encode_terrain(terrain: ExportedTerrain, ending: str) -> bytes:
+    """The content of a file of one of :data:`FORMATS`."""
+    heights, buffer = np.asarray(terrain.heights, dtype=np.float64), io.BytesIO()
+    match ending:
+        case "npz":  # as sim.terrains.maps.heightmap reads it, and genes
+            content = {"heights": np.asarray(terrain.heights, np.float32), "size_m": np.array(terrain.size)}
+            if terrain.genes is not None:
+                content["genes"] = np.asarray(terrain.genes, np.float32)
+            if (ground := terrain.ground) is not None:
+                content |= {"friction": ground.friction[0], "time_constant_s": ground.time_constant_s[0]}
+            return npz_bytes(content)
+        case "png":  # 16-bit gray, seen from above: x to the right, y up, so that the topmost row is the highest y
+            scale, offset = terrain.gray_scale
+            gray = np.rint((heights - offset) / scale).astype(np.uint16)
+            Image.fromarray(np.ascontiguousarray(gray[::-1])).save(buffer, format="PNG", optimize=True)
+            return buffer.getvalue()
+        case (
+            "npy"
+        ):  # as the terrain generators of Isaac Lab and legged_gym hold heights: int16 [x, y], in steps of 1 mm
+            steps = np.rint(heights.T / STEP_M)
+            if np.abs(steps).max() > np.iinfo(np.int16).max:
+                largest = f"{np.abs(heights).max():g} m: leave npy out of the formats"
+                raise ValueError(f"heights of an npy must lie within 32.767 m of 0, got {largest}")
+            np.save(buffer, np.ascontiguousarray(steps.astype(np.int16)))
+            return buffer.getvalue()
+        case "stl":
+            return export_stl(block_of(terrain.heights))
+        case "glb":  # heights as colours; a node turns the block, since y is up in glTF
+            block, scene = block_of(terrain.heights), trimesh.Scene()
+            colors = interpolate(block.vertices[:, 2].clip(terrain.heights.min()), "viridis")
+            mesh = trimesh.Trimesh(block.vertices, block.faces, vertex_colors=colors, process=False)
+            scene.add_geometry(mesh, transform=_Y_UP)
+            return export_glb(scene)
+        case "sdf":
+            return _SIX_LINES.format(name=escape(terrain.name, {'"': "&quot;"})).encode()
+        case _:
+            return _encode_mjcf(terrain)
 
 
 def _encode_mjcf(terrain: ExportedTerrain) -> bytes:
@@ -150,23 +159,6 @@ def block_of(heights: NDArray[np.floating]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([top, below, below.mean(axis=0, keepdims=True)]), faces, process=False)
 
 
-def _encode_glb(terrain: ExportedTerrain) -> bytes:
-    """The block with its heights as colours; a node turns it, since y is up in glTF."""
-    block, scene = block_of(terrain.heights), trimesh.Scene()
-    colors = interpolate(block.vertices[:, 2].clip(terrain.heights.min()), "viridis")
-    mesh = trimesh.Trimesh(block.vertices, block.faces, vertex_colors=colors, process=False)
-    scene.add_geometry(mesh, transform=_Y_UP)
-    return export_glb(scene)
-
-
-FORMATS: dict[str, Callable[[ExportedTerrain], bytes]] = {
-    "npz": _encode_npz, "png": _encode_png, "npy": _encode_npy, "xml": _encode_mjcf,
-    "stl": lambda terrain: export_stl(block_of(terrain.heights)), "glb": _encode_glb,
-    "sdf": lambda terrain: _SIX_LINES.format(name=escape(terrain.name, {'"': "&quot;"})).encode(),
-}  # fmt: skip
-"""Formats by the ending of their files; ``xml`` is MJCF, ``sdf`` a model for Gazebo round the STL beside it."""
-
-
 def write_terrain(
     folder: Path, terrain: ExportedTerrain, *, formats: Sequence[str], about: dict[str, Any]
 ) -> list[Path]:
@@ -192,7 +184,7 @@ def write_terrain(
         "npy_height": "vertical_scale * whole number",
         **about,
     }
-    files = {folder / f"{terrain.name}.{ending}": FORMATS[ending](terrain) for ending in formats}
+    files = {folder / f"{terrain.name}.{ending}": encode_terrain(terrain, ending) for ending in formats}
     files[folder / f"{terrain.name}.json"] = to_json(meaning)
     for path, content in files.items():
         write_atomically(path, content)

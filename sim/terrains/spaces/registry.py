@@ -154,42 +154,13 @@ LOADED: list[UserSpace] = []
 
 
 def find_user_space(name: str, sha256: str | None) -> UserSpace:
-    """A space that :func:`load_user_space` loaded, by the hash of its code if there is one."""
+    """A space that :func:`load_space` loaded, by the hash of its code if there is one."""
     for space in LOADED:
         if space.name == name if sha256 is None else space.sha256 == sha256:
             return space
     if name in (space.name for space in LOADED):
         raise ValueError(f"the code of the space {name} has changed since: put it back, or search anew")
     raise ValueError(f"the space {name} is code, which runs only if named: give --space {shlex.quote(name)}")
-
-
-def load_user_space(spec: str) -> UserSpace:
-    """Runs ``file.py:Space`` or ``module:Space``, a class without arguments, and tries all of it on three terrains.
-
-    Code that was loaded before, and has not changed, is not run again.
-    """
-    sha256 = controller_hash(spec)
-    same = (space for space in LOADED if sha256 is not None and (space.name, space.sha256) == (spec, sha256))
-    if space := next(same, None):
-        return space
-    parsed = ControllerSpec.parse(spec)
-    try:
-        code: Any = import_object(str(parsed.module), str(parsed.name))
-        code = code() if inspect.isclass(code) else code
-    except Exception as error:  # a user's code can fail with anything
-        raise ValueError(f"space '{spec}' cannot be loaded: {in_one_line(error)}") from error
-    space = UserSpace(spec, code)
-    hard = space.hard_random(2, 0)
-    genes = np.concatenate([np.zeros((1, space.num_genes), np.float32), hard])
-    with wp.ScopedDevice(host_device()):
-        rows = wp.array(genes, dtype=float)
-        space.rasterise(rows, SPACING, wp.zeros((len(genes), NUM_ROWS, NUM_COLS), dtype=float))
-        space.lay_ground(rows, make_ground(len(genes), host_device()))
-    space.without(hard, range(len(space.parts(hard[0]))))
-    space.scaled(hard, 0.5)
-    space.describe(hard[0])
-    LOADED.insert(0, space)
-    return space
 
 
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
@@ -216,15 +187,34 @@ def space_key(name: str, sha256: str | None) -> str:
 def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's code is run, and :func:`get_space` finds it from then on.
 
-    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, and behind it ground and conditions, as in
-    ``course+friction+push``; None is the paper's space.
+    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, a class without arguments, and behind it ground
+    and conditions, as in ``course+friction+push``; None is the paper's space. All of a user's space is tried on three
+    terrains. Code that was loaded before, and has not changed, is not run again.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
     once = "+".join((base, *kinds))
     if name and len(once) < len(name):
         raise ValueError(f"a space must have each kind of ground and condition once, got {name}: give {once}")
-    if is_user_space(base):
-        load_user_space(base)
+    sha256 = controller_hash(base) if is_user_space(base) else None
+    is_loaded = sha256 is not None and (base, sha256) in [(space.name, space.sha256) for space in LOADED]
+    if is_user_space(base) and not is_loaded:
+        parsed = ControllerSpec.parse(base)
+        try:
+            code: Any = import_object(str(parsed.module), str(parsed.name))
+            code = code() if inspect.isclass(code) else code
+        except Exception as error:  # a user's code can fail with anything
+            raise ValueError(f"space '{base}' cannot be loaded: {in_one_line(error)}") from error
+        space = UserSpace(base, code)
+        hard = space.hard_random(2, 0)
+        genes = np.concatenate([np.zeros((1, space.num_genes), np.float32), hard])
+        with wp.ScopedDevice(host_device()):
+            rows = wp.array(genes, dtype=float)
+            space.rasterise(rows, SPACING, wp.zeros((len(genes), NUM_ROWS, NUM_COLS), dtype=float))
+            space.lay_ground(rows, make_ground(len(genes), host_device()))
+        space.without(hard, range(len(space.parts(hard[0]))))
+        space.scaled(hard, 0.5)
+        space.describe(hard[0])
+        LOADED.insert(0, space)
     return get_space(once)
 
 

@@ -87,7 +87,11 @@ class WiderSpace(TerrainSpace):
         row = clipped(genes)
         texts = [*self.inner.parts(row[: self.inner.num_genes])]
         for kind in self.maps:
-            texts += [_patch_text(kind, *patch) for patch in enumerate(self._patch_values(row, kind))]
+            for (y, x), value in zip(np.ndindex(ROWS, COLS), self._patch_values(row, kind), strict=True):
+                soft = f"soft ground of {value:.3f} s" if value else "firm ground"
+                text = f"friction {value:.2f}" if kind == "friction" else soft
+                limits = PATCH * np.array([x, x + 1, y, y + 1])
+                texts.append("{} at x = {:.0f} to {:.0f} m, y = {:.0f} to {:.0f} m".format(text, *limits))
         conditions = zip(self.conditions, self._condition_texts(row), strict=True)
         return (*texts, *(text or f"no {name}" for name, text in conditions))
 
@@ -116,12 +120,21 @@ class WiderSpace(TerrainSpace):
         """
         row = clipped(genes)
         heights = row[: self.inner.num_genes]
-        across = self.inner.spans(heights) if self.maps else ()
-        spans = [text + self._ground_text(row, begin, end) for text, begin, end in across]
+        maps = {kind: self._patch_values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY] for kind in self.maps}
+        spans = []
+        for text, *ends in self.inner.spans(heights) if maps else ():
+            first, last = patch_index(ends, PATCH * COLS, COLS)
+            worst = []
+            for kind, values in maps.items():
+                below = values[:, first : last + 1]
+                if kind == "friction" and below.min() < _MAX_SLIPPERY:
+                    worst.append(f"friction {below.min():.2f}")
+                if kind == "softness" and below.max() > 0.0:
+                    worst.append(f"soft, {below.max():.3f} s")
+            spans.append(f"{text} ({', '.join(worst)})" if worst else text)
         lines = [", ".join(spans) or self.inner.describe(heights)]
-        for kind in self.maps:
-            sides = self._patch_values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY]
-            right, left = (" ".join(f"{value:.2f}" for value in side) for side in sides)
+        for kind, values in maps.items():
+            right, left = (" ".join(f"{value:.2f}" for value in side) for side in values)
             lines.append(f"{_TITLES[kind]}: left of the way {left}, right of it {right}")
         return "\n".join(lines + [self.condition_text(row)] * bool(self.conditions))
 
@@ -133,18 +146,6 @@ class WiderSpace(TerrainSpace):
     def _condition_texts(self, genes: ArrayLike) -> list[str]:
         return condition_texts(self.condition_rows(np.asarray(genes)[None])[0], self.conditions)
 
-    def _ground_text(self, row: NDArray[np.float32], begin: float, end: float) -> str:
-        """The worst ground on both sides of the way between two x [m], in brackets; empty if all is as always."""
-        first, last = patch_index((begin, end), PATCH * COLS, COLS)
-        texts = []
-        for kind in self.maps:
-            values = self._patch_values(row, kind).reshape(ROWS, COLS)[_ROWS_OF_THE_WAY, first : last + 1]
-            if kind == "friction" and values.min() < _MAX_SLIPPERY:
-                texts.append(f"friction {values.min():.2f}")
-            if kind == "softness" and values.max() > 0.0:
-                texts.append(f"soft, {values.max():.3f} s")
-        return f" ({', '.join(texts)})" if texts else ""
-
     def _patch_values(self, row: NDArray[np.float32], kind: str) -> NDArray[np.float64]:
         """Frictions, or time constants [s], of one terrain, shape (32,)."""
         share = (row[self._map_columns(kind)].astype(np.float64) + 1.0) / 2.0
@@ -152,14 +153,6 @@ class WiderSpace(TerrainSpace):
             return 1.0 - (1.0 - share) * (1.0 - MIN_FRICTION)
         tau = MIN_TIME_CONSTANT_S * (MAX_TIME_CONSTANT_S / MIN_TIME_CONSTANT_S) ** share
         return np.where(share > 0.0, tau, 0.0)
-
-
-def _patch_text(kind: str, patch: int, value: float) -> str:
-    row, col = divmod(patch, COLS)
-    where = f"at x = {PATCH * col:.0f} to {PATCH * (col + 1):.0f} m, y = {PATCH * row:.0f} to {PATCH * (row + 1):.0f} m"
-    if kind == "friction":
-        return f"friction {value:.2f} {where}"
-    return f"soft ground of {value:.3f} s {where}" if value else f"firm ground {where}"
 
 
 def ground_genes(values: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:

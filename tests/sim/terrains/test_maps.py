@@ -15,7 +15,7 @@ from sim.mujoco_c.model import surface_heights
 from sim.robots.shipped import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.maps.heightmap import Heightmap, as_terrain, fitted, read_heightmap
-from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, block_of, check_formats, write_terrain
+from sim.terrains.maps.terrain_files import ExportedTerrain, block_of, check_formats, encode_terrain, write_terrain
 from tests.sim.plain_mujoco import rays_from_above
 
 X = SPACING * np.arange(NUM_COLS)
@@ -161,7 +161,7 @@ def rough():
 def ray_heights(heights, tmp_path, points):
     """Where rays from above meet the exported scene."""
     path = tmp_path / "terrain.xml"
-    path.write_bytes(FORMATS["xml"](ExportedTerrain(heights=heights)))
+    path.write_bytes(encode_terrain(ExportedTerrain(heights=heights), "xml"))
     return rays_from_above(mujoco.MjModel.from_xml_path(str(path)), points)[0]
 
 
@@ -180,12 +180,12 @@ def test_rays_meet_the_exported_scene_where_the_simulations_surface_is(rough, tm
 
 
 def test_a_scene_has_the_simulations_options_and_takes_its_robots(rough):
-    scene = mujoco.MjSpec.from_string(FORMATS["xml"](ExportedTerrain(heights=rough, timestep=0.002)).decode())
+    scene = mujoco.MjSpec.from_string(encode_terrain(ExportedTerrain(heights=rough, timestep=0.002), "xml").decode())
     model = scene.compile()
     assert model.opt.timestep == 0.002 and model.opt.gravity.tolist() == [0, 0, -9.81] and model.nlight == 1
     assert model.site("start").pos.tolist() == pytest.approx([2, 4, rough[80, 40]])
     assert model.site("goal").pos.tolist() == pytest.approx([14, 4, rough[80, 280]])
-    scene = mujoco.MjSpec.from_string(FORMATS["xml"](ExportedTerrain(heights=FLAT)).decode())
+    scene = mujoco.MjSpec.from_string(encode_terrain(ExportedTerrain(heights=FLAT), "xml").decode())
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of options that differ
         robot = mujoco.MjSpec.from_file(str(ROBOTS["anymal"].model_file))
@@ -216,16 +216,18 @@ def test_an_sdf_is_a_static_model_of_the_mesh(rough, tmp_path):
 
 
 def test_an_npy_is_what_terrain_generators_hold(rough):
-    whole = np.load(io.BytesIO(FORMATS["npy"](ExportedTerrain(heights=rough))))
+    whole = np.load(io.BytesIO(encode_terrain(ExportedTerrain(heights=rough), "npy")))
     assert whole.dtype == np.int16 and whole.shape == (NUM_COLS, NUM_ROWS)  # x along the rows
     np.testing.assert_allclose(0.001 * whole[30, 7], rough[7, 30], atol=0.00051)
     with pytest.raises(ValueError, match="npy"):
-        FORMATS["npy"](ExportedTerrain(heights=FLAT + 40.0))
+        encode_terrain(ExportedTerrain(heights=FLAT + 40.0), "npy")
 
 
 def test_a_mesh_is_a_closed_block_with_the_simulations_surface_on_top(rough):
     small = rough[:9, :13]
-    mesh = trimesh.load(io.BytesIO(FORMATS["stl"](ExportedTerrain(heights=small))), file_type="stl", force="mesh")
+    mesh = trimesh.load(
+        io.BytesIO(encode_terrain(ExportedTerrain(heights=small), "stl")), file_type="stl", force="mesh"
+    )
     assert mesh.is_watertight and mesh.is_winding_consistent
     # The volume between the terrain and the bottom, half a metre below its lowest point.
     cells = [small[:-1, :-1], small[:-1, 1:], small[1:, :-1], small[1:, 1:]]
@@ -240,7 +242,7 @@ def test_a_mesh_is_a_closed_block_with_the_simulations_surface_on_top(rough):
 def test_a_glb_stands_upright_and_is_coloured_by_height():
     heights = np.zeros((9, 13), np.float32)
     heights[:, 6:] = 1.0
-    scene = trimesh.load(io.BytesIO(FORMATS["glb"](ExportedTerrain(heights=heights))), file_type="glb")
+    scene = trimesh.load(io.BytesIO(encode_terrain(ExportedTerrain(heights=heights), "glb")), file_type="glb")
     (mesh,) = scene.geometry.values()
     # 0.6 m along x, -0.5 to 1 m along y, which is up in glTF, and 0.4 m along -z.
     np.testing.assert_allclose(scene.bounds, [[0.0, -0.5, -0.4], [0.6, 1.0, 0.0]], atol=1e-6)
