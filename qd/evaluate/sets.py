@@ -226,10 +226,8 @@ def nearest_distance(
     maps, training_maps = (
         make_heights(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
     )
-    nearest = np.full(len(maps), np.inf)
-    for first in range(0, len(training_maps), _BANK):
-        nearest = np.minimum(nearest, rms_distances(maps, training_maps[first : first + _BANK]).min(axis=1))
-    return nearest
+    banks = (training_maps[first : first + _BANK] for first in range(0, len(training_maps), _BANK))
+    return np.min([rms_distances(maps, bank).min(axis=1) for bank in banks], axis=0)
 
 
 def make_sets(
