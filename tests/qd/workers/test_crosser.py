@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kernels.episode import Invalidity, Outcome
+from kernels.episode import Outcome
 from qd.workers import crosser as service
 from qd.workers.cache import Cache
 from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser, cross
-from qd.workers.invalid import AllInvalidError, explain_invalid, find_flaw, invalid_iterations, report_invalid
+from qd.workers.invalid import AllInvalidError, explain_invalid, find_flaw, invalid_iterations
 from sim.files.command import Interrupted
 from sim.robots.find import get_robot
 from sim.terrains.spaces.course import COURSE
@@ -20,7 +20,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 from tests.qd import stand_in
 from tests.qd.robots import Robots
-from tests.qd.stand_in import assert_same, compute_by, evaluate, make_result
+from tests.qd.stand_in import assert_same, compute_by, evaluate
 
 ROBOT = get_robot("anymal")
 POLICY = str(ROBOT.policy_file)
@@ -180,14 +180,17 @@ def test_settings_that_mean_nothing_are_refused(flaw):
         cross({"a": "shipped"}, TERRAINS[:1], **{"replicas": 1} | flaw)
 
 
-def test_a_result_without_a_valid_episode_is_refused_unless_that_is_asked_for(tmp_path):
+def test_invalid_episodes_are_reported_and_refused_where_there_are_no_others_unless_they_may_be(tmp_path, capsys):
     def invalid(cfg, genes, seeds):
         result = stand_in.evaluate(genes, seeds, cfg.replicas)
         return stand_in.make_result(result.penalties, invalid=np.ones(result.invalid.shape))
 
+    cross_all(Robots(), label="flat")
     with pytest.raises(AllInvalidError):
         cross_all(Robots(invalid), tmp_path)
-    assert cross_all(Robots(), tmp_path, invalid_ok=True).invalid.all()  # it was stored all the same
+    assert capsys.readouterr().err == ""
+    assert cross_all(Robots(), tmp_path, invalid_ok=True, label="steep").invalid.all()  # it was stored all the same
+    assert "steep: 180 of 180 episodes are invalid" in capsys.readouterr().err
 
 
 def test_engines_are_stored_apart_and_mujoco_c_refuses_what_it_cannot(tmp_path):
@@ -202,15 +205,6 @@ def test_engines_are_stored_apart_and_mujoco_c_refuses_what_it_cannot(tmp_path):
     for asked in ({"reward": True}, {"penalties_from_s": 1.0}, {"record": True}):
         with pytest.raises(ValueError, match="mujoco_c"):
             cross_all(Robots(), engine="mujoco_c", **asked)
-
-
-FINE, ACTION, SPEED = Invalidity.NONE, Invalidity.ACTION, Invalidity.SPEED
-
-
-def end_by(codes):
-    result = make_result(np.ones((*np.shape(codes), 1)), invalid=np.array(codes) != FINE)
-    result.invalidity[:] = codes
-    return result
 
 
 def test_more_than_one_in_twenty_is_reported_with_the_remedy_of_the_most_frequent_reason():
@@ -230,17 +224,6 @@ def test_of_a_searchs_iterations_those_with_many_are_summed():
     words = invalid_iterations(rows)
     assert "2 of 3" in words and "43 of 80" in words and "53.8%: 40 non-finite state, 2 solver overflow" in words
     assert invalid_iterations(rows[1:2]) is None
-
-
-def test_nothing_but_invalid_episodes_is_an_error_unless_it_may_be(capsys):
-    nothing = end_by([[ACTION, ACTION, SPEED]])
-    with pytest.raises(AllInvalidError):
-        report_invalid(nothing, "flat")
-    report_invalid(nothing, "flat", all_ok=True)
-    report_invalid(end_by([[ACTION, ACTION, FINE]]), "steep")
-    assert [line[:5] for line in capsys.readouterr().err.splitlines()] == ["flat:", "steep"]
-    report_invalid(end_by([[FINE] * 3]), "flat")
-    assert capsys.readouterr().err == ""
 
 
 RESULT = evaluate(np.zeros((3, 64), np.float32), np.arange(3), 4)
