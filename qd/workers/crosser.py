@@ -39,7 +39,7 @@ _MUJOCO_C_LOT = 4  # terrains of a process
 def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterator[Pipeline]:
     """Opens what crosses terrains, in processes or on a Ray cluster, until the end; ``build`` makes simulators."""
     if cfg.on_ray:
-        with importlib.import_module("qd.workers.ray_workers").open_ray_workers(cfg, build) as workers:
+        with importlib.import_module("qd.workers.ray_workers").RayWorkers.opened(cfg, build) as workers:
             yield workers
     elif cfg.in_process:
         yield Pipeline(cfg.num_terrains, build(cfg, cfg.num_terrains))

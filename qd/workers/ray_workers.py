@@ -121,17 +121,25 @@ class RayWorkers(Pipeline):
         self._grown_at, self._seen_at = -_GROW_EVERY_S, time.monotonic()  # when the cluster and a worker were looked at
         self._result_at = time.perf_counter()
 
-    def open(self) -> None:
-        """Starts the workers and waits for them; once one is ready, no longer than a minute for the others."""
+    @classmethod
+    @contextmanager
+    def opened(cls, cfg: PipelineCfg, build: Build) -> Iterator["RayWorkers"]:
+        """Starts the workers and ends them; once one is ready, it waits no longer than a minute for the others."""
+        connect(parse_workers(cfg.compute.workers)[1])
+        workers = cls(cfg, build)
         began = time.monotonic()
-        while not self._idle or (self.status().workers < len(self._workers) and time.monotonic() - began < _GATHER_S):
-            self._turn()
-
-    def close(self) -> None:
-        """Ends the workers, whatever they do."""
-        for worker in self._workers:
-            with suppress(RayError):  # the whole cluster may be gone
-                ray.kill(worker)
+        try:
+            while not workers._idle or (
+                workers.status().workers < len(workers._workers) and time.monotonic() - began < _GATHER_S
+            ):
+                workers._turn()
+            yield workers
+        except RayError as error:
+            raise EvaluatorError(f"the Ray cluster failed: {_find_reason(error)}") from error
+        finally:
+            for worker in workers._workers:
+                with suppress(RayError):  # the whole cluster may be gone
+                    ray.kill(worker)
 
     def status(self) -> WorkerStatus:
         """How the workers fare."""
@@ -239,17 +247,3 @@ def _find_reason(error: BaseException) -> str:
         text = f"{type(error.cause).__name__}: {' '.join(str(error.cause).split())}"
         return f"{text}\n{error}" if debugging() else text  # Ray keeps the worker's traceback in the error's text
     return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-
-
-@contextmanager
-def open_ray_workers(cfg: PipelineCfg, build: Build) -> Iterator[RayWorkers]:
-    """Starts the workers and ends them; arguments and errors as of :func:`qd.workers.crosser.open_pipeline`."""
-    connect(parse_workers(cfg.compute.workers)[1])
-    workers = RayWorkers(cfg, build)
-    try:
-        workers.open()
-        yield workers
-    except RayError as error:
-        raise EvaluatorError(f"the Ray cluster failed: {_find_reason(error)}") from error
-    finally:
-        workers.close()
