@@ -14,7 +14,6 @@ from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
 from qd.evaluate.tables import is_regression
 from qd.search.archive import write_archive
-from qd.workers.compute import Compute
 from sim.files.command import run_command
 from tests.builders import make_archive
 from tests.qd.robots import Robots
@@ -23,7 +22,6 @@ from tests.qd.stand_in import PENALTIES, compute_by
 from tests.train.conftest import write_trained
 
 STAND, STRETCH = "tests.sim.policies:stand", "tests.sim.policies:stretch"
-CPU = Compute()
 
 
 def write_elites(path, count, *, robot="anymal", seed=0):

@@ -88,8 +88,8 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
         assert entry["searched"]["goal_rate"] < 0.75 and entry["certificates"][0]["controller"] == "C-G"
         assert entry["rates"]["C-G"]["goal_rate"] == 1.0 and entry["rates"]["base"]["valid_episodes"] == 20
     assert (content["searched"], content["certifiers"]) == ("base", ["C-G"])
-    failing = sum(entry["rates"]["base"]["goal_rate"] < 0.5 for entry in content["terrains"])
-    assert content["rates"]["base"]["failing"] == failing
+    rates = [entry["rates"]["base"]["goal_rate"] for entry in content["terrains"]]
+    assert content["rates"]["base"]["failing"] == sum(rate < 0.5 for rate in rates)
     few = make(OTHER, size=3)  # the first of the same; the searched controller is always among those that cross
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
@@ -107,12 +107,9 @@ def pack(tmp_path, anymal, monkeypatch):
     chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
     entries = add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
     genes = np.array([np.full(64, entry["elite"] / 100) for entry in chosen], np.float32)
-    content = {
-        **controller_identity(anymal, anymal.policy_file), "seed": 0, "episodes": 4, "searched": "base",
-        "terrains": entries,
-        "rates": {"base": summarise_rates(entries, "base", 0)},
-        "terrains_sha256": write_terrains(Path("pack"), round_heights(heights), genes),
-    }  # fmt: skip
+    content = controller_identity(anymal, anymal.policy_file) | {"seed": 0, "episodes": 4, "searched": "base"}
+    content |= {"terrains": entries, "rates": {"base": summarise_rates(entries, "base", 0)}}
+    content["terrains_sha256"] = write_terrains(Path("pack"), round_heights(heights), genes)
     Path("pack/pack.json").write_text(json.dumps(content))
     return heights
 
