@@ -15,7 +15,7 @@ from typing import Any, Literal
 from qd.search.archive import ARCHIVE_FILE, Archive, read_archive, write_archive
 from qd.search.checkpoint import REMEDY, load_checkpoint, save_checkpoint
 from qd.search.settings import SearchCfg, as_settings, differences
-from sim.files.atomic import check_writable, is_leftover, locked, read_json, to_json, write_atomically
+from sim.files.atomic import is_leftover, locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.settings import from_builtins
 from sim.robots.robot import RobotCfg, check_robot_identity
 from sim.terrains.spaces.registry import get_space, load_space
@@ -146,7 +146,7 @@ def claimed(path: Path) -> Iterator[None]:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"run directory {path} cannot be made: {error.strerror}: give another one") from None
-    check_writable(path)
+    prepare_output(path / CONFIG_FILE)
     with locked(path, f"another command works in {path}: let it end, or name another folder"):
         try:
             yield

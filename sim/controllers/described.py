@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from sim.controllers.adapters import Sensed, read_row
+from sim.controllers.adapters import read_row
 from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
 from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
@@ -271,8 +271,16 @@ class Described(torch.nn.Module):
         clip = self.cfg.observation_clip
         memory = self._get_memory(len(row))
         sensed = read_row(row, self.robot)
-        terms = zip(self.cfg.observation, self._sensors, self._index, strict=True)
-        columns = [self._compute_quantity(term, sensed, memory, at)[:, index] for term, at, index in terms]
+        columns: list[torch.Tensor] = []
+        for term, at, index in zip(self.cfg.observation, self._sensors, self._index, strict=True):
+            if term.term == "lin_vel":
+                quantity = sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, at.expand_as(sensed.ang_vel))
+            elif term.term == "clock":
+                angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
+                quantity = torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
+            else:
+                quantity = memory.action if term.term == "last_action" else getattr(sensed, term.term).flatten(1)
+            columns.append(quantity[:, index])
         now = (torch.cat(columns, dim=1) - self._zeros).clamp(self._low, self._high) * self._scale
         now = now if clip is None else now.clamp(-clip, clip)
         history = self.cfg.history
@@ -298,17 +306,6 @@ class Described(torch.nn.Module):
         actions = moved.new_zeros(len(moved), self.robot.num_joints)  # 0 holds the default pose
         actions[:, self._joints] = moved
         return actions
-
-    def _compute_quantity(self, term: Term, sensed: Sensed, memory: _Memory, sensor: torch.Tensor) -> torch.Tensor:
-        """All columns of a term's quantity, shape (num_envs, any)."""
-        if term.term == "lin_vel":
-            return sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, sensor.expand_as(sensed.ang_vel))
-        if term.term == "last_action":
-            return memory.action
-        if term.term == "clock":
-            angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
-            return torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
-        return getattr(sensed, term.term).flatten(1)
 
 
 def _limits(clip: Any) -> Any:

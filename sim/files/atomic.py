@@ -47,23 +47,15 @@ def is_leftover(path: Path) -> bool:
     return path.name.startswith(".") and path.name.endswith(_TEMPORARY)
 
 
-def check_writable(folder: Path) -> None:
-    """Raises a ValueError if files cannot be made in a folder: to be called before long work."""
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        raise ValueError(f"{folder} cannot be written to: {error.strerror}: give another place") from None
-
-
 def prepare_output(file: Path) -> None:
     """Makes the folder of a file; raises a ValueError if it cannot be written: to be called before long work."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=file.parent).close()
     except OSError as error:
-        raise ValueError(f"cannot write to {error.filename}: {error.strerror}: give another place") from None
+        raise ValueError(f"{file.parent} cannot be written to: {error.strerror}: give another place") from None
     if file.is_dir():
         raise ValueError(f"{file} is a directory, expected a file to write: name a file in it")
-    check_writable(file.parent)
 
 
 def to_json(content: dict[str, Any]) -> bytes:

@@ -129,7 +129,12 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
         sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and _is_output_closed():
+        poll = select.poll()
+        poll.register(1, 0)
+        poll.register(2, 0)
+        if isinstance(error, BrokenPipeError) and (closed := poll.poll(0)):  # what is left to print is dropped
+            for stream, _ in closed:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
             return 1
         remedy = _cache_remedy(error)
         if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
@@ -142,17 +147,6 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     except KeyboardInterrupt as stop:
         print(f"\n{stop}" if isinstance(stop, Interrupted) else "\nStopped.", file=sys.stderr)
         return 130
-
-
-def _is_output_closed() -> bool:
-    """Whether standard output or errors have lost their reader; what is left to print there is dropped."""
-    poll = select.poll()
-    poll.register(1, 0)
-    poll.register(2, 0)
-    closed = poll.poll(0)
-    for stream, _ in closed:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-    return bool(closed)
 
 
 def _cache_remedy(error: Exception) -> str:

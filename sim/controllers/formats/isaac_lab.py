@@ -125,7 +125,14 @@ def _read_action(actions: dict[str, Any], path: Path, source: Source) -> list[st
         joint_order = read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"]
         reason = ""
     else:
-        joint_order = _breadth_first(source.model)
+        model = source.model
+        names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
+
+        def path_to(body: int) -> list[str]:
+            return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
+
+        paths = sorted(map(path_to, names), key=lambda joints: (len(joints), joints))
+        joint_order = [joints[-1] for joints in paths]  # from the base outwards, a body's children by name
         reason = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
     kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items() if term is not None}
     if list(kinds.values()) != ["JointPositionAction"]:
@@ -142,16 +149,6 @@ def _read_action(actions: dict[str, Any], path: Path, source: Source) -> list[st
         offset = per_joint(term["offset"], joints, f"{label}.offset", partly=True)
         source.set(action_offset=[angle or 0.0 for angle in offset])
     return joint_order
-
-
-def _breadth_first(model: Any) -> list[str]:
-    """Joints from the base outwards, those of a body's children by name."""
-    names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
-
-    def path_to(body: int) -> list[str]:
-        return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
-
-    return [joints[-1] for joints in sorted(map(path_to, names), key=lambda joints: (len(joints), joints))]
 
 
 def _read_term(
