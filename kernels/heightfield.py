@@ -2,7 +2,7 @@
 
 A terrain is a triangulated grid: node ``(row, col)`` stands at ``x = col * spacing``, ``y = row * spacing``, and every
 cell is cut along the diagonal from its (low x, high y) to its (high x, low y) corner; MuJoCo's heightfield along the
-other one (:mod:`sim.terrains.maps.hfield` hands it the same surface). Beyond the grid the height of the nearest edge
+other one (:mod:`sim.terrains.maps.heightmap` hands it the same surface). Beyond the grid the height of the nearest edge
 node continues.
 """
 

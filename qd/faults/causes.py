@@ -11,10 +11,10 @@ from kernels.ground import FIRM
 from sim.crossing import CrossingCfg
 from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.conditions.kinds import CONDITIONS, condition_texts
-from sim.terrains.ground import PATCHES, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.wider import WiderSpace
+from sim.terrains.terrains import PATCHES, patch_index
 
 _LEAST_HEIGHT = 0.03  # a part that is lower and less deep everywhere under the robot lies beside its way [m]
 _GENTLE = 10.0  # slopes below are gentle [degrees]

@@ -20,9 +20,9 @@ from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import format_value
 from sim.terrains.bank import make_terrains
-from sim.terrains.ground import GroundMaps
 from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
 from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.terrains import GroundMaps
 
 _BLUE = "#0072b2"
 _SUN = (-0.45, 0.35)  # light that slopes along x and y of a relief gain

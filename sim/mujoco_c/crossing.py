@@ -37,8 +37,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, make_terrains
 from sim.terrains.conditions.kinds import nominal_row, split_row
-from sim.terrains.ground import GroundMaps
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 
 _WARNINGS = [
     getattr(mj.mjtWarning, f"mjWARN_{name}")

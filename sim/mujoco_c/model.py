@@ -19,9 +19,9 @@ from sim.crossing import GROUND_FRICTION, CrossingCfg
 from sim.robots.compiled import robot_spec
 from sim.robots.elements import mj, rotation_matrix
 from sim.robots.robot import RobotCfg
-from sim.terrains.ground import PATCHES, GroundMaps
 from sim.terrains.hand_crafted import SPACING
-from sim.terrains.maps.hfield import QUARTER_TURN, Margins, as_hfield
+from sim.terrains.maps.heightmap import QUARTER_TURN, Margins, as_hfield
+from sim.terrains.terrains import PATCHES, GroundMaps
 
 _MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = 4 << 20  # bytes

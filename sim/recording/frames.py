@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.terrains.ground import GroundMaps
+from sim.terrains.terrains import GroundMaps
 
 FRAME_ARRAYS = {
     "base_position": np.float32,

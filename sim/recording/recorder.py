@@ -31,9 +31,8 @@ from sim.recording.frames import FRAME_ARRAYS, Frames
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout, RolloutResult
 from sim.terrains.bank import make_heights
-from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space, is_user_space
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 
 FORMAT = "faultline recording 3"
 """Name and version in every file."""

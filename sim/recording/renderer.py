@@ -19,10 +19,10 @@ from sim.crossing import CrossingCfg
 from sim.robots.elements import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import find_touches, robot_model, shown_spec
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
-from sim.terrains.maps.hfield import surface_of
+from sim.terrains.maps.heightmap import surface_of
 from sim.terrains.maps.picture import height_colors, tinted
+from sim.terrains.terrains import GroundMaps
 
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""

@@ -9,11 +9,10 @@ from kernels.ground import FIRM, Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
 from sim.device import host_device
 from sim.terrains.conditions.kinds import nominal_row
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 
 _ALL = slice(None)
 

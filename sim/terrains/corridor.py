@@ -6,9 +6,9 @@ import warp as wp
 
 from kernels.ground import COLS, MAX_TIME_CONSTANT_S, ROWS, make_ground
 from sim.terrains.conditions.kinds import condition_genes
-from sim.terrains.ground import patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.terrains import patch_index
 
 X = (2.0, 14.0)
 """From the start to the goal [m]."""

@@ -1,4 +1,4 @@
-"""Terrains to cross, as one value: what they are made of, and the seeds of their episodes."""
+"""Terrains to cross, as one value: genes or heights, ground and conditions, and the seeds of their episodes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -7,13 +7,95 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from sim.terrains.ground import GroundMaps
+from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
+from sim.terrains.conditions.kinds import condition_genes, nominal_row
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 Rows = slice | NDArray[Any]
+GROUND_KINDS = ("friction", "softness")
+"""What the ground may have maps of."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GroundMaps:
+    """Friction and softness of the patches of T terrains, and the conditions under which each is crossed."""
+
+    friction: NDArray[np.float32]
+    """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
+    time_constant_s: NDArray[np.float32]
+    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
+    conditions: NDArray[np.float32] | None = None
+    """Conditions (:mod:`sim.terrains.conditions`), shape (T, number of values); nominal ones if None."""
+
+    def __post_init__(self) -> None:
+        check_map("friction", self.friction)
+        check_map("softness", self.time_constant_s)
+        if len(self.friction) != len(self.time_constant_s):
+            raise ValueError(
+                f"maps must be of as many terrains, got {len(self.friction)} of friction and "
+                f"{len(self.time_constant_s)} of softness"
+            )
+        genes = condition_genes()
+        if self.rows.shape != (len(self), len(genes)):
+            raise ValueError(f"conditions must have shape ({len(self)}, {len(genes)}), got {self.rows.shape}")
+        for gene, values in zip(genes, self.rows.T, strict=True):
+            low, high = gene.limits
+            wrong = ~((values >= low - 1e-6) & (values <= high + 1e-6))
+            if wrong.any():
+                raise ValueError(f"the condition {gene.name} must lie in {low:g} to {high:g}, got {values[wrong][0]:g}")
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """Conditions of all, shape (T, number of values)."""
+        return np.tile(nominal_row(), (len(self), 1)) if self.conditions is None else self.conditions
+
+    def __len__(self) -> int:
+        return len(self.friction)
+
+    def __getitem__(self, rows: Rows) -> "GroundMaps":
+        chosen: dict[str, Any] = {name: maps[rows] for name, maps in vars(self).items() if maps is not None}
+        return GroundMaps(**chosen)
+
+    @classmethod
+    def plain(cls, num_terrains: int) -> "GroundMaps":
+        """Maps of ground that changes nothing."""
+        whole = num_terrains, *PATCHES
+        return cls(friction=np.ones(whole, np.float32), time_constant_s=np.full(whole, FIRM, np.float32))
+
+    def joined(self, other: "GroundMaps") -> "GroundMaps":
+        """These terrains, and others behind them."""
+        nominal = self.conditions is None and other.conditions is None
+        return GroundMaps(
+            friction=np.concatenate([self.friction, other.friction]),
+            time_constant_s=np.concatenate([self.time_constant_s, other.time_constant_s]),
+            conditions=None if nominal else np.concatenate([self.rows, other.rows]),
+        )
+
+
+def patch_index(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
+    """Row or column of the patch at each place along an axis, which ``count`` patches divide evenly.
+
+    Places and length are in nodes or metres, from the beginning of the axis. Patches at the edge go on beyond it.
+    """
+    return np.clip(np.asarray(places) * count // length, 0, count - 1).astype(np.int64)
+
+
+def check_map(kind: str, values: NDArray[np.floating]) -> None:
+    """That values are frictions or, of ``softness``, contact time constants [s] of the patches of terrains."""
+    if values.ndim != 3 or values.shape[1:] != PATCHES:
+        raise ValueError(f"a map of {kind} must have shape (terrains, {PATCHES[0]}, {PATCHES[1]}), got {values.shape}")
+    if kind == "friction":
+        allowed = (values >= MIN_FRICTION - 1e-6) & (values <= 1.0)
+        words = f"{MIN_FRICTION} to 1"
+    else:
+        soft = (values >= MIN_TIME_CONSTANT_S - 1e-6) & (values <= MAX_TIME_CONSTANT_S + 1e-6)
+        allowed = soft | (values == FIRM)
+        words = f"{FIRM:g} (firm), or {MIN_TIME_CONSTANT_S} to {MAX_TIME_CONSTANT_S} s"
+    if not allowed.all():
+        raise ValueError(f"{kind} must be {words}, got {values[~allowed][0]:g} in one of the patches")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

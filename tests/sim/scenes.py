@@ -12,8 +12,8 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.terrains import GroundMaps
 from tests.sim.policies import stand
 
 NODE_X = np.arange(NUM_COLS) * SPACING

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from sim.robots.training import Draw
 from sim.terrains.bank import make_terrains
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import (
     CROSSING_TYPES,
     NUM_COLS,
@@ -20,6 +19,7 @@ from sim.terrains.hand_crafted import (
     training_tiles,
 )
 from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.terrains import GroundMaps
 from train.cfg import CurriculumCfg
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains

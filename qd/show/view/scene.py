@@ -19,10 +19,10 @@ from sim.mujoco_c.model import surface_heights
 from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
-from sim.terrains.maps.hfield import surface_of
+from sim.terrains.maps.heightmap import surface_of
 from sim.terrains.maps.picture import height_colors, tinted
+from sim.terrains.terrains import GroundMaps
 
 FORCE_COLOR = (0.84, 0.10, 0.11)
 """Arrows of contact forces, RGB, 0 to 1."""

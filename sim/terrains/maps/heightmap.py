@@ -1,7 +1,12 @@
-"""Heightmaps of a user as terrains to cross: what a file must hold, and how it becomes the project's grid.
+"""Height grids as triangles and as heightfields of MuJoCo's, and heightmaps of a user as terrains to cross.
 
-A map is a grid of nodes over a rectangle of ``size_m`` (along x, along y), from edge to edge. It is laid with its
-middle on the middle of the terrain, 16 m x 8 m, which robots cross from x = 2 m to 14 m. What reaches beyond the
+MuJoCo cuts every cell of a heightfield from its (low x, low y) to its (high x, high y) corner, for contacts as for
+rays; ours are cut from (low x, high y) to (high x, low y) (:mod:`kernels.heightfield`). On a grid that is turned by a
+quarter the one cut is the other, so our grids are handed over on their side, their columns along MuJoCo's rows: then
+both have the same surface, between the nodes too.
+
+A map of a user is a grid of nodes over a rectangle of ``size_m`` (along x, along y), from edge to edge. It is laid with
+its middle on the middle of the terrain, 16 m x 8 m, which robots cross from x = 2 m to 14 m. What reaches beyond the
 terrain is cut off; where the map ends before it, the height of its edge continues. Heights stay as they are: the ground
 of the project's own terrains is at 0.
 
@@ -24,13 +29,66 @@ from PIL import Image
 from sim.files.atomic import read_json
 from sim.files.npz import array_names, read_arrays
 from sim.files.settings import from_builtins
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.terrains import GroundMaps
 
+LEAST_EXTENT = 1e-3
+"""Of flat ground, whose range is 0 where a size or scale may not be [m]."""
+_THICKNESS = 1.0  # of the ground below its lowest point [m]
+QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+"""Of the geom, quaternion w x y z: its x axis is the grid's y, its y axis the grid's -x."""
 _MAX_HEIGHT_M = 10.0  # above or below 0
 _MAX_NODES = 10_000  # along one side
 _WHOLE = (SPACING * (NUM_COLS - 1), SPACING * (NUM_ROWS - 1))
 _GRAY_MODES = ("L", "I", "I;16", "I;16B", "I;16L", "I;16N")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hfield:
+    """What an ``hfield`` asset and the ``geom`` that shows it need beside :data:`QUARTER_TURN`; axes are the grid's."""
+
+    data: NDArray[np.float64]
+    """0 to 1, as in ``MjModel.hfield_data``; an asset's ``elevation`` has its rows in reverse."""
+    size: tuple[float, float, float, float]
+    """Half lengths along the asset's x and y, height of data 1, thickness below data 0 [m]."""
+    position: tuple[float, float, float]
+    """Of the geom [m]."""
+
+
+Margins = tuple[tuple[int, int], tuple[int, int]]
+"""Nodes to add at low y and high y, and at low x and high x."""
+
+
+def as_hfield(heights: NDArray[np.floating], *, margin: int | Margins = 0) -> Hfield:
+    """A height grid as a heightfield with the same surface, with ``margin`` nodes of edge height more.
+
+    Heights [m] have shape (nrow, ncol), at :data:`sim.terrains.hand_crafted.SPACING`; node (0, 0) stands at x = y = 0.
+    """
+    margins = ((margin, margin),) * 2 if isinstance(margin, int) else margin
+    grid = np.pad(np.asarray(heights, dtype=np.float64), margins, mode="edge")
+    lowest, extent = float(grid.min()), float(np.ptp(grid)) or LEAST_EXTENT
+    half_y, half_x = (0.5 * SPACING * (count - 1) for count in grid.shape)
+    (low_y, _), (low_x, _) = margins
+    return Hfield(
+        data=((grid - lowest) / extent).T[::-1],
+        size=(half_y, half_x, extent, _THICKNESS),
+        position=(half_x - SPACING * low_x, half_y - SPACING * low_y, lowest),
+    )
+
+
+def surface_of(heights: NDArray[np.floating], margin: int = 0) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The ground that robots walk on: vertices [m], row by row, and two triangles a cell, cut as the physics cuts it.
+
+    Heights [m] have shape (nrow, ncol), node (0, 0) at x = y = 0; ``margin`` more nodes continue each edge.
+    """
+    grid = np.pad(heights, margin, mode="edge")
+    nrow, ncol = grid.shape
+    y, x = (SPACING * (np.arange(count) - margin) for count in grid.shape)
+    vertices = np.stack([*np.meshgrid(x, y), grid], axis=-1).reshape(-1, 3)
+    low = (np.arange(nrow - 1)[:, None] * ncol + np.arange(ncol - 1)).ravel()
+    # Each cell is cut from its (low x, high y) to its (high x, low y) corner.
+    faces = np.stack([low, low + 1, low + ncol, low + 1, low + ncol + 1, low + ncol], axis=1)
+    return vertices.astype(np.float64), faces.reshape(-1, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +122,7 @@ def read_heightmap(
     """A heightmap from a file: data only, nothing in it can run.
 
     An ``.npz`` holds ``heights`` (nrow, ncol), floats in metres, row along y, and may hold ``size_m``; of the size of a
-    terrain also ``friction`` and ``time_constant_s``, as :class:`sim.terrains.ground.GroundMaps` has them. A ``.png``
+    terrain also ``friction`` and ``time_constant_s``, as :class:`sim.terrains.terrains.GroundMaps` has them. A ``.png``
     is 8 or 16-bit grayscale seen from above, x to the right and y up; height = offset + scale * gray level. What is not
     given here is taken from the npz, or from the keys ``size_m``, ``scale_m`` and ``offset_m`` of a JSON of the same
     name beside the image; without an offset it is 0. Sizes are along x and along y; a given scale and offset are of the

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
 from sim.crossing import CrossingCfg
-from sim.terrains.ground import GroundMaps, patch_index
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
+from sim.terrains.terrains import GroundMaps, patch_index
 
 LENGTH, WIDTH = 16.0, 8.0
 """Of a terrain [m]."""

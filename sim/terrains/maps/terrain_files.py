@@ -22,9 +22,9 @@ from trimesh.visual import interpolate
 from sim.crossing import GROUND_FRICTION, CrossingCfg, SolverCfg
 from sim.files.atomic import to_json, write_atomically
 from sim.files.npz import npz_bytes
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import SPACING
-from sim.terrains.maps.hfield import LEAST_EXTENT, QUARTER_TURN, as_hfield, surface_of
+from sim.terrains.maps.heightmap import LEAST_EXTENT, QUARTER_TURN, as_hfield, surface_of
+from sim.terrains.terrains import GroundMaps
 
 FORMATS = ("npz", "png", "npy", "xml", "stl", "glb", "sdf")
 """Formats by the ending of their files; ``xml`` is MJCF, ``sdf`` a model for Gazebo round the STL beside it."""

@@ -32,7 +32,7 @@ class TerrainSpace:
     genes_per_part: int | None = None
     """Genes of a part that can be exchanged for that of another terrain; None if it has no such parts."""
     ground: tuple[str, ...] = ()
-    """Maps that its terrains have beside heights, some of :data:`sim.terrains.ground.GROUND_KINDS`."""
+    """Maps that its terrains have beside heights, some of :data:`sim.terrains.terrains.GROUND_KINDS`."""
     conditions: tuple[str, ...] = ()
     """Conditions that it has genes of, some of :data:`sim.terrains.conditions.kinds.CONDITIONS`."""
     height_share: float = 1.0

@@ -18,12 +18,12 @@ from sim.device import host_device
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
 from sim.terrains.conditions.kinds import CONDITIONS
-from sim.terrains.ground import GROUND_KINDS, check_map
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import MAX_HEIGHT, Seed, ShippedSpace, TerrainSpace, clipped
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import WiderSpace
+from sim.terrains.terrains import GROUND_KINDS, check_map
 
 SPACES: dict[str, ShippedSpace] = {SUPER_GAUSSIAN.name: SUPER_GAUSSIAN, COURSE.name: COURSE}
 """Every shipped space by its name."""

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
 from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_genes, condition_texts
-from sim.terrains.ground import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
+from sim.terrains.terrains import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 
 _ABSENT = {"friction": 1.0, "softness": -1.0}  # the gene of ground that changes nothing
 _TITLES = {
@@ -29,7 +29,7 @@ class WiderSpace(TerrainSpace):
     """
 
     def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
-        """``kinds`` are some of :data:`sim.terrains.ground.GROUND_KINDS`, then conditions, in their order."""
+        """``kinds`` are some of :data:`sim.terrains.terrains.GROUND_KINDS`, then conditions, in their order."""
         self.inner, self.kinds, self.name = inner, kinds, "+".join((inner.name, *kinds))
         for name in ("sha256", "sigma0", "any_spacing", "height_share", "genes_per_part"):
             setattr(self, name, getattr(inner, name))

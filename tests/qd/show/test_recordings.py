@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from qd.show.recordings import Recordings, request_elite
-from sim.terrains.ground import GroundMaps
 from sim.terrains.spaces.registry import get_space
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 from tests.builders import small_archive
 from tests.qd.recordings import stand_in_cross
 

@@ -22,11 +22,10 @@ from sim.terrains.conditions.kinds import (
     nominal_row,
     round_steps,
 )
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.registry import get_space, load_space, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 from tests.sim.dogs import write_dog
 from tests.sim.plain_mujoco import cross_and_keep
 

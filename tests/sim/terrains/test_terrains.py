@@ -16,12 +16,11 @@ from sim.mujoco_c.model import GROUND, crossing_model
 from sim.rollout import Rollout
 from sim.terrains.bank import TerrainBank, make_heights, make_terrains
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
-from sim.terrains.ground import GroundMaps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 from tests.kernels import oracle
 from tests.sim.plain_mujoco import rays_from_above
 from tests.sim.scenes import FLAT, NODE_X, NODE_Y, Stepper, free_body, lying, positions, put, simulate, slope

@@ -11,7 +11,7 @@ import tyro
 from kernels.episode import Outcome
 from sim.robots.find import get_robot
 from sim.terrains.conditions.kinds import condition_column, nominal_row
-from sim.terrains.ground import GroundMaps
+from sim.terrains.terrains import GroundMaps
 from tests.sim.dogs import STAND, mjcf, write_dog
 from tests.train.conftest import CURRICULUM, NUM_ENVS
 from train.cfg import NoiseCfg, PpoCfg, TaskCfg, TrainCfg
