@@ -62,10 +62,7 @@ def way_to_end(outcome: int, fallen: bool) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Ranking(Evaluation):
-    """N elites by what is known best of each, in orders to show them in.
-
-    Values are those of fresh episodes where valid ones exist, else as found. Lower numbers have a higher fitness.
-    """
+    """N elites by what is known best of each: values of fresh episodes where valid ones exist, else as found."""
 
     numbers: NDArray[np.int64]
     """Number of each elite in the archive, shape (N,), ascending."""
@@ -127,10 +124,8 @@ class Ranking(Evaluation):
         return dict(sorted(rows.items(), key=lambda pair: (pair[0] == UNCLEAR, -len(pair[1]))))
 
     def by_severity(self) -> NDArray[np.int64]:
-        """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last.
-
-        Fitness alone does not order by failure: it prizes trouble that is the same in every episode.
-        """
+        """Rows by how badly the robot fares, shape (N,), the worst first: by verdict, rates, and fitness at last."""
+        # Fitness alone does not order by failure: it prizes trouble that is the same in every episode.
         return np.lexsort((-self.fitness, -self.fallen_rate, -self.collision_rate, self.goal_rate, -self.verdict))
 
     def order(self, by: str = "cause") -> NDArray[np.int64]:

@@ -65,10 +65,7 @@ class Judging:
 def open_judging(
     search: Search, compute: Compute, certifiers: Mapping[str, str] | None, *, ask: bool
 ) -> Iterator[Judging]:
-    """Tries the controller, and certifiers if they are to be asked, and keeps other commands out of the search's run.
-
-    Certifiers are those of :func:`qd.faults.searches.find_certifiers` if None. Crossings are kept in the run.
-    """
+    """Tries the controller, and certifiers if they are asked; keeps other commands out of the run, crossings in it."""
     check_policy(search.policy, search.robot, compute.device)
     certifiers = find_certifiers(search) if certifiers is None else certifiers
     if ask:
@@ -296,10 +293,7 @@ def judge(
 
 
 def find_seen(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
-    """Whether each certifier of a judged archive has trained on kin of each elite, shape (N, C).
-
-    None if the training record of one of them is not at hand.
-    """
+    """Whether each certifier has trained on kin of each elite, shape (N, C); None if a training record lacks."""
     marks = np.array(hash_elites(archive.genes))
     columns = []
     for name in archive.certifiers:

@@ -218,8 +218,7 @@ def open_case(
 def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) -> None:
     """Finds the minimal terrains of some elites, all of them together, by number of the elite.
 
-    All subsets of an elite are crossed from the same starts, fresh episodes from others. Starts follow from the
-    search's seed and from what names the elite.
+    All subsets of an elite are crossed from the same starts, fresh episodes from others.
     """
     search = judging.search
     seeds = {}

@@ -38,10 +38,7 @@ class Search:
 
 
 def find_search(run: Path, *, robot: str | None = None, policy: str | None = None, space: str | None = None) -> Search:
-    """The search of a run.
-
-    What has moved, or is code, must be named: the settings file of a robot, a controller, a terrain space.
-    """
+    """The search of a run; what has moved, or is code, must be named: a robot's settings, a controller, a space."""
     cfg = RunDirectory(run).read_cfg()
     if space is not None:
         load_space(space)  # a user's space, which the run's name then finds

@@ -88,17 +88,14 @@ class Cache:
 
 
 class StoredCrossings:
-    """Crossings in a cache by the digest of terrain and seed; ``settings`` is the hash of all else that they depend on.
-
-    Files are looked through once; those that other processes write later are not found.
-    """
+    """Crossings in a cache by the digest of terrain and seed; ``settings`` is the hash of all else they depend on."""
 
     def __init__(self, cache: Cache, settings: str, penalty_names: tuple[str, ...]) -> None:
         self._cache = cache
         self._settings = settings
         self._penalty_names = penalty_names
         self._index: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
-        for key in cache.keys(settings):
+        for key in cache.keys(settings):  # not those that other processes write later
             if stored := cache.read(key, [_ROWS]):
                 self._index.update({row.tobytes(): (key, number) for number, row in enumerate(stored[_ROWS])})
 

@@ -72,11 +72,7 @@ def report_invalid(result: RolloutResult, label: str, *, all_ok: bool = False) -
 
 
 def find_flaw(result: Any, count: int, replicas: int) -> str | None:
-    """Why a result cannot be one of ``count`` terrains, in words; None if it can.
-
-    Memory gone bad on another machine must not become a number in an archive: shapes, finite penalties of every valid
-    episode, and times that can be.
-    """
+    """Why a result cannot be one of ``count`` terrains; None if it can. Memory may go bad on another machine."""
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
     shape = (count, replicas)

@@ -39,7 +39,6 @@ class PipelineCfg:
 
     compute: Compute
     robot: RobotCfg | str
-    """The robot, or the name of a shipped one."""
     policy: str
     """Controller, as :func:`sim.controllers.loaders.load_policy` takes it."""
     num_terrains: int
