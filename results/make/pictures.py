@@ -122,7 +122,7 @@ def main() -> None:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())
     if "pages" in wanted:
-        subprocess.run([sys.executable, "-m", "tests.qd.show.view.screenshots"], check=True)
+        subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Any
 import viser
 
 from qd.show.recordings import Recordings
-from qd.show.view.panels import PlayerBar
+from qd.show.view.panels import PlayerBar, Selection
 from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.scene import SKY, compute_first_view, robot_shapes
 from qd.show.view.tab import Shared, Tab
@@ -37,19 +37,17 @@ class App:
     """The page and its tabs."""
 
     def __init__(self, show: ViewedRun, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
-        """Open the page; the recorder is closed with it."""
+        """Open the page."""
         self.tabs: dict[int, Tab] = {}
         self.bars: dict[int, PlayerBar] = {}
         self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
         recorder.robot = show.robot
         recorder.report = partial(self.post, self.show_progress)
-        first = int(show.ranking.order()[0]) if show.elite is None else show.elite
-        request = show.request(first, next(iter(show.controllers), None), minimal=show.minimal)
+        request = show.request(Selection(show).picked, next(iter(show.controllers), None), minimal=show.minimal)
         if request is not None and recordings.read(request) is None:
             recorder.request(request, key="first")  # before a page is open
         skeleton = Skeleton(show.robot)
-        shapes = robot_shapes(skeleton, show.robot)
-        self._shared = Shared(show, skeleton, shapes, recordings, recorder, self.post)
+        self._shared = Shared(show, skeleton, robot_shapes(skeleton, show.robot), recordings, recorder, self.post)
         self.page = Page(host=host, port=port, label="faultline", verbose=False)
         self.page.gui.configure_theme(show_logo=False, show_share_button=False)
         self.page.scene.set_up_direction("+z")
@@ -94,11 +92,6 @@ class App:
         for tab in self.tabs.values():
             tab.show_progress(progress)
 
-    def close(self) -> None:
-        """End process and page."""
-        self._shared.recorder.stop()
-        self.page.stop()
-
     def run(self) -> None:
         """Serve until interrupted."""
         last = time.perf_counter()
@@ -138,7 +131,7 @@ def serve(show: ViewedRun, recorder: Recorder, *, host: str, port: int, cache: P
     except KeyboardInterrupt:
         print("\nStopped.")
     finally:
-        app.close()
+        app.page.stop()
 
 
 def check_port(host: str, port: int) -> None:

@@ -1,16 +1,20 @@
-"""The panels of a tab, the archive left and the crossing right, with its selection and clock, and the bar below.
+"""The panels of a tab, the archive left and the crossing right, the bar below, a tab's selection, clock and address.
 
 A panel posts what a visitor does to the viewer's loop, which calls the :class:`qd.show.view.tab.Tab`.
 """
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, quote, urlencode
 
+import msgspec
 import numpy as np
 import viser
 from matplotlib.colors import to_hex
@@ -39,17 +43,18 @@ _KEYS = """- **Space** play or pause
 - **1** to **9** an episode
 - **N** **P** next or previous elite
 - **F** follow the robot, **O** overview"""
+_NAMES = {"time_s": "t", "position": "initialCameraPosition", "look_at": "initialCameraLookAt"}
 
 
 class Selection:
-    """The listed elites in their order, and the picked one: at first all, and the first."""
+    """The listed elites in their order, and the picked one: at first all, and the one to show first."""
 
     def __init__(self, show: ViewedRun) -> None:
         self._show = show
         self._choice: dict[str, str] = {}
         self.matching: NDArray[np.int64] = show.list_elites()
         """Numbers of the elites of the list, in their order."""
-        self.picked = int(self.matching[0])
+        self.picked = int(self.matching[0]) if show.elite is None else show.elite
         """Number of the elite that is shown; it stays when it is not listed any more."""
 
     def choose(self, **changes: str) -> None:
@@ -87,35 +92,68 @@ class Clock:
 
     def tick(self, real_s: float) -> None:
         """Let real time go by [s]."""
-        if self.playing and self.time_s < self.duration_s:
-            self.seek(self.time_s + self.speed * real_s)
-            self._waited_s = 0.0
-        elif self.playing:
-            self._waited_s += real_s
-            if self._waited_s >= _HOLD_S:
-                self.seek(self.begin_s)
+        if self.playing:
+            self._waited_s = self._waited_s + real_s if self.time_s >= self.duration_s else 0.0
+            self.seek(self.begin_s if self._waited_s >= _HOLD_S else self.time_s + self.speed * real_s)
 
-    def frame(self, dt: float, num_frames: int) -> int:
-        """Frame of the shown time among ``num_frames`` that are ``dt`` [s] apart."""
-        return int(np.clip(round(self.time_s / dt), 0, num_frames - 1))
+
+class Address(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, rename=_NAMES):
+    """What a tab shows, read when it opens and kept up to date while it is used; None or False where it is not said."""
+
+    elite: int | None = None
+    terrain: str | None = None
+    controller: str | None = None
+    ghost: str | None = None
+    episode: int | None = None
+    """Counted from 1."""
+    time_s: float | None = None
+    follow: bool = False
+    position: str | None = None
+    """Where the camera stands [m], ``x,y,z``; viser reads it too: its page begins there."""
+    look_at: str | None = None
+    """What the camera looks at [m]."""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.time_s or 0.0):
+            raise ValueError("a time must be finite")
+
+    def query(self) -> str:
+        """The address behind its question mark."""
+        values: dict[str, Any] = msgspec.to_builtins(self)
+        texts = {name: value if isinstance(value, str) else f"{value:.9g}" for name, value in values.items()}
+        return urlencode(texts, safe=",", quote_via=quote)
+
+
+def read_address(query: str) -> tuple[Address, list[str]]:
+    """The address of a page behind its question mark, and a sentence for each value that is no number."""
+    values = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True))
+    refused = []
+    for name, value in [*values.items()]:
+        try:
+            msgspec.convert({name: value}, Address, strict=False)
+        except msgspec.ValidationError:
+            refused.append(f"{name}={value} in the address is no number that makes sense: it is left out.")
+            del values[name]
+    return msgspec.convert(values, Address, strict=False), refused
 
 
 class ArchivePanel:
     """The archive's summary, the list of the chosen elites, and a map of where their episodes end."""
 
-    def __init__(self, client: viser.ClientHandle, selection: Selection, title: str, tab: Any) -> None:
+    def __init__(self, tab: Any) -> None:
         """Add the panel; a visitor's choices are posted to the ``tab``."""
-        gui = client.gui
-        self._selection = selection
-        self._run = show = tab.shared.show
+        gui = tab.client.gui
+        self._selection = tab.selection
+        self._run = show = tab.show
         panel = gui.add_panel()
         panel.dock_left()
         panel.set_width(_WIDTH)
         if tab.window[0] < _WIDE:
             panel.minimize()
         with panel.add_tab("Archive"):
-            summary = escape(summarise_search(show.ranking, show.archive))
-            gui.add_html(_small(f"{escape(title)}<br><b>{summary}.</b>"))
+            title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
+            summary = summarise_search(show.ranking, show.archive)
+            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary)}.</b>"))
             orders = {label: name for name, label in ORDERS.items()}
             choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", show.causes(), partial(choose, "cause"))
@@ -137,10 +175,11 @@ class ArchivePanel:
 class CrossingPanel:
     """The picked elite, its controllers, rates and penalties. Time is on the player bar."""
 
-    def __init__(self, client: viser.ClientHandle, controllers: Sequence[str], tab: Any) -> None:
+    def __init__(self, tab: Any) -> None:
         """Add the panel; a visitor's choices are posted to the ``tab``."""
-        gui = client.gui
+        gui = tab.client.gui
         post = tab.shared.post
+        controllers = tab.show.controllers
         if tab.window[0] >= PHONE:  # in a narrower window viser makes a sheet of all panels
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
@@ -153,12 +192,12 @@ class CrossingPanel:
         whole = {label: bool(k) for k, label in enumerate(TERRAINS)}
         self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
         self.rates = gui.add_html("")
-        names = tab.shared.show.archive.penalties
-        series = [uplot.Series(label=PENALTIES[name].label, stroke=PENALTIES[name].color, width=2.0) for name in names]
+        kinds = [PENALTIES[name] for name in tab.show.archive.penalties]
+        series = [uplot.Series(label=kind.label, stroke=kind.color, width=2.0) for kind in kinds]
         with gui.add_folder("Penalties so far, in multiples of their scales", expand_by_default=True):
             look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
-            nothing = (np.zeros(2),) * (1 + len(names))
-            self._curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
+            nothing = (np.zeros(2),) * (1 + len(kinds))
+            self.curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
         _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, compute_first_view)}, post)
         _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
         self.film_status = gui.add_html("")
@@ -179,14 +218,10 @@ class CrossingPanel:
 
     def show_curves(self, crossing: Crossing | None) -> None:
         """Show the penalties of a crossing over its time; ``page.js`` draws the line of the present."""
-        self._curves.visible = crossing is not None
+        self.curves.visible = crossing is not None
         if crossing is not None:
-            chosen = np.unique(np.linspace(0, crossing.num_frames - 1, _CURVE_POINTS).astype(int))
-            self._curves.data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
-
-    def stretch_curves(self, duration_s: float) -> None:
-        """Have the curves' time last as long as the bar's [s]."""
-        self._curves.scales = {"x": uplot.Scale(time=False, range=(0.0, max(duration_s, 0.02)))}
+            chosen = np.unique(np.linspace(0, len(crossing.penalties) - 1, _CURVE_POINTS).astype(int))
+            self.curves.data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
 
 
 class PlayerBar:
@@ -206,17 +241,14 @@ class PlayerBar:
         panel.expand()
         with panel.add_tab("player bar"):
             client.gui.add_html('<i class="faultline-channel"></i>')
-            field = client.gui.add_text("channel", "")
-        field.on_update(lambda event: self._receive(field.value) if event.client is not None else None)
+            client.gui.add_text("channel", "").on_update(self._receive)
         self._run(_SCRIPT)
 
-    def _receive(self, text: str) -> None:
-        try:
-            _, actions = json.loads(text)
+    def _receive(self, event: viser.GuiEvent[Any]) -> None:
+        with suppress(ValueError, TypeError, AttributeError):  # anybody may write into the field
+            _, actions = json.loads(event.target.value)
             for name, value in actions.items():
                 self._act(name, value)
-        except (ValueError, TypeError, AttributeError):  # anybody may write into the field
-            return
 
     def show(self, values: Mapping[str, Any]) -> None:
         """Show values by their names in ``page.js``; only changed ones are sent."""
@@ -239,11 +271,9 @@ def _small(text: str) -> str:
     return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 
-def _add_choice(
-    gui: Any, label: str, options: Mapping[str, Any], act: Callable[[Any], None], hint: str | None = None
-) -> Any:
+def _add_choice(gui: Any, label: str, options: Mapping[str, Any], act: Callable[[Any], None], hint: str = "") -> Any:
     """A choice among values by their label."""
-    chooser = gui.add_dropdown(label, tuple(options), hint=hint)
+    chooser = gui.add_dropdown(label, tuple(options), hint=hint or None)
     # Only what a visitor sets, and not what this program sets.
     chooser.on_update(lambda event: act(options[event.target.value]) if event.client is not None else None)
     return chooser

@@ -1,6 +1,6 @@
 """One crossing as it is shown: bodies, touches, forces, command and penalties at every frame, and what happens when."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -46,10 +46,9 @@ class Crossing:
     failure_s: float
     """When it went wrong [s] (:func:`qd.show.crossed.find_failure_time`)."""
 
-    @property
-    def num_frames(self) -> int:
-        """F."""
-        return len(self.positions)
+    def find_frame(self, time_s: float) -> int:
+        """The frame of a time, no further than the last."""
+        return min(round(time_s / self.dt), len(self.positions) - 1)
 
 
 def trace_crossing(
@@ -66,8 +65,8 @@ def trace_crossing(
     duration_s = float(recording.duration_s[0, replica])
     positions, quaternions = skeleton.body_poses(qpos)
     newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
-    size = np.linalg.norm(newtons, axis=-1)
-    arrows = np.where(size[..., None] >= _LEAST_FORCE, _FORCE_LENGTH * newtons, 0.0)
+    is_shown = np.linalg.norm(newtons, axis=-1, keepdims=True) >= _LEAST_FORCE
+    arrows = np.where(is_shown, _FORCE_LENGTH * newtons, 0.0)
     shapes = [skeleton.model.geom(name) for name in recording.foot_names]
     bodies = [foot.bodyid[0] - 1 for foot in shapes]
     offsets = [_rotation(quaternions[:, body]).apply(foot.pos) for body, foot in zip(bodies, shapes, strict=True)]
@@ -123,18 +122,12 @@ def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], .
 
 def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
     """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
-    endings = list(map(get_ending, recording.outcome[0].tolist()))
-    return [
-        (
-            f"{count} of {len(endings)}: {ending.label}",
-            [
-                (k + 1, f"episode {k + 1}: {describe_ending(recording, k)}")
-                for k, other in enumerate(endings)
-                if other == ending
-            ],
-        )
-        for ending, count in Counter(endings).most_common()
-    ]
+    groups = defaultdict[str, list[tuple[int, str]]](list)
+    for k, outcome in enumerate(recording.outcome[0].tolist()):
+        groups[get_ending(outcome).label].append((k + 1, f"episode {k + 1}: {describe_ending(recording, k)}"))
+    replicas = recording.outcome.shape[1]
+    commonest_first = sorted(groups.items(), key=lambda group: -len(group[1]))
+    return [(f"{len(members)} of {replicas}: {label}", members) for label, members in commonest_first]
 
 
 def _rotation(quaternions: NDArray[np.floating]) -> Rotation:
@@ -142,12 +135,9 @@ def _rotation(quaternions: NDArray[np.floating]) -> Rotation:
     return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
 
 
-def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, int, int]]]:
+def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, ...]]]:
     """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
-    paths = []
-    for frames, outcome, positions in zip(
-        recording.num_frames[0].tolist(), recording.outcome[0], recording.base_position[0], strict=True
-    ):
-        chosen = np.unique([*range(0, frames, every), frames - 1]) if frames else []
-        paths.append((positions[chosen], ImageColor.getrgb(get_ending(outcome).color)))
-    return paths
+    outcomes = recording.outcome[0].tolist()
+    colors = [ImageColor.getrgb(get_ending(outcome).color) for outcome in outcomes]
+    chosen = [[*range(0, last, every), last] if last >= 0 else [] for last in (recording.num_frames[0] - 1).tolist()]
+    return [(recording.base_position[0, k, chosen[k]], color) for k, color in enumerate(colors)]

@@ -5,6 +5,7 @@ The process takes seconds to load the simulation, so it starts before the page, 
 
 import threading
 from collections.abc import Callable, Hashable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
@@ -30,10 +31,6 @@ class TaskProgress:
     failed: bool = False
 
 
-class _CancelledError(Exception):
-    """The task was cancelled."""
-
-
 class RecordingWorker:
     """Works in the process: it does the task that is put in, and drops it when ``cancelled`` is set."""
 
@@ -56,7 +53,7 @@ class RecordingWorker:
         def report(share: float) -> None:
             progress(share)
             if self._cancelled.is_set():
-                raise _CancelledError
+                raise CancelledError
 
         try:
             if isinstance(self._task, partial):
@@ -64,7 +61,7 @@ class RecordingWorker:
                 return self._task.keywords["out"]
             self._crosser = self._crosser or self._make_crosser(self._robot, "cpu")
             return self._crosser([self._task], report)[0]
-        except _CancelledError:
+        except CancelledError:
             return None
         except (ValueError, OSError) as error:
             return error
@@ -149,11 +146,9 @@ class Recorder:
         """Result of a task, its error, or None if it was cancelled."""
         if not self._is_ready:
             self.report(TaskProgress(task=task, text=_PREPARING))
-            self._worker.receive()  # it is ready
-            self._is_ready = True
         self._worker.send(task, self.robot)
-        while True:
-            message, value = self._worker.receive()
-            if message == "result":
-                return value
-            self.report(TaskProgress(task=task, share=float(value)))
+        while (message := self._worker.receive())[0] != "result":
+            self._is_ready = True
+            if message[0] == "progress":
+                self.report(TaskProgress(task=task, share=message[1]))
+        return message[1]

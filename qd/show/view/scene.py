@@ -28,27 +28,22 @@ FORCE_COLOR = (0.84, 0.10, 0.11)
 """Arrows of contact forces, RGB, 0 to 1."""
 COMMAND_COLOR = (0.0, 0.62, 0.45)
 """Arrow of the commanded velocity."""
-_START_COLOR = (255, 255, 255)
 _GOAL_COLOR = (0, 158, 115)
-_WAY_COLOR = (240, 200, 60)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
 """Background, blue above and pale below, as an image of one column."""
 _BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
-_PATH_WIDTH = 1.2  # [pixels]
 _WAY_LIFT = 0.03  # over the ground [m]
 _POST_HEIGHT = 1.0
 _POST_RADIUS = 0.03
 _START_RADIUS = 0.25
 _DISC: Any = {"height": 0.02, "opacity": 0.5, "cast_shadow": False}
-_GHOST_OPACITY = 0.4
 _GHOST_NAME_HEIGHT = 0.35  # over its base [m]
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Where the camera stands and what it looks at [m]."""
-_LINE_EVERY = 1.0  # [m]
 _LINE_DARKNESS = 0.84
 _SEGMENTS = 20  # round an arrow
 
@@ -71,20 +66,6 @@ def in_linear_light(colors: NDArray[np.integer]) -> NDArray[np.uint8]:
     return np.rint(255.0 * linear).astype(np.uint8)
 
 
-def terrain_mesh(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> trimesh.Trimesh:
-    """The surface that the robot walks on, triangle by triangle: blue below 0, brown above, a darker line every metre.
-
-    Friction and softness of the ``ground`` tint it. The height grid [m] has shape (nrow, ncol), row along y.
-    """
-    vertices, faces = surface_of(heights)
-    color = height_colors(heights)
-    color = 255.0 * (color if ground is None else tinted(color, ground))
-    every = round(_LINE_EVERY / SPACING)
-    color[::every] *= _LINE_DARKNESS
-    color[:, ::every] *= _LINE_DARKNESS
-    return _mesh(vertices, faces, color.reshape(-1, 3).astype(np.uint8))
-
-
 def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: NDArray[np.integer]) -> trimesh.Trimesh:
     """Triangles with a colour (sRGB) a vertex, or one of all."""
     colors = np.broadcast_to(in_linear_light(colors), (len(vertices), 3))
@@ -104,12 +85,6 @@ def arrow_mesh() -> trimesh.Trimesh:
     shaft = trimesh.creation.cylinder(radius=0.02, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=_SEGMENTS)
     head = trimesh.creation.cone(radius=0.05, height=0.25, sections=_SEGMENTS)
     return _joined([shaft, head.apply_translation([0.0, 0.0, 0.75])])
-
-
-def arrow_pose(begin: NDArray[np.floating], end: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """Quaternion w x y z that turns z into the way from one point to another, and the length of that [m], not 0."""
-    turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end - begin)
-    return trimesh.transformations.quaternion_from_matrix(turn), float(np.linalg.norm(end - begin))
 
 
 def robot_shapes(skeleton: Skeleton, robot: RobotCfg) -> list[BodyShape]:
@@ -161,7 +136,7 @@ class Scene:
             self.touched.append(self._add_mesh(f"{name}-touched", shape.mesh, color, cast_shadow=True))
         self.ghost, self.ghost_bodies = self._add_bodies("/ghost")
         self._ghost_name = scene.add_label("/ghost/name", "", anchor="bottom-center")
-        self._ghost_shapes: list[Any] = []  # from when there is a ghost
+        self._has_ghost = False  # its shapes are sent with the first one
         # Meshes that are moved, as the bodies are: arrows of changing points stay behind in the browser at times.
         arrow = arrow_mesh()
         self.forces = [self._add_mesh(f"/forces/{k}", arrow, FORCE_COLOR) for k in range(num_feet)]
@@ -177,16 +152,24 @@ class Scene:
         return whole, [add(f"{name}/{k}", show_axes=False) for k in range(self._num_bodies)]
 
     def set_terrain(self, heights: NDArray[np.floating], ground: GroundMaps | None = None) -> None:
-        """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), and friction and softness."""
+        """Show another terrain and no crossing on it: heights [m], shape (nrow, ncol), row along y.
+
+        It is blue below 0 and brown above, with a darker line every metre; friction and softness tint it.
+        """
         start = CrossingCfg.start
         goal = CrossingCfg.goal
         scene = self._client.scene
+        color = height_colors(heights)
+        color = 255.0 * (color if ground is None else tinted(color, ground))
+        every = round(1.0 / SPACING)
+        color[::every] *= _LINE_DARKNESS
+        color[:, ::every] *= _LINE_DARKNESS
+        surface = _mesh(*surface_of(heights), color.reshape(-1, 3).astype(np.uint8))
         with self._client.atomic():
             self.hide_crossing()
-            mesh = terrain_mesh(heights, ground)
-            scene.add_mesh_trimesh("/terrain", mesh, cast_shadow=False, receive_shadow=0.45)
+            scene.add_mesh_trimesh("/terrain", surface, cast_shadow=False, receive_shadow=0.45)
             low, high = surface_heights(heights, *np.array([start, goal]).T).tolist()
-            scene.add_cylinder("/start/disc", _START_RADIUS, color=_START_COLOR, position=(*start, low), **_DISC)
+            scene.add_cylinder("/start/disc", _START_RADIUS, color=(255, 255, 255), position=(*start, low), **_DISC)
             before = (start[0] - _START_RADIUS, start[1], low)
             scene.add_label("/start/label", "start", position=before, anchor="top-center")
             radius = CrossingCfg.goal_radius
@@ -197,14 +180,12 @@ class Scene:
             way = np.linspace(start, goal, round(math.dist(start, goal) / SPACING) + 1)  # along the ground
             points = np.column_stack([way, surface_heights(heights, *way.T) + _WAY_LIFT])
             dashes = np.stack([points[:-1], points[1:]], axis=1)[::2]
-            scene.add_line_segments("/way/line", dashes, colors=_WAY_COLOR, thickness=0.02)
+            scene.add_line_segments("/way/line", dashes, colors=(240, 200, 60), thickness=0.02)
 
     def hide_crossing(self) -> None:
         """Show the terrain alone."""
-        self.robot.visible = False
-        self.ghost.visible = False
         self._followed = None
-        for handle in (*self.forces, self._command):
+        for handle in (self.robot, self.ghost, self._command, *self.forces):
             handle.visible = False
         self.set_paths(())
 
@@ -216,7 +197,7 @@ class Scene:
         ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
         colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
         if paths:
-            look: Any = {"thickness": _PATH_WIDTH, "thickness_units": "screen", "visible": not self.follow}
+            look: Any = {"thickness": 1.2, "thickness_units": "screen", "visible": not self.follow}
             light = in_linear_light(np.concatenate(colors))
             self.paths = [self._client.scene.add_line_segments("/paths", np.concatenate(ends), colors=light, **look)]
 
@@ -226,7 +207,7 @@ class Scene:
         for handle in self.paths:
             handle.visible = not follow  # near the robot, paths would hide it
         if follow and self._followed is not None:
-            self._go_near(self._followed)
+            self.go_to((tuple(self._followed + _BEHIND), tuple(self._followed)))
 
     def show_frame(self, crossing: Crossing, frame: int) -> None:
         """Put the robot where it is at a frame of a crossing, with what touches, its forces and command."""
@@ -236,13 +217,13 @@ class Scene:
             for shape, alone, touched in zip(self._shapes, self.shapes, self.touched, strict=True):
                 touched.visible = bool(crossing.touching[frame, list(shape.touches)].any())
                 alone.visible = not touched.visible
-            _set_arrow(self._command, crossing.command[frame])
+            set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
-                _set_arrow(handle, arrow)
+                set_arrow(handle, arrow)
         before = self._followed
         self._followed = base = crossing.positions[frame, 0].copy()
         if self.follow and before is None:
-            self._go_near(base)
+            self.set_follow(True)
         elif self.follow:
             camera = self._client.camera
             camera.position = camera.position + (base - before)  # what it looks at goes with it
@@ -250,11 +231,10 @@ class Scene:
     def show_ghost(self, crossing: Crossing, frame: int, label: str = "") -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""
         with self._client.atomic():
-            if not self._ghost_shapes:
-                for k, shape in enumerate(self._shapes):
-                    name = f"/ghost/{shape.body}/{k}"
-                    look = {"opacity": _GHOST_OPACITY, "visible": True}
-                    self._ghost_shapes.append(self._add_mesh(name, shape.mesh, OTHER_CONTROLLER, **look))
+            for k, shape in enumerate(() if self._has_ghost else self._shapes):
+                name = f"/ghost/{shape.body}/{k}"
+                self._add_mesh(name, shape.mesh, OTHER_CONTROLLER, opacity=0.4, visible=True)
+            self._has_ghost = True
             self.ghost.visible = True
             _move_bodies(self.ghost_bodies, crossing, frame)
             self._ghost_name.text = label
@@ -264,12 +244,8 @@ class Scene:
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:
         """A shape of one colour; by default invisible and without shadow."""
         look = {"visible": False, "cast_shadow": False, "receive_shadow": False} | look
-        return self._client.scene.add_mesh_simple(
-            name, np.asarray(mesh.vertices), np.asarray(mesh.faces), color=color, **look
-        )
-
-    def _go_near(self, base: Points) -> None:
-        self.go_to((tuple(base + _BEHIND), tuple(base)))
+        shape: Any = (np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        return self._client.scene.add_mesh_simple(name, *shape, color=color, **look)
 
     def go_to(self, view: View) -> None:
         """Move the camera."""
@@ -284,10 +260,12 @@ def _move_bodies(bodies: Sequence[Any], crossing: Crossing, frame: int) -> None:
         handle.wxyz = tuple(turn)
 
 
-def _set_arrow(handle: Any, arrow: Points) -> None:
-    """Show an arrow from one point to another, shape (2, 3), unless it has no length."""
-    handle.visible = bool(np.any(arrow[0] != arrow[1]))
+def set_arrow(handle: Any, arrow: Points) -> None:
+    """Show an :func:`arrow_mesh` from one point to another, shape (2, 3), unless it has no length."""
+    way = arrow[1] - arrow[0]
+    handle.visible = bool(way.any())
     if handle.visible:
-        handle.wxyz, length = arrow_pose(arrow[0], arrow[1])
+        turn = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], way)
+        handle.wxyz = trimesh.transformations.quaternion_from_matrix(turn)
         handle.position = tuple(arrow[0])
-        handle.scale = (1.0, 1.0, length)
+        handle.scale = (1.0, 1.0, float(np.linalg.norm(way)))

@@ -11,12 +11,21 @@ from typing import Any
 
 import viser
 
+from qd.faults.families import VERDICTS
 from qd.search.directory import output_folder
 from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
 from qd.show.recordings import CrossingRequest, Recordings
-from qd.show.view.address import MINIMAL, Address, read_address
-from qd.show.view.panels import TERRAINS, ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
+from qd.show.view.panels import (
+    TERRAINS,
+    Address,
+    ArchivePanel,
+    Clock,
+    CrossingPanel,
+    PlayerBar,
+    Selection,
+    read_address,
+)
 from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
 from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.scene import BodyShape, Scene, View, compute_first_view, compute_overview
@@ -48,27 +57,27 @@ class Shared:
     """Has the loop call a function with arguments."""
 
 
+@dataclass(eq=False)
 class ShownController:
     """The controller that is shown, or the ghost beside it."""
 
-    def __init__(self, shared: Shared, key: Hashable) -> None:
-        """No controller yet. The recorder works on the last request of each ``key``."""
-        self._shared = shared
-        self._key = key
-        self.name: str | None = None
-        self.request: CrossingRequest | None = None
-        self.recording: Recording | None = None
-        self.crossing: Crossing | None = None
+    shared: Shared
+    key: Hashable
+    """The recorder works on the last request of each."""
+    name: str | None = None
+    request: CrossingRequest | None = None
+    recording: Recording | None = None
+    crossing: Crossing | None = None
 
     def load(self, elite: int, name: str | None, *, minimal: bool = False) -> None:
         """Load the recording of another elite or controller, or request it."""
         self.name = name
         self.recording = None
         self.crossing = None
-        self.request = self._shared.show.request(elite, name, minimal=minimal)
+        self.request = self.shared.show.request(elite, name, minimal=minimal)
         if self.request is not None:
-            self.recording = self._shared.recordings.read(self.request)
-        self._shared.recorder.request(self.request if self.recording is None else None, key=self._key)
+            self.recording = self.shared.recordings.read(self.request)
+        self.shared.recorder.request(self.request if self.recording is None else None, key=self.key)
 
     def take(self, progress: TaskProgress) -> bool:
         """Take the recording, if it is done; returns whether the progress is of this controller's request."""
@@ -79,10 +88,9 @@ class ShownController:
 
     def show_episode(self, replica: int) -> None:
         """Trace an episode, counted from 0, if one is recorded."""
-        show = self._shared.show
         self.crossing = None
         if self.recording is not None:
-            self.crossing = trace_crossing(self.recording, replica, self._shared.skeleton, show.scales)
+            self.crossing = trace_crossing(self.recording, replica, self.shared.skeleton, self.shared.show.scales)
 
 
 class Tab:
@@ -114,9 +122,8 @@ class Tab:
         self.robot = ShownController(shared, client.client_id)
         self.ghost = ShownController(shared, (client.client_id, "ghost"))
         self.scene = Scene(client, shared.shapes, shared.skeleton.num_bodies, len(show.robot.foot_geoms))
-        title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
-        self.list = ArchivePanel(client, self.selection, title, self)
-        self.panel = CrossingPanel(client, list(show.controllers), self)
+        self.list = ArchivePanel(self)
+        self.panel = CrossingPanel(self)
         self.go_to(query)
 
     def act(self, name: str, value: Any) -> None:
@@ -129,7 +136,7 @@ class Tab:
             "follow": (bool, self.set_follow),
             "overview": (bool, lambda _: self.overview()),
             "pick": (str, self.pick),
-            "step": (int, self.step),
+            "step": (int, lambda by: self.pick(self.selection.step(by))),  # the next (1) or previous (-1)
             "resize": (list, self.resize),
             "open": (str, self.go_to),
         }
@@ -151,11 +158,10 @@ class Tab:
         address, refused = read_address(query)
         for text in refused:
             self.refuse(text)
-        first = self.selection.picked if show.elite is None else show.elite
-        elite = first if address.elite is None else address.elite
-        if not 0 <= elite < len(self.show.archive):
+        elite = self.selection.picked if address.elite is None else address.elite
+        if not 0 <= elite < len(show.archive):
             self._refuse_elite(elite)
-            elite = first
+            elite = self.selection.picked
         for name, choices in ((address.controller, show.controllers), (address.ghost, self.ghost_choices)):
             if name is not None and name not in choices:
                 self.refuse(f"There is no controller '{name}' here: there are {', '.join(show.controllers) or 'none'}.")
@@ -164,7 +170,7 @@ class Tab:
             self.panel.controller.value = address.controller
         if address.ghost in self.ghost_choices:
             self.ghost_choice = address.ghost
-        is_minimal = address.terrain == MINIMAL
+        is_minimal = address.terrain == TERRAINS[1]
         self._prefers_minimal = is_minimal or (address.elite is None and show.minimal)
         if is_minimal and show.minimal_genes(elite) is None:
             self.refuse(f"Elite {elite} has no minimal terrain here.")
@@ -209,7 +215,7 @@ class Tab:
             elite=self.selection.picked,
             controller=self.controller,
             ghost=None if self.ghost_choice == CERTIFIER else self.ghost_choice,
-            terrain=MINIMAL if self.minimal else None,
+            terrain=TERRAINS[1] if self.minimal else None,
             episode=None if self.replica is None else self.replica + 1,
             time_s=time_s if time_s is None else round(time_s, 2),
             follow=self.scene.follow,
@@ -292,10 +298,6 @@ class Tab:
         """Show the whole terrain, and stop following."""
         self.set_follow(False)
         self.look(compute_overview)
-
-    def step(self, by: int) -> None:
-        """Show the next (1) or previous (-1) elite of the list."""
-        self.pick(self.selection.step(by))
 
     def pick(self, text: str | int) -> None:
         """Show the elite of a number, just before the robot fails, or refuse the number."""
@@ -382,7 +384,9 @@ class Tab:
         minimal_genes = show.minimal_genes(elite)
         genes = minimal_genes if self.minimal and minimal_genes is not None else self.show.archive.genes[elite]
         conditions = show.space.condition_text(genes)
-        facts = filter(None, (f"elite {elite} of {len(self.show.archive):,}", show.verdict(elite), conditions))
+        facts = filter(
+            None, (f"elite {elite} of {len(self.show.archive):,}", VERDICTS[show.ranking.verdict[elite]], conditions)
+        )
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
         text = f"<b>{escape(name)}</b><br>{' · '.join(facts)}"
         self.panel.head.content = f'<div style="padding:0 0.6em 0.4em">{text}</div>'
@@ -394,14 +398,9 @@ class Tab:
 
     def _show_rates(self) -> None:
         """Show how episodes ended: those of the archive on the whole terrain, and recorded ones of other crossings."""
-        recorded = [self.robot] if self.controller != SEARCHED else []
-        columns = [*self.show.columns(self.selection.picked)]
-        if self.minimal:
-            recorded = [self.robot, self.ghost]
-            columns = []
-        for controller in recorded:
-            if controller.recording is not None:
-                columns.append(count_endings(str(controller.name), controller.recording))
+        columns = [] if self.minimal else [*self.show.columns(self.selection.picked)]
+        recorded = [self.robot, self.ghost] if self.minimal else [self.robot] * (self.controller != SEARCHED)
+        columns += [count_endings(str(one.name), one.recording) for one in recorded if one.recording is not None]
         self.panel.show_rates(columns)
 
     def _load_ghost(self) -> None:
@@ -437,7 +436,7 @@ class Tab:
             note = f"Ghost, {self.ghost.name}{in_episode}: {ghost.ending}"
         self.clock.duration_s = duration_s
         self.clock.seek(self.clock.time_s)
-        self.panel.stretch_curves(duration_s)
+        self.panel.curves.scales = {"x": {"time": False, "range": (0.0, max(duration_s, 0.02))}}
         self.bar.show({"duration": duration_s, "status": escape(" · ".join(filter(None, (crossing.ending, note))))})
         self._show_frame()
 
@@ -489,9 +488,9 @@ class Tab:
 
     def _show_frame(self) -> None:
         if (crossing := self.robot.crossing) is not None:
-            self.scene.show_frame(crossing, self.clock.frame(crossing.dt, crossing.num_frames))
+            self.scene.show_frame(crossing, crossing.find_frame(self.clock.time_s))
             if (ghost := self.ghost.crossing) is not None:
-                self.scene.show_ghost(ghost, self.clock.frame(ghost.dt, ghost.num_frames), self.ghost.name or "")
+                self.scene.show_ghost(ghost, ghost.find_frame(self.clock.time_s), self.ghost.name or "")
 
     def _show_time(self) -> None:
         self.bar.show({"time": round(self.clock.time_s, 3), "playing": self.clock.playing})

@@ -105,14 +105,11 @@ class ViewedRun(OpenedRun):
         rows = self.ranking.by_cause()
         return {"all": "", **{f"{cause} ({len(members):,})": cause for cause, members in rows.items()}}
 
-    def verdict(self, number: int) -> str:
-        """One of :data:`qd.faults.families.VERDICTS`."""
-        return VERDICTS[int(self.ranking.verdict[number])]
-
     def render_list(self, listed: NDArray[np.int64], picked: int) -> str:
         """HTML of the elites, one below the other; a click on one shows it (``page.js``)."""
+        verdicts = [VERDICTS[verdict] for verdict in self.ranking.verdict.tolist()]
         template = TEMPLATES.get_template("list.html")
-        return template.render(run=self, names=self._names, listed=listed.tolist(), picked=picked)
+        return template.render(names=self._names, verdicts=verdicts, listed=listed.tolist(), picked=picked)
 
     def render_map(self, listed: NDArray[np.int64], picked: int) -> str:
         """HTML of a map of where the typical episode of each elite ends; a click on one shows it (``page.js``)."""
@@ -132,19 +129,17 @@ class ViewedRun(OpenedRun):
         """Episodes on the whole terrain: fresh, finer contact, varied conditions, and of the best certifier."""
         ranking = self.ranking
         archive = self.archive
+        first = "fresh" if ranking.is_fresh[number] else "as found"
         hits = {name: ranking.hits(name, number) for name in _RATES}
-        columns: list[Column] = [
-            ("fresh" if ranking.is_fresh[number] else "as found", int(ranking.counted[number]), hits)
-        ]
-        outcomes_by_head = {"finer contact": archive.resolved_outcomes[number]}
+        columns: list[Column] = [(first, int(ranking.counted[number]), hits)]
+        further = {"finer contact": archive.resolved_outcomes[number]}
         if archive.varied_outcomes is not None:
-            outcomes_by_head["varied"] = archive.varied_outcomes[number]
+            further["varied"] = archive.varied_outcomes[number]
         if name := best_certifier(archive, number):
-            outcomes_by_head[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
-        for head, outcomes in outcomes_by_head.items():
-            if outcomes.any():
-                hits = dict(zip([*_RATES][:3], outcomes.tolist()[:3], strict=True))
-                columns.append((head, sum(hits.values()), hits))
+            further[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
+        for head, ends in further.items():
+            if ends.any():
+                columns.append((head, int(ends[:3].sum()), dict(zip(_RATES, ends[:3].tolist(), strict=False))))
         return columns
 
     def details(self, number: int) -> str:

@@ -1,5 +1,11 @@
-"""The viewer as a user begins it, a tab without a browser, and chromium without a screen driven by playwright."""
+"""The viewer as a user begins it, a tab without a browser, and chromium without a screen driven by playwright.
 
+``python -m tests.qd.show.view.browser [--report PAGE]`` takes pictures of the viewer, with the published archive of
+ANYmal, and of the report's top.
+"""
+
+import argparse
+import io
 import shutil
 import signal
 import subprocess
@@ -14,14 +20,17 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 import viser
+from PIL import Image
 from websockets.sync.client import ClientConnection, connect
 
 from tests.builders import free_port
 
 ROOT = Path(__file__).parents[4]
+DOCS = ROOT / "docs" / "pictures"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 LIMIT_MS = 120_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
+SETTLE_MS = 4000  # for the last frames of a browser that draws without a GPU
 WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -90,3 +99,36 @@ def wait_for(page, script):
 def until_it_plays(page):
     """Waits until the robot plays."""
     wait_for(page, "button === 'Pause'")
+
+
+def take(page, file: Path) -> None:
+    """Writes what a page shows."""
+    for close in page.locator(".mantine-Notification-closeButton").all():  # such as that there is no GPU
+        close.click()
+    page.wait_for_timeout(SETTLE_MS)
+    Image.open(io.BytesIO(page.screenshot(timeout=LIMIT_MS))).convert("RGB").save(file, quality=78)
+    print(file, flush=True)
+
+
+def main() -> None:
+    """Takes all pictures."""
+    flags = argparse.ArgumentParser(description=__doc__)
+    flags.add_argument("--report", type=Path, help="a page that `faultline report` wrote")
+    report = flags.parse_args().report
+    with open_chromium() as browser:
+        with serve("--run", "results/anymal/archive") as address:
+            page = browser.new_page(viewport={"width": 1366, "height": 768})
+            page.goto(address, timeout=LIMIT_MS)
+            until_it_plays(page)
+            wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
+            page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
+            page.keyboard.press("Space")
+            take(page, DOCS / "viewer.jpg")
+        if report is not None:
+            page = browser.new_page(viewport={"width": 1400, "height": 1400})
+            page.goto(report.absolute().as_uri())
+            take(page, DOCS / "report.jpg")
+
+
+if __name__ == "__main__":
+    main()

@@ -22,9 +22,9 @@ from tests.qd.show.view.browser import visit
 
 
 @pytest.fixture(scope="module")
-def show(anymal, run):
+def show(anymal, published):
     policies = (f"base=shipped other={anymal.policy_file}",)
-    return open_viewed_run(run, elite="0", policies=policies)
+    return open_viewed_run(published / "anymal" / "archive", elite="0", policies=policies)
 
 
 def wanted_of(recorder):
@@ -68,7 +68,7 @@ class Shown:
     def close(self):
         for socket in self.sockets:
             socket.close()
-        self.app.close()
+        self.app.page.stop()
 
 
 @pytest.fixture(scope="module")

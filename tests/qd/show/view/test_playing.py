@@ -1,4 +1,5 @@
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from kernels.episode import Outcome
 from qd.show.view.playing import find_marks, group_episodes, trace_crossing, trace_paths
-from qd.show.view.scene import arrow_mesh, arrow_pose, robot_shapes
+from qd.show.view.scene import arrow_mesh, robot_shapes, set_arrow
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
@@ -38,7 +39,7 @@ def recording():
 def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     names = recording.penalty_names[::-1]
     crossing = trace_crossing(recording, 0, skeleton, dict.fromkeys(names, 2.0))
-    assert (crossing.num_frames, crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
+    assert (len(crossing.positions), crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
     np.testing.assert_allclose(crossing.positions[3, 0], [2.3, 4.0, 0.0], atol=1e-6)
     # penalty j sums j + 1 a frame; shown in the order asked for, divided by 2
     np.testing.assert_allclose(crossing.penalties[2], np.arange(len(names), 0, -1.0))
@@ -46,6 +47,7 @@ def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     assert (first[:, 0] == first[:, 1]).all()  # none at the start
     np.testing.assert_allclose(last[0, 1] - last[0, 0], [0.0, 0.0, 0.5])  # 500 N
     assert (last[1:, 0] == last[1:, 1]).all()
+    assert [crossing.find_frame(time_s) for time_s in (0.0, 0.021, 99.0)] == [0, 1, FRAMES - 1]
     assert trace_crossing(recording, 2, skeleton, {}) is None  # it broke at once
 
 
@@ -106,7 +108,9 @@ def test_each_part_of_a_robot_shows_one_touch(robot):
 
 def test_an_arrow_points_from_its_beginning_to_its_end():
     begin, way = np.array([1.0, 2.0, 3.0]), np.array([0.3, -0.4, 1.2])
-    quaternion, length = arrow_pose(begin, begin + way)
+    arrow = SimpleNamespace()
+    set_arrow(arrow, np.stack([begin, begin + way]))
+    assert arrow.visible and arrow.position == (1.0, 2.0, 3.0)
     np.testing.assert_allclose(arrow_mesh().bounds[:, 2], [0.0, 1.0], atol=1e-6)
-    turn = Rotation.from_quat(np.roll(quaternion, -1))
-    np.testing.assert_allclose(turn.apply([0.0, 0.0, length]), way, atol=1e-5)
+    turn = Rotation.from_quat(np.roll(arrow.wxyz, -1))
+    np.testing.assert_allclose(turn.apply([0.0, 0.0, arrow.scale[2]]), way, atol=1e-5)

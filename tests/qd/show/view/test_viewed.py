@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from qd.search.archive import write_archive
-from qd.show.view.address import Address, read_address
 from qd.show.view.app import check_port
-from qd.show.view.panels import Clock, Selection
+from qd.show.view.panels import Address, Clock, Selection, read_address
 from qd.show.view.viewed import ViewedRun, count_endings, open_viewed_run, render_rates
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
@@ -21,6 +20,20 @@ from tests.qd.recordings import recording_of
 
 def list_archive(archive, robot):
     return ViewedRun(path=Path(), archive=archive, robot=robot, controllers={})
+
+
+@pytest.fixture
+def run(published):
+    return published / "anymal" / "archive"
+
+
+@pytest.fixture
+def show(anymal):
+    """Twenty elites whose goal rate is their number / 20, and collision rate 1 where the number is odd."""
+    numbers = np.arange(20)
+    rates = {"goal_rate": numbers / 20, "collision_rate": (numbers % 2).astype(float)}
+    values = {"fitness": 10.0 - numbers, "episodes": np.full(20, 20)}
+    return list_archive(dataclasses.replace(small_archive(20), **rates, **values), anymal)
 
 
 def test_the_list_begins_with_each_cause_and_sorts_by_what_is_chosen(show):
@@ -88,7 +101,7 @@ def test_time_goes_by_at_its_speed_and_begins_again():
     clock.tick(0.5)
     assert (clock.time_s, clock.playing) == (0.5, True)
     clock.seek(99.0)
-    assert clock.time_s == 2.0 and clock.frame(0.02, 90) == 89
+    assert clock.time_s == 2.0
 
 
 @pytest.mark.parametrize(
