@@ -39,28 +39,28 @@ def make_probes(strips, spread=0.0, bundled=False):
     )  # fmt: skip
 
 
-def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundled=False, parked=0):
+def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundled=False, parked=0, room=None):
     """Contacts of all robots as a dict of arrays, with ``env``, the probe's ``centre`` in its body, and ``touched``.
 
     The latter is on the ground. ``count`` is by robot; ``buffer`` has all.
     """
     poses = np.float32(poses).reshape(-1, len(strips), 7)
-    buffer = make_contacts(len(poses), 3 * len(strips))
+    buffer = make_contacts(len(poses), room or 3 * len(strips))
     buffer.count.fill_(5)  # of another step
     buffer.shape.fill_(UNTOUCHED)
     world, on = wp.array(poses, dtype=wp.transform), wp.array(terrain_of_env, dtype=int)
     parked, probes = wp.array(np.full(len(poses), parked), dtype=int), make_probes(strips, spread, bundled)
     collide_strips(world, on, make_terrain(grids), probes, ground or Ground(), parked, buffer)
-    count, room = buffer.count.numpy(), buffer.shape.shape[1]
-    env, slot = np.nonzero(np.arange(room) < count[:, None])
+    count = buffer.count.numpy()
+    env, slot = np.nonzero(np.arange(buffer.shape.shape[1]) < count[:, None])
     names = [name for name in Contacts.vars if name not in ("count", "force")]
     records = {name: getattr(buffer, name).numpy()[env, slot] for name in names}
     pose, half = np.float64(poses)[env, records["shape"]], 0.5 * records["distance"][:, None]
     radius = np.array([radius for _, radius in strips])[records["shape"]][:, None]
-    to_world = np.array([oracle.rotation_matrix(row[3:]) for row in pose]).reshape(-1, 3, 3)
     # The point lies half way between the surfaces.
     centre = records["point"] + (half + radius) * records["normal"]
-    records["centre"] = np.einsum("nji,nj->ni", to_world, centre - pose[:, :3])
+    turns = oracle.rotation_matrix(pose[:, 3:])
+    records["centre"] = np.einsum("nji,nj->ni", turns, centre - pose[:, :3])
     records["touched"] = records["point"] - half * records["normal"]
     return records | {"count": count, "env": env, "buffer": buffer}
 
@@ -170,16 +170,10 @@ def test_contacts_past_the_capacity_are_counted_but_not_written():
     # Robot 0 touches with three shapes, robot 1 with one, and has room for two.
     poses = np.tile([5, 4, 0.05, 0, 0, 0, 1], (2, 3, 1))
     poses[1, 1:, 2] = 1.0
-    buffer = make_contacts(3, 2)
-    buffer.shape.fill_(UNTOUCHED)
-    world, on = wp.array(np.float32(poses), dtype=wp.transform), wp.zeros(2, dtype=int)
-    flat = make_terrain(np.zeros((1, 161, 321)))
-    probes, nobody = make_probes([(np.zeros(3), 0.1)] * 3), wp.zeros(2, dtype=int)
-    collide_strips(world, on, flat, probes, Ground(), nobody, buffer)
-    shapes = buffer.shape.numpy()
-    assert buffer.count.numpy().tolist() == [3, 1, 0]
-    assert len(set(shapes[0])) == 2 and (shapes[0] >= 0).all()
-    assert shapes[1:].tolist() == [[0, UNTOUCHED], [UNTOUCHED] * 2]
+    records = collide(poses, [0, 0], np.zeros((1, 161, 321)), [(np.zeros(3), 0.1)] * 3, room=2)
+    first, second = records["buffer"].shape.numpy()
+    assert records["count"].tolist() == [3, 1] and second.tolist() == [0, UNTOUCHED]
+    assert len(set(first)) == 2 and (first >= 0).all()
 
 
 def test_a_state_that_is_not_finite_touches_nothing_nor_does_a_parked_robot():
@@ -191,36 +185,24 @@ def test_a_state_that_is_not_finite_touches_nothing_nor_does_a_parked_robot():
     assert not collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"].any()
 
 
-def geom_forces(*, count, column_of_shape, num_geoms):
-    """Two robots with room for two contacts; contact k is on shape k of robot k % 2, with 10 k + (1, 2, 3) N."""
+@pytest.mark.parametrize(
+    ("count", "column_of_shape", "expected"),
+    [
+        # Shapes 0 and 2 share column 1, shape 1 has column 2, shape 3 has none.
+        ([2, 2], [1, 2, 1, -1], {(0, 1): (22, 24, 26), (1, 2): (11, 12, 13)}),
+        # Contacts 1, 2 and 3 are stale; then robot 0's count runs on past the capacity.
+        ([1, 0], [0, 1, 2, 3], {(0, 0): (1, 2, 3)}),
+        ([900, 0], [0, 1, 2, 3], {(0, 0): (1, 2, 3), (0, 2): (21, 22, 23)}),
+    ],
+)
+def test_contact_forces_of_one_geom_add_up_and_others_are_left_out(count, column_of_shape, expected):
+    # Two robots with room for two contacts; contact k is on shape k of robot k % 2, with 10 k + (1, 2, 3) N.
     force = [[(1, 2, 3), (21, 22, 23)], [(11, 12, 13), (31, 32, 33)]]
     contacts = filled(Contacts, count=count, shape=[[0, 2], [1, 3]], force=np.float32(force))
-    out = wp.full((2, num_geoms), wp.vec3(7.0), dtype=wp.vec3)
+    out = wp.full((2, 4), wp.vec3(7.0), dtype=wp.vec3)
     sum_forces(contacts, wp.array(column_of_shape, dtype=int), out)
-    return out.numpy()
-
-
-def test_contact_forces_of_one_geom_add_up_and_others_are_left_out():
-    # Shapes 0 and 2 share column 1, shape 1 has column 2, shape 3 has none.
-    expected = np.zeros((2, 3, 3))
-    expected[0, 1], expected[1, 2] = (22, 24, 26), (11, 12, 13)
-    np.testing.assert_array_equal(geom_forces(count=[2, 2], column_of_shape=[1, 2, 1, -1], num_geoms=3), expected)
-
-
-@pytest.mark.parametrize(("count", "last"), [([1, 0], 0), ([900, 0], 21)])
-def test_only_contacts_that_exist_are_read(count, last):
-    # Contacts 1, 2 and 3 are stale in the first case; in the second, robot 0's count ran on past the capacity.
-    forces = geom_forces(count=count, column_of_shape=[0, 1, 2, 3], num_geoms=4)
-    assert forces[0, :, 0].tolist() == [1, 0, last, 0]
-    assert not forces[1].any()
-
-
-def surface_normal(grid, x, y):
-    """Upward unit normal of the triangle at one (x, y), 5e-5 m or more from its edges."""
-    along_x = surface_heights(grid, x + 1e-5, y) - surface_heights(grid, x - 1e-5, y)
-    along_y = surface_heights(grid, x, y + 1e-5) - surface_heights(grid, x, y - 1e-5)
-    normal = np.array([-along_x, -along_y, 2e-5])
-    return normal / np.linalg.norm(normal)
+    forces = out.numpy()
+    assert {index: tuple(forces[index]) for index in map(tuple, np.argwhere(forces.any(axis=2)))} == expected
 
 
 @wp.kernel
@@ -235,29 +217,18 @@ def _ceiling_kernel(terrain: Terrain, lower: wp.array[wp.vec2], upper: wp.array[
     out[k] = ceiling_over(terrain, 0, lower[k], upper[k])
 
 
-def sample(terrain, points, reach):
-    out = wp.zeros(len(points), dtype=SurfacePoint)
-    wp.launch(_sample_kernel, len(points), [terrain, wp.array(np.float32(points), dtype=wp.vec3), reach, out])
-    return out.numpy()["distance"], out.numpy()["normal"]
-
-
-def scatter(nrow, ncol, count):
-    """Points over and up to 0.3 m beyond the grid, none closer than 1e-3 cells to an edge where the normal jumps."""
-    rng = np.random.default_rng(5)
-    low, high = [-0.3, -0.3, -0.4], [(ncol - 1) * SPACING + 0.3, (nrow - 1) * SPACING + 0.3, 0.4]
-    points = np.float32(rng.uniform(low, high, (4 * count, 3)))
-    fraction = (points[:, :2] / SPACING) % 1
-    edges = np.column_stack([fraction, 1 - fraction, np.abs(1 - fraction.sum(1))])
-    return points[(edges > 1e-3).all(1)][:count]
-
-
 @pytest.mark.parametrize("reach", [0.03, 0.1])
 def test_nearest_point(reach):
-    grid = rough(33, 49)
-    points = scatter(33, 49, 400)
-    distance, direction = sample(make_terrain(grid[None]), points, reach)
-    near = 0
-    for p, got, normal in zip(np.float64(points), distance, np.float64(direction), strict=True):
+    # Points over and up to 0.3 m beyond the grid, none closer than 1e-3 cells to an edge where the normal jumps.
+    grid, near = rough(33, 49), 0
+    points = np.float32(np.random.default_rng(5).uniform([-0.3, -0.3, -0.4], [2.7, 1.9, 0.4], (1600, 3)))
+    fraction = (points[:, :2] / SPACING) % 1
+    edges = np.column_stack([fraction, 1 - fraction, np.abs(1 - fraction.sum(1))])
+    points = points[(edges > 1e-3).all(1)][:400]
+    out = wp.zeros(400, dtype=SurfacePoint)
+    wp.launch(_sample_kernel, 400, [make_terrain(grid[None]), wp.array(points, dtype=wp.vec3), reach, out])
+    nearest = out.numpy()
+    for p, got, normal in zip(np.float64(points), nearest["distance"], np.float64(nearest["normal"]), strict=True):
         expected, _ = oracle.nearest_on_surface(grid, SPACING, p, reach)
         if abs(expected) < reach - 1e-4:
             near += 1
@@ -268,7 +239,10 @@ def test_nearest_point(reach):
         elif expected == np.inf:
             assert got > reach - 1e-4
         elif expected == -np.inf:  # deep inside: the plane of the triangle straight above
-            plane = surface_normal(grid, *p[:2])
+            about = p[:2] + 1e-5 * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+            west, east, south, north = surface_heights(grid, *about.T)
+            plane = np.array([west - east, south - north, 2e-5])
+            plane /= np.linalg.norm(plane)
             depth = (p[2] - surface_heights(grid, *p[:2])) * plane[2]
             assert got == pytest.approx(depth, abs=1e-5)
             np.testing.assert_allclose(normal, plane, atol=1e-5)

@@ -1,9 +1,10 @@
-"""The observation row and the action, against a float64 oracle and by hand."""
+"""Observation, action, and the state in mujoco_warp's data, against float64 formulas and by hand."""
 
 import numpy as np
 import pytest
 import warp as wp
 
+from kernels.coordinates import Delay, SolverState, from_solver, poses_from_solver, to_solver
 from kernels.observation import Noise, Sensors, apply_action, write_observation
 from kernels.state import RobotStep
 from sim.mujoco_c.model import observations, to_mujoco
@@ -29,19 +30,13 @@ def observe(states, command, last_action, terrain_of_env, grids, scan):
     return out.numpy()
 
 
-def random_case(num_envs, num_joints, num_scan, num_terrains=2, seed=0):
-    rng = np.random.default_rng(seed)
-    grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(num_terrains)])
-    scan = rng.uniform(-0.8, 0.8, (num_scan, 2)).astype(np.float32)
-    command, action = rng.uniform(-1, 1, (num_envs, 3)), rng.normal(size=(num_envs, num_joints))
-    terrain_of_env = rng.integers(0, num_terrains, num_envs)
-    states = random_states(num_envs, num_joints, seed)
-    return states, np.float32(command), np.float32(action), terrain_of_env, grids, scan
-
-
 @pytest.mark.parametrize(("num_envs", "num_joints", "num_scan"), [(40, 12, 187), (7, 0, 0)])
 def test_parity_with_the_oracle(num_envs, num_joints, num_scan):
-    states, command, action, terrain_of_env, grids, scan = random_case(num_envs, num_joints, num_scan)
+    rng = np.random.default_rng(0)
+    grids = np.stack([rough(161, 321, 0.3, seed=k) for k in range(2)])
+    states, scan = random_states(num_envs, num_joints), np.float32(rng.uniform(-0.8, 0.8, (num_scan, 2)))
+    command, action = np.float32(rng.uniform(-1, 1, (num_envs, 3))), np.float32(rng.normal(size=(num_envs, num_joints)))
+    terrain_of_env = rng.integers(0, 2, num_envs)
     got = observe(states, command, action, terrain_of_env, grids, scan)
     default = np.float64(np.float32(np.linspace(-0.5, 0.5, num_joints)))
     plain = to_mujoco(*states, np.array(BASE_COM))
@@ -78,3 +73,62 @@ def test_action_by_hand():
     np.testing.assert_array_equal(last, np.float32([[0.2, -1], [100, -100], [np.nan, np.nan]]))
     np.testing.assert_allclose(targets[:, 7:], [[-0.4, 0], [49.5, -49.5], [np.nan, np.nan]], atol=1e-6)
     assert (targets[:, :7] == 9).all()  # the base's columns are not targets
+
+
+# In mujoco_warp's data joints and bodies are in another order.
+ENVS = 5
+COLUMNS, FOLLOWED, BODIES = (9, 7, 8), (8, -1, 7, 9), (2, 1)
+
+
+@pytest.fixture
+def solver():
+    """The data of five robots with three joints, four actuators and two bodies, all of it -5."""
+    return filled(
+        SolverState,
+        **{name: np.full((ENVS, width), -5.0) for name, width in (("qpos", 10), ("qvel", 9), ("ctrl", 4))},
+        **{"xpos": np.zeros((ENVS, 3, 3)), "xquat": np.zeros((ENVS, 3, 4)), "base_com": BASE_COM},
+        **{"column_of_joint": COLUMNS, "target_of_actuator": FOLLOWED, "column_of_body": BODIES},
+    )
+
+
+@pytest.fixture
+def written(solver):
+    q, qd = random_states(ENVS, 3)
+    targets = q + np.float32(1.0)
+    to_solver(*(wp.array(rows, dtype=float) for rows in (q, qd, targets)), Delay(), solver)
+    return q, qd, targets
+
+
+def test_coordinates_and_velocities_are_those_of_mujoco(solver, written):
+    q, qd, _ = written
+    expected = to_mujoco(q, qd, np.float64(BASE_COM))
+    order = np.argsort(COLUMNS)
+    np.testing.assert_array_equal(solver.qpos.numpy()[:, :7], np.float32(expected.qpos[:, :7]))
+    np.testing.assert_array_equal(solver.qpos.numpy()[:, 7:], q[:, 7:][:, order])
+    np.testing.assert_allclose(solver.qvel.numpy()[:, :6], expected.qvel[:, :6], atol=3e-6)
+    np.testing.assert_array_equal(solver.qvel.numpy()[:, 6:], qd[:, 6:][:, order])
+    assert np.abs(expected.qvel[:, :3] - qd[:, :3]).max() > 0.05  # else the mass centre would not count
+
+
+def test_actuators_without_a_target_keep_their_control(solver, written):
+    expected = np.where(np.array(FOLLOWED) < 0, -5.0, written[2][:, np.array(FOLLOWED)])
+    np.testing.assert_array_equal(solver.ctrl.numpy(), np.float32(expected))
+
+
+def test_state_is_read_back(solver, written):
+    q, qd, _ = written
+    now = wp.zeros(q.shape, dtype=float), wp.zeros(qd.shape, dtype=float)
+    from_solver(solver, *now)
+    np.testing.assert_array_equal(now[0].numpy(), q)
+    np.testing.assert_allclose(now[1].numpy(), qd, atol=3e-6)
+
+
+def test_poses_are_those_of_the_bodies_with_quaternions_turned_round(solver):
+    rng = np.random.default_rng(1)
+    positions, rotations = rng.normal(size=(ENVS, 3, 3)), rng.normal(size=(ENVS, 3, 4))
+    solver.xpos.assign(np.float32(positions))
+    solver.xquat.assign(np.float32(rotations))
+    poses = wp.zeros((ENVS, 2), dtype=wp.transform)
+    poses_from_solver(solver, poses)
+    expected = np.concatenate([positions, rotations[..., [1, 2, 3, 0]]], axis=-1)[:, list(BODIES)]
+    np.testing.assert_array_equal(poses.numpy(), np.float32(expected))

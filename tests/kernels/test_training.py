@@ -66,6 +66,9 @@ def test_level_goes_up_down_or_stays():
     assert promoted(0.0, 0.0)[0] == [1]  # told to stand
     assert promoted(4.1, 1.0)[0] == [2]  # far, though less than is due
     assert promoted(0.0, 1.0, level=0)[0] == [0]
+    levels, terrain = promoted([9.0, 9.0], 0.3, outcome=[Outcome.RUNNING, Outcome.INVALID])
+    assert levels.tolist() == [1, 1]  # both keep their level
+    assert terrain.tolist() == [99, NUM_COLUMNS + 2]
 
 
 def test_past_the_last_level_any_level_follows():
@@ -74,20 +77,13 @@ def test_past_the_last_level_any_level_follows():
     assert counts.shape == (NUM_LEVELS,) and (counts > 60).all()  # 100 expected, standard deviation 8.7
 
 
-def test_running_and_invalid_episodes_keep_their_level():
-    levels, terrain = promoted([9.0, 9.0], 0.3, outcome=[Outcome.RUNNING, Outcome.INVALID])
-    assert levels.tolist() == [1, 1]
-    assert terrain.tolist() == [99, NUM_COLUMNS + 2]
-
-
 def test_starts_are_drawn_from_counter_and_environment_alone():
-    def seeds(num_envs, count):
-        episodes, training = make_batch(num_envs, count=count)
+    seeds = []
+    for count in (7, 7, 8):
+        episodes, training = make_batch(4, count=count)
         seed_restarts(training, episodes)
-        return episodes.rng.numpy().tolist()
-
-    assert seeds(4, 7) == seeds(4, 7)
-    assert len({*seeds(4, 7), *seeds(4, 8)}) == 8
+        seeds.append(episodes.rng.numpy().tolist())
+    assert seeds[0] == seeds[1] and len({*seeds[1], *seeds[2]}) == 8
 
 
 def command(num_envs=1, *, steps=0, yaw=0.0, heading=None, count=0, position=(0.0, 0.0), task=None, **rules):

@@ -11,8 +11,7 @@ from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import FIRST_COL, NUM_STARTS
 from sim.terrains.spaces.registry import get_space
-from tests.kernels import course_oracle as oracle
-from tests.kernels.course_oracle import course, element
+from tests.kernels.oracle import course, course_heights, element
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
 
@@ -116,7 +115,7 @@ def dose_of(name, *values, **others):
 def test_an_obstacle_is_the_element_of_a_course(name):
     genes, value = IN_RANGE[name]
     (heights,) = dose_of(name, *value.values()).terrains(1, np.random.default_rng(0))
-    expected = oracle.heights(course([*genes[:1], *element("flat", lead=4)[1:2], *genes[2:]])[0])
+    expected = course_heights(course([*genes[:1], *element("flat", lead=4)[1:2], *genes[2:]])[0])
     # There it begins behind 4 cells of flat ground, at column 84; here at column 100.
     np.testing.assert_allclose(heights[:, 16:], expected[:, : 321 - 16], atol=1e-5)
     assert not heights[:, :17].any()

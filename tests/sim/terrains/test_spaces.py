@@ -23,8 +23,7 @@ from sim.terrains.spaces.registry import SPACES, get_space, is_user_space, load_
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import varied_space
 from sim.terrains.terrains import Terrains
-from tests.kernels import oracle
-from tests.kernels.course_oracle import course, element
+from tests.kernels.oracle import course, element, mixture_height
 from tests.sim.scenes import NODE_X, NODE_Y
 from tests.sim.terrains.spaces.spaces import write_ridges
 
@@ -55,7 +54,7 @@ def test_a_terrain_without_some_bumps_is_the_sum_of_the_others():
     genes = SUPER_GAUSSIAN.hard_random(2, 5)
     without = SUPER_GAUSSIAN.without(genes, [0, 3, 7])
     others = genes.reshape(2, 8, 8)[:, [1, 2, 4, 5, 6]].reshape(2, 40)
-    expected = [oracle.mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in others]
+    expected = [mixture_height(row, NODE_X[None, :], NODE_Y[:, None]) for row in others]
     np.testing.assert_allclose(make_heights(without), expected, atol=1e-5)
     assert not make_heights(SUPER_GAUSSIAN.without(genes, range(8))).any()
     np.testing.assert_array_equal(SUPER_GAUSSIAN.without(genes, []), genes)
