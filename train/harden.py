@@ -74,7 +74,15 @@ def harden(
                 hardening.evaluate()
     except KeyboardInterrupt:
         raise Interrupted(f"Stopped; what is done is kept, and the same command goes on in {run_dir}.") from None
-    _show(content)
+    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
+    counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
+    rows = []
+    for row in content["rounds"]:
+        name = row["controller"]
+        cells = ("-" if row[count] is None else f"{row[count]:,}" for count in counts)
+        rates = (format_value(goal[fixed].get(name), limits[fixed].get(name)) for fixed in FIXED_SETS)
+        rows.append((name, *cells, *rates))
+    show_table("Rounds", ["controller", *counts, *(f"goal on {name}" for name in FIXED_SETS)], rows)
     print(f"The hardened controller: {hardening.policies[f'round-{cfg.rounds}']}")
     return content
 
@@ -231,15 +239,3 @@ def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, f
     lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST + 1e-9}
     why += "".join(f"; on {name} it is {points:.3f} below the base's" for name, points in lost.items())
     return {"kept": not lost and scores["after"] >= scores["before"], "why": why, "score": scores}
-
-
-def _show(content: Mapping[str, Any]) -> None:
-    goal, limits = content["tables"]["goal"], content["tables"]["intervals"]["goal"]
-    counts = ("elites", "failing", "confirmed", "faults", "faults_panel")
-    rows = []
-    for row in content["rounds"]:
-        name = row["controller"]
-        cells = ("-" if row[count] is None else f"{row[count]:,}" for count in counts)
-        rates = (format_value(goal[fixed].get(name), limits[fixed].get(name)) for fixed in FIXED_SETS)
-        rows.append((name, *cells, *rates))
-    show_table("Rounds", ["controller", *counts, *(f"goal on {name}" for name in FIXED_SETS)], rows)

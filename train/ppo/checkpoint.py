@@ -71,7 +71,17 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
     else:
         policy = load_policy(path, robot, "cpu")
     if isinstance(policy, Described):
-        return _start_described(policy, path, robot)
+        network = plain_layers(policy.network, str(path))
+        weights = path if path.name == CHECKPOINT else weights_file(path)
+        # TorchScript does not say its noise.
+        content = read_weights(weights) if weights and isinstance(policy.network, MlpPolicy) else {}
+        stored = content.get("actor_state_dict", content.get("model_state_dict", {}))
+        noise = [torch.exp(stored[name]) if "log" in name else stored[name] for name in _NOISES if name in stored]
+        std = (noise or [torch.full((network.sizes[1],), _DEFAULT_NOISE)])[0].float()
+        actor = {f"mlp.{key}": value.detach().clone() for key, value in network.layers.state_dict().items()}
+        critic = content.get("critic_state_dict") if path.name == CHECKPOINT else None
+        start = _make_start(network, actor | {STD: std}, critic, robot, path)
+        return replace(start, controller=replace(policy.cfg, policy=POLICY, activation=network.activation))
     content = read_weights(path) if isinstance(policy, MlpPolicy) else {}
     if not isinstance(policy, MlpPolicy) or policy.activation != "elu" or "actor_state_dict" not in content:
         raise ValueError(
@@ -108,22 +118,6 @@ def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, p
                 "others: leave it out of the file, and a critic is trained"
             )
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
-
-
-def _start_described(described: Described, path: Path, robot: RobotCfg) -> Start:
-    """The network of a description, with the critic of a training's checkpoint."""
-    weights = path if path.name == CHECKPOINT else weights_file(path)
-    policy = plain_layers(described.network, str(path))
-    # TorchScript does not say its noise.
-    content = read_weights(weights) if weights and isinstance(described.network, MlpPolicy) else {}
-    stored = content.get("actor_state_dict", content.get("model_state_dict", {}))
-    noise = [torch.exp(stored[name]) if "log" in name else stored[name] for name in _NOISES if name in stored]
-    std = (noise or [torch.full((policy.sizes[1],), _DEFAULT_NOISE)])[0].float()
-    actor = {f"mlp.{key}": value.detach().clone() for key, value in policy.layers.state_dict().items()} | {STD: std}
-    start = _make_start(
-        policy, actor, content.get("critic_state_dict") if path.name == CHECKPOINT else None, robot, path
-    )
-    return replace(start, controller=replace(described.cfg, policy=POLICY, activation=policy.activation))
 
 
 @torch.inference_mode()

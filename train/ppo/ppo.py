@@ -129,21 +129,19 @@ class CapturedPPO(PPO):
         for _ in range(self.num_learning_epochs):
             for index in order.view(self.num_mini_batches, -1):
                 self._index.copy_(index)
-                self._run_minibatch()
-
-    def _run_minibatch(self) -> None:
-        # All processes of a training have taken the same number of steps, so they capture and replay together.
-        if self._stream is None or self._eager_steps < _EAGER_STEPS:
-            self._learn_minibatch()
-            self._eager_steps += 1
-            return
-        if self._graph is None:
-            self.optimizer.zero_grad(set_to_none=True)
-            self._graph = torch.cuda.CUDAGraph()
-            # NCCL's watchdog queries events from another thread, which a capture of all threads forbids.
-            with recording(), torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local"):
-                self._learn_minibatch()
-        self._graph.replay()
+                # All processes of a training have taken the same number of steps, so they capture and replay together.
+                if self._stream is None or self._eager_steps < _EAGER_STEPS:
+                    self._learn_minibatch()
+                    self._eager_steps += 1
+                    continue
+                if self._graph is None:
+                    self.optimizer.zero_grad(set_to_none=True)
+                    self._graph = torch.cuda.CUDAGraph()
+                    # NCCL's watchdog queries events from another thread, which a capture of all threads forbids.
+                    capture = torch.cuda.graph(self._graph, stream=self._stream, capture_error_mode="thread_local")
+                    with recording(), capture:
+                        self._learn_minibatch()
+                self._graph.replay()
 
     def _learn_minibatch(self) -> None:
         """One optimiser step on the transitions of ``_index``; reads and writes fixed memory only."""

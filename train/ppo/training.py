@@ -51,9 +51,6 @@ _HEADER = (
     f"{'level':>6} {'std':>5}"
 )
 
-Kind = Literal["train", "finetune"]
-"""What a training is, by the command that makes it."""
-
 
 @contextmanager
 def stop_request() -> Iterator[threading.Event]:
@@ -128,7 +125,7 @@ def run_directory(run_dir: Path, export: Path | None) -> Iterator[None]:
         yield
 
 
-def read_saved(run_dir: Path, kind: Kind, robot: str) -> dict[str, Any]:
+def read_saved(run_dir: Path, kind: Literal["train", "finetune"], robot: str) -> dict[str, Any]:
     """The checkpoint in a training's directory; refuses one of another kind or robot."""
     saved = read_checkpoint(run_dir / CHECKPOINT)
     if (saved["kind"], saved["robot"]) != (kind, robot):
@@ -247,30 +244,27 @@ class Training:
 
         ``export`` is a further file for the controller.
         """
-        if self.learner.ranks.is_first:
-            write_atomically(self._run_dir / CONFIG, to_json(self._settings))
-        with stop_request() as stop:
-            self._iterate(stop)
-            self._finish(export)
-        if stop.is_set():
-            done = f"{self.learner.iteration} of {self._cfg.iterations} iterations"
-            raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
-        return self._run_dir / (POLICY if self.learner.env.controller is None else DESCRIBED)
-
-    def _iterate(self, stop: threading.Event) -> None:
         learner = self.learner
+        ranks = learner.ranks
+        if ranks.is_first:
+            write_atomically(self._run_dir / CONFIG, to_json(self._settings))
         last_save = time.monotonic()
         if learner.iteration - learner.averaged < self.averaged_from:  # a shorter training averaged other actors
             learner.count_into_mean(False)
-        ranks = learner.ranks
-        while ranks.all_true(learner.iteration < self._cfg.iterations and not stop.is_set(), learner.env.device):
-            self.before_iteration()
-            step = learner.iterate()
-            learner.count_into_mean(learner.iteration > self.averaged_from)
-            self.progress.add(step)
-            if time.monotonic() - last_save > SAVE_EVERY_S and learner.ranks.is_first:
-                write_checkpoint(self._run_dir / CHECKPOINT, self.state())
-                last_save = time.monotonic()
+        with stop_request() as stop:
+            while ranks.all_true(learner.iteration < self._cfg.iterations and not stop.is_set(), learner.env.device):
+                self.before_iteration()
+                step = learner.iterate()
+                learner.count_into_mean(learner.iteration > self.averaged_from)
+                self.progress.add(step)
+                if time.monotonic() - last_save > SAVE_EVERY_S and ranks.is_first:
+                    write_checkpoint(self._run_dir / CHECKPOINT, self.state())
+                    last_save = time.monotonic()
+            self._finish(export)
+        if stop.is_set():
+            done = f"{learner.iteration} of {self._cfg.iterations} iterations"
+            raise Interrupted(f"Stopped after {done}; the same command goes on in {self._run_dir}.")
+        return self._run_dir / (POLICY if learner.env.controller is None else DESCRIBED)
 
     def _finish(self, export: Path | None) -> None:
         learner = self.learner
