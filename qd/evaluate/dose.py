@@ -62,11 +62,6 @@ class Dose(Sweep):
     space: str = SUPER_GAUSSIAN.name
     """Terrain space of its genes; of heights any."""
 
-    @property
-    def harder_up(self) -> bool:
-        """Whether larger values are harder."""
-        return self.values[-1] >= self.values[0]
-
     def describe(self) -> str:
         """The obstacle and its other quantities: ``stairs up, tread 0.30 m, flight 5 steps``."""
         texts = [self.title]
@@ -78,7 +73,7 @@ class Dose(Sweep):
     def changed(self, values: Iterable[float] | None, others: Mapping[str, float]) -> "Dose":
         """The same with other values, the easiest first, and other quantities where it has them."""
         changed = {name: value for name, value in others.items() if name in self.others}
-        values = self.values if values is None else sorted(values, reverse=not self.harder_up)
+        values = self.values if values is None else sorted(values, reverse=self.values[-1] < self.values[0])
         if not values or len(set(values)) < len(values):
             raise ValueError(f"{self.title}: values of {self.parameter} must be some, each once, got {values}")
         for name, value in [*((self.parameter, value) for value in values), *changed.items()]:
@@ -268,7 +263,8 @@ def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult)
     values = [rows[number]["value"] for number in crossed]
     value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None for at in steps)
     beyond = None if value is not None else "last" if step > 0 else "first"
-    return {**half, "value": value, "beyond": beyond, "interval": limits if dose.harder_up else limits[::-1]}
+    interval = limits if dose.values[-1] >= dose.values[0] else limits[::-1]
+    return {**half, "value": value, "beyond": beyond, "interval": interval}
 
 
 def _find_crossing(rates: NDArray[np.floating]) -> float:

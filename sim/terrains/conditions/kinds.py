@@ -126,13 +126,13 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
 def begin_effects() -> tuple[tuple[Any, int], ...]:
     """Warp functions that vary robots, each with its first column in a row."""
     columns = split_row(np.arange(len(condition_genes())))
-    return tuple((condition.begin, int(first)) for condition, (first, *_) in columns if condition.begin is not None)
+    return tuple((condition.begin, int(first)) for condition, (first, *_) in columns if condition.begin)
 
 
 def disturb_effects() -> tuple[tuple[Any, int], ...]:
     """Warp functions that disturb control steps, in the order in which they do, each with its first column in a row."""
     columns = sorted(split_row(np.arange(len(condition_genes()))), key=lambda pair: pair[0].disturbs_last)
-    return tuple((condition.disturb, int(first)) for condition, (first, *_) in columns if condition.disturb is not None)
+    return tuple((condition.disturb, int(first)) for condition, (first, *_) in columns if condition.disturb)
 
 
 def round_steps(seconds: float, dt: float) -> int:

@@ -52,11 +52,11 @@ class Course(ShippedSpace):
         rows, num_kinds = genes.reshape(-1, GENES_PER_ELEMENT), len(self.kinds)
         numbers = np.minimum((rows[:, _KIND] + 1.0) / 2.0 * num_kinds, num_kinds - 1).astype(int)
         for number, kind in enumerate(self._kinds):
+            mask = numbers == number
             for column, limits in enumerate(kind.ranges, _SIZE):
-                genes_of_kind = rows[numbers == number, column]
-                if limits.hard:
-                    hard = {"low": -1.0, "high": 1.0, "either": np.where(genes_of_kind < 0.0, -1.0, 1.0)}[limits.hard]
-                    rows[numbers == number, column] = hard
+                drawn = rows[mask, column]
+                ends = {"": drawn, "low": -1.0, "high": 1.0, "either": np.where(drawn < 0.0, -1.0, 1.0)}
+                rows[mask, column] = ends[limits.hard]
         return genes
 
     def elements(self, genes: ArrayLike) -> NDArray[Any]:
