@@ -77,9 +77,8 @@ class Case:
     """Parts that change it, in the order in which they are taken away."""
     how: How
     """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
-    scalable: bool
     flat: Parts = ()
-    """Parts that change no height: slippery patches, conditions. A terrain of these alone is not scaled."""
+    """Parts without heights to scale: slippery patches, conditions. A terrain of these alone is not scaled."""
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
     """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
     minimal: Parts = ()
@@ -126,7 +125,7 @@ Steps = Generator[list[Trial], None, Any]
 def find_minimal(case: Case) -> Steps:
     """Finds the minimal terrain of a case, and the least scale of its heights by halving."""
     case.minimal = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
-    if not case.scalable or set(case.minimal) <= set(case.flat):
+    if set(case.minimal) <= set(case.flat):
         return
     passing = 0.0
     failing = 1.0
@@ -206,11 +205,11 @@ def open_case(
     parts = np.flatnonzero(effects.changes(_LEAST_EFFECT_M)).tolist()
     if how == "exhaustive" and len(parts) > MAX_PARTS:
         raise ValueError(f"how must be greedy with over {MAX_PARTS} parts, got {len(parts)} of elite {number}")
+    scalable = space.scaled(genes[None], 0.5) is not None
     return Case(
         parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
         how=how or ("exhaustive" if on_gpu and len(parts) <= MAX_PARTS else "greedy"),
-        scalable=space.scaled(genes[None], 0.5) is not None,
-        flat=tuple(part for part in parts if np.abs(effects.heights[part]).max() <= _LEAST_EFFECT_M),
+        flat=tuple(part for part in parts if not scalable or np.abs(effects.heights[part]).max() <= _LEAST_EFFECT_M),
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
     )
 

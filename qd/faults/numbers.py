@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
 from sim.files.atomic import read_json
-from sim.files.command import choose_elites
 from sim.files.intervals import bootstrap_interval, format_rate, format_value, wilson_interval
 from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
@@ -216,10 +215,6 @@ class MinimalTerrains:
     """The content of ``minimal.json``."""
     genes: dict[int, NDArray[np.float32]]
     """By number of the elite, each of shape (num_genes,)."""
-
-    def choose(self, text: str, run: object) -> list[int]:
-        """Numbers of elites of a run that have a minimal terrain, as a command line names them: some, or ``all``."""
-        return choose_elites(text, [*self.genes], f"{run} has no minimal terrain of elite")
 
     def entry(self, number: int) -> dict[str, Any]:
         """The entry of an elite in ``minimal.json``."""

@@ -147,7 +147,7 @@ class OpenedRun:
             raise FileNotFoundError(f"{self.path} has no minimal terrains: make them with `faultline minimise`")
         else:
             genes = self.minima.genes
-            numbers = self.minima.choose(minimal, self.path)
+            numbers = choose_elites(minimal, [*self.minima.genes], f"{self.path} has no minimal terrain of elite")
             entries = {number: self.minima.entry(number) for number in numbers}
         causes = self.rank(numbers=numbers).causes
         return [
