@@ -173,9 +173,8 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
         print(f"Height {height:g} m: {shares[height]:.0%} of episodes reach the goal.", flush=True)
         return shares[height] < _CROSSED
 
-    highest = last = len(_HEIGHTS) - 1
-    if fails(_HEIGHTS[last]):
-        highest = bisect_left(_HEIGHTS, True, hi=last, key=fails) - 1
+    last = len(_HEIGHTS) - 1
+    highest = bisect_left(_HEIGHTS, True, hi=last, key=fails) - 1 if fails(_HEIGHTS[last]) else last
     height = _HEIGHTS[max(highest, 0)]
     return height, shares[height]
 
@@ -203,8 +202,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
         drawn = _draw_terrains(_MAX_ROUNDS * terrains, height)
         for first in range(0, len(drawn), terrains):
             label = f"hard-random terrains from {first + 1:,}"
-            lot = drawn[first : first + terrains]
-            results.append(crosser.cross(policy, lot, replicas=replicas, label=label))
+            results.append(crosser.cross(policy, drawn[first : first + terrains], replicas=replicas, label=label))
             scales = measure_scales(RolloutResult.join(results))
             if scales["failing_episodes"] >= _ENOUGH:
                 break

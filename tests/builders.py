@@ -13,8 +13,7 @@ from kernels.super_gaussian import LOWER, UPPER
 from qd.search.archive import Archive, FreshValues, no_outcomes, write_archive
 from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json
-from sim.robots.robot import robot_identity
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, robot_identity
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 
 OBSERVATIONS, ACTIONS = 235, 12

@@ -23,7 +23,7 @@ from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.provenance import provenance
 from sim.robots.find import get_robot
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
 

@@ -37,8 +37,7 @@ from sim.files.intervals import RATES as RATE_BOUNDS
 from sim.files.intervals import wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.rates import counted_episodes
-from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS

@@ -25,8 +25,7 @@ from qd.search.directory import read_robot_archive, search_seed
 from sim.controllers.formats.rsl_rl import read_weights
 from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json
-from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg
 from sim.robots.training import PaperCfg
 from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings

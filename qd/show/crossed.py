@@ -16,7 +16,7 @@ from sim.files.figures import new_figure
 from sim.files.intervals import format_rate, wilson_interval
 from sim.rates import typical_outcome
 from sim.recording.recorder import Recording
-from sim.robots.find import robot_label
+from sim.robots.robot import ROBOTS
 from sim.terrains.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
 
 
@@ -122,7 +122,8 @@ def find_ghost_episode(recording: Recording, episode: int, scales: dict[str, flo
 
 def make_title(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
-    head = robot_label(recording.robot) + (f" with {controller}" if controller else "") + f", {recording.labels[0]}"
+    robot = ROBOTS[recording.robot].label if recording.robot in ROBOTS else recording.robot
+    head = robot + (f" with {controller}" if controller else "") + f", {recording.labels[0]}"
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
     if not valid.any():

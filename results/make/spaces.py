@@ -10,7 +10,7 @@ from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import SearchCfg
 from results.make.common import COUNTS, Script, parse
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS
 from sim.terrains.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")

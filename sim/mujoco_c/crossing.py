@@ -31,8 +31,7 @@ from sim.mujoco_c.model import (
     step_penalties,
     to_mujoco,
 )
-from sim.robots.compiled import robot_spec
-from sim.robots.elements import mj
+from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, make_terrains

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES, PlainStep
 from sim.crossing import GROUND_FRICTION, CrossingCfg
-from sim.robots.compiled import robot_spec
-from sim.robots.elements import mj, rotation_matrix
+from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import QUARTER_TURN, Margins, as_hfield

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import zoom
 
 from sim.crossing import CrossingCfg
-from sim.robots.elements import mj
+from sim.robots.compiled import mj
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import find_touches, robot_model, shown_spec
 from sim.terrains.hand_crafted import SPACING
@@ -89,7 +89,17 @@ def scene_model(
     rim = [CrossingCfg.goal_radius, 0.02, 0.0]  # of the circle that counts as reaching the goal
     spec.worldbody.add_geom(pos=[x, y, z + 0.5], size=[0.02, 0.5, 0.0], rgba=[*_GREEN, 1.0], **cylinder)
     spec.worldbody.add_geom(pos=[x, y, z + 0.01], size=rim, rgba=[*_GREEN, 0.25], **cylinder)
-    _add_light(spec)
+    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64}
+    spec.add_texture(name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], height=384, **sky)
+    for light in spec.lights:
+        light.active = False
+    sun = {"type": mj.mjtLightType.mjLIGHT_DIRECTIONAL, "pos": [8.0, 4.0, 20.0], "dir": [-0.25, 0.45, -1.0]}
+    colors = {"diffuse": [0.55, 0.55, 0.53], "ambient": [0.0] * 3, "specular": [0.1] * 3}
+    spec.worldbody.add_light(name="faultline_sun", castshadow=True, **sun, **colors)
+    for name, brightness in {"ambient": 0.42, "diffuse": 0.22, "specular": 0.0}.items():
+        setattr(spec.visual.headlight, name, [brightness] * 3)
+    spec.visual.quality.shadowsize = 2048
+    spec.visual.quality.offsamples = 0
     spec.visual.global_.offwidth = width
     spec.visual.global_.offheight = height
     model = robot_model(spec, robot)
@@ -111,20 +121,6 @@ def _add_ground(spec: Any, heights: NDArray[np.floating], paint: tuple[int, ...]
     material.textures[mj.mjtTextureRole.mjTEXROLE_RGB] = GROUND
     kind = {"type": mj.mjtGeom.mjGEOM_MESH, "meshname": GROUND, "material": GROUND}
     spec.worldbody.add_geom(name=GROUND, group=0, contype=0, conaffinity=0, **kind)
-
-
-def _add_light(spec: Any) -> None:
-    sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64}
-    spec.add_texture(name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], height=384, **sky)
-    for light in spec.lights:
-        light.active = False
-    sun = {"type": mj.mjtLightType.mjLIGHT_DIRECTIONAL, "pos": [8.0, 4.0, 20.0], "dir": [-0.25, 0.45, -1.0]}
-    colors = {"diffuse": [0.55, 0.55, 0.53], "ambient": [0.0] * 3, "specular": [0.1] * 3}
-    spec.worldbody.add_light(name="faultline_sun", castshadow=True, **sun, **colors)
-    for name, brightness in {"ambient": 0.42, "diffuse": 0.22, "specular": 0.0}.items():
-        setattr(spec.visual.headlight, name, [brightness] * 3)
-    spec.visual.quality.shadowsize = 2048
-    spec.visual.quality.offsamples = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +182,6 @@ class Renderer(AbstractContextManager):
         self._scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = shadows
         self._scene.flags[mj.mjtRndFlag.mjRND_REFLECTION] = False
         self._options = mj.MjvOption()
-        self._nudge = mj.MjvPerturb()
         self._camera = mj.MjvCamera()
         self._camera.type = mj.mjtCamera.mjCAMERA_FREE
         self._gpu = mj.MjrContext(self.model, mj.mjtFontScale.mjFONTSCALE_100.value)
@@ -226,7 +221,14 @@ class Renderer(AbstractContextManager):
         mj.mjv_updateScene(self.model, data, self._options, None, self._camera, everything, self._scene)
         self._dress(touching)
         if ghost is not None:
-            self._add_ghost(ghost)
+            self._pose(self._ghost_data, ghost)
+            first = self._scene.ngeom
+            moving = mj.mjtCatBit.mjCAT_DYNAMIC.value
+            mj.mjv_addGeoms(self.model, self._ghost_data, self._options, mj.MjvPerturb(), moving, self._scene)
+            for geom in self._scene.geoms[first : self._scene.ngeom]:
+                geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
+                geom.matid = -1
+                geom.transparent = 1
         if foot_force is not None:
             for foot, force in zip(data.geom_xpos[self._feet], np.asarray(foot_force, np.float64), strict=True):
                 self._add_arrow(foot, force)
@@ -253,32 +255,20 @@ class Renderer(AbstractContextManager):
                 geom.rgba[:3] = FOOT_TOUCH if columns[0] >= self._first_foot else TOUCH
                 geom.matid = -1
 
-    def _add_ghost(self, qpos: NDArray[np.floating]) -> None:
-        self._pose(self._ghost_data, qpos)
-        first = self._scene.ngeom
-        moving = mj.mjtCatBit.mjCAT_DYNAMIC.value
-        mj.mjv_addGeoms(self.model, self._ghost_data, self._options, self._nudge, moving, self._scene)
-        for geom in self._scene.geoms[first : self._scene.ngeom]:
-            geom.rgba[:] = *OTHER_CONTROLLER, _GHOST_OPACITY
-            geom.matid = -1
-            geom.transparent = 1
-
     def _named(self, picture: NDArray[np.uint8], base: NDArray[np.floating], name: str) -> NDArray[np.uint8]:
         """The picture with a name over a robot whose base is there [m]."""
         image = Image.fromarray(picture)
-        (height, width, _) = picture.shape
         camera = self._scene.camera[0]  # that of one eye, at most a few centimetres from the middle of both
-        over = [0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height]
-        away = np.asarray(base, np.float64) + np.array(over) - camera.pos
+        over = np.array([0.0, 0.0, _NAME_HEIGHT * self._robot.default_base_height])
+        away = np.asarray(base, np.float64) + over - camera.pos
         depth = float(away @ camera.forward)
         if depth > camera.frustum_near:
-            pixels = 0.5 * height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
+            pixels = 0.5 * image.height * camera.frustum_near / camera.frustum_top / depth  # of a metre there
             right = away @ np.cross(camera.forward, camera.up)
-            up = away @ camera.up
-            place = 0.5 * width + pixels * right, 0.5 * height - pixels * up
+            point = 0.5 * image.width + pixels * right, 0.5 * image.height - pixels * (away @ camera.up)
             color = tuple(round(150.0 * share) for share in OTHER_CONTROLLER)
-            font = ImageFont.load_default(max(_LEAST_LETTERS, height // 22))
-            ImageDraw.Draw(image).text(place, name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
+            font = ImageFont.load_default(max(_LEAST_LETTERS, image.height // 22))
+            ImageDraw.Draw(image).text(point, name, color, font, anchor="mb", stroke_width=2, stroke_fill="white")
         return np.array(image)
 
     def _add_arrow(self, foot: NDArray[np.float64], force: NDArray[np.float64]) -> None:

@@ -10,8 +10,7 @@ from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
-from sim.robots.robot import RobotCfg, check_robot_identity
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg, check_robot_identity
 
 
 def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
@@ -31,11 +30,6 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
         return load_robot(Path(spec))
     known = ", ".join(ROBOTS)
     raise ValueError(f"unknown robot '{spec}': expected {known}, a robot.toml or a Python file (docs/robots.md)")
-
-
-def robot_label(name: str) -> str:
-    """Name of a shipped robot as its makers write it; the name itself of any other."""
-    return ROBOTS[name].label if name in ROBOTS else name
 
 
 def resolve_robot(

@@ -7,12 +7,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec
-from sim.robots.elements import mj, read_mesh, rotation_matrix
+from sim.robots.compiled import mj, read_mesh, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
 
 _SHAPES = ("SPHERE", "CAPSULE", "CYLINDER", "BOX", "ELLIPSOID", "MESH", "PLANE")
 _TYPES = {getattr(mj.mjtGeom, f"mjGEOM_{name}"): getattr(newton.GeoType, name) for name in _SHAPES}
+_PASSIVE = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}  # Newton's names and MuJoCo's
 _FREE_RANGE = 1e10  # limits of a joint that turns freely [rad]
 _NO_EFFORT_LIMIT = 1e6  # [N m]
 _RAW_SOLREF = 1  # Newton: MuJoCo's solref is taken as it stands
@@ -64,7 +64,7 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     name = model.joint(joint).name
     if body == 1:
         base = builder.add_joint_free(child=link, label=name)
-        for ours, theirs in (("armature", "armature"), ("damping", "damping"), ("friction", "frictionloss")):
+        for ours, theirs in _PASSIVE.items():
             getattr(builder, f"joint_{ours}")[:6] = getattr(model, f"dof_{theirs}")[:6].tolist()
         return base
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
@@ -80,14 +80,12 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
         axis=wp.vec3(*map(float, model.jnt_axis[joint])),
         target_ke=0.0,
         target_kd=0.0,
-        damping=float(model.dof_damping[dof]),
         stiffness=float(model.jnt_stiffness[joint]),
         rest_q=float(model.qpos_spring[model.jnt_qposadr[joint]]),
         limit_lower=float(limits[0]),
         limit_upper=float(limits[1]),
-        armature=float(model.dof_armature[dof]),
-        friction=float(model.dof_frictionloss[dof]),
         effort_limit=effort,
+        **{ours: float(getattr(model, f"dof_{theirs}")[dof]) for ours, theirs in _PASSIVE.items()},
         label=name,
         custom_attributes={
             "mujoco:solreflimit": _vec2(*model.jnt_solref[joint]),

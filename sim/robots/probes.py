@@ -22,7 +22,7 @@ from sim.device import host_device
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
-_BUNDLE = 8  # strips
+_BUNDLE = 8  # strips, few enough that one thread looks at all
 _vec3: Any = wp.vec3
 
 
@@ -189,12 +189,11 @@ def box_strips(*half: float) -> list[Strip]:
     thin, middle, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
     back = np.argsort(order)
     strips = []
-    for i, px in enumerate(thin):
-        for j, py in enumerate(middle):
-            is_rim = i in (0, len(thin) - 1) or j in (0, len(middle) - 1)
-            # Inside the cross-section only the two end faces have a surface.
-            for row in [along] if is_rim else [along[:1], along[-1:]]:
-                strips.append(Strip(centres=_along_z(float(px), float(py), row)[:, back], radius=radius))
+    for px, py in itertools.product(thin, middle):
+        is_rim = px in thin[[0, -1]] or py in middle[[0, -1]]
+        # Inside the cross-section only the two end faces have a surface.
+        for row in [along] if is_rim else [along[:1], along[-1:]]:
+            strips.append(Strip(centres=_along_z(float(px), float(py), row)[:, back], radius=radius))
     return strips
 
 
@@ -247,45 +246,35 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
     """Sphere probes of all collision shapes of one robot, on the current device."""
-    shape: list[int] = []
-    strips: list[Strip] = []
-    centres: list[list[Any]] = []
+    strips: list[tuple[int, Strip]] = []
     problems: list[str] = []
     for k in range(builder.shape_count):
-        pose: Any = builder.shape_transform[k]
+        scale = np.asarray(builder.shape_scale[k])
         try:
-            scale = np.asarray(builder.shape_scale[k])
             added = shape_strips(newton.GeoType(builder.shape_type[k]), scale, builder.shape_source[k])
-            shape += [k] * len(added)
-            strips += added
-            centres += [[wp.transform_point(pose, _vec3(*centre)) for centre in strip.centres] for strip in added]
+            strips += [(k, strip) for strip in added]
         except ValueError as error:
             problems.append(f"geom {builder.shape_label[k]}: {error}")
     if problems:
         raise ValueError("; ".join(problems))
-    radius = [strip.radius for strip in strips]
+    poses: Any = builder.shape_transform
+    centres = [[wp.transform_point(poses[k], _vec3(*centre)) for centre in strip.centres] for k, strip in strips]
+    shape = [k for k, _ in strips]
+    radius = [strip.radius for _, strip in strips]
     body = [builder.shape_body[k] for k in shape]
-    bundles = _bundle_strips(body)
+    runs = (list(run) for _, run in itertools.groupby(range(len(body)), body.__getitem__))
+    bundles = [first for run in runs for first in run[::_BUNDLE]] + [len(body)]  # neighbours on one body
     balls = [_bounding_ball(centres[a:b], radius[a:b]) for a, b in itertools.pairwise(bundles)]
     probes = Probes()
     probes.position = wp.array([centre for strip in centres for centre in strip], dtype=wp.vec3)
     probes.strip_start = wp.array(np.cumsum([0] + [len(strip) for strip in centres]), dtype=int)
     probes.strip_radius = wp.array(radius, dtype=float)
-    probes.strip_spread = wp.array([strip.spread for strip in strips], dtype=float)
+    probes.strip_spread = wp.array([strip.spread for _, strip in strips], dtype=float)
     probes.strip_shape = wp.array(shape, dtype=int)
     probes.bundle_start = wp.array(bundles, dtype=int)
     probes.bundle_body = wp.array([body[first] for first in bundles[:-1]], dtype=int)
     probes.bundle_ball = wp.array(balls, dtype=wp.vec4)
     return probes
-
-
-def _bundle_strips(body: Sequence[int]) -> list[int]:
-    """First strip of each bundle and the end: neighbours on one body, few enough that one thread looks at all."""
-    starts = [0]
-    for k in range(1, len(body)):
-        if body[k] != body[k - 1] or k - starts[-1] == _BUNDLE:
-            starts.append(k)
-    return [*starts[: len(body)], len(body)]
 
 
 def _bounding_ball(strips: Sequence[Sequence[Any]], radii: Sequence[float]) -> tuple[float, ...]:

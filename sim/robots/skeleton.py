@@ -12,8 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.robots.compiled import robot_spec
-from sim.robots.elements import mj, read_mesh, touching_geoms
+from sim.robots.compiled import mj, read_mesh, robot_spec, touching_geoms
 from sim.robots.robot import RobotCfg
 
 _SHAPE = mj.mjtGeom
@@ -41,7 +40,12 @@ def shown_spec(robot: RobotCfg) -> Any:
     except ValueError:  # for example a visual mesh of too many faces
         spec = robot_spec(robot)
     look_file = robot.model_file.with_suffix(LOOK_SUFFIX)
-    looks = _read_look(look_file) if look_file.is_file() else {}
+    looks = defaultdict[str, list[dict[str, Any]]](list)  # shapes by the name of their body, as add_geom takes them
+    if look_file.is_file():
+        look: Any = _compiled(lambda: mj.MjModel.from_xml_path(str(look_file)), look_file)
+        for k in range(look.ngeom):
+            shape = {name: getattr(look, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
+            looks[look.body(look.geom_bodyid[k]).name].append(shape)
     for body in spec.bodies[1:]:
         _dress(body, looks.pop(body.name, []), robot)
     if looks:
@@ -103,16 +107,6 @@ def _dress(body: Any, look: list[dict[str, Any]], robot: RobotCfg) -> None:
             geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if geom.name in robot.base_geoms else _LIMB_COLOR
 
 
-def _read_look(file: Path) -> dict[str, list[dict[str, Any]]]:
-    """Shapes by the name of their body, as ``add_geom`` takes them."""
-    looks = defaultdict[str, list[dict[str, Any]]](list)
-    model = _compiled(lambda: mj.MjModel.from_xml_path(str(file)), file)
-    for k in range(model.ngeom):
-        shape = {name: getattr(model, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
-        looks[model.body(model.geom_bodyid[k]).name].append(shape)
-    return looks
-
-
 class Skeleton:
     """A robot's bodies without the world."""
 
@@ -156,12 +150,11 @@ class Skeleton:
 
 def _make_primitive(kind: int, size: NDArray[np.float64]) -> trimesh.Trimesh:
     """A shape about its own centre, along z."""
-    radius = float(size[0])
-    length = 2.0 * float(size[1])
+    round_shape = {"radius": float(size[0]), "height": 2.0 * float(size[1])}
     if kind == _SHAPE.mjGEOM_CAPSULE:
-        return trimesh.creation.capsule(height=length, radius=radius, count=(_SEGMENTS, _SEGMENTS))
+        return trimesh.creation.capsule(**round_shape, count=(_SEGMENTS, _SEGMENTS))
     if kind == _SHAPE.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(radius=radius, height=length, sections=_SEGMENTS)
+        return trimesh.creation.cylinder(**round_shape, sections=_SEGMENTS)
     if kind == _SHAPE.mjGEOM_BOX:
         return trimesh.creation.box(extents=2.0 * size)
-    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _SHAPE.mjGEOM_ELLIPSOID else radius)
+    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _SHAPE.mjGEOM_ELLIPSOID else size[0])

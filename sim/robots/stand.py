@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter
 
 from sim.crossing import CAPACITY_OVERFLOWS
 from sim.files.templates import open_templates
-from sim.robots.elements import read_drives
+from sim.robots.compiled import read_drives
 from sim.robots.model import build_robot
 from sim.robots.probes import measure_extents, start_height
 from sim.robots.robot import RobotCfg
@@ -188,14 +188,10 @@ def describe_model(robot: RobotCfg) -> str:
     """Joints and geoms of a robot as the solver holds them, and numbers that look like other units."""
     builder = build_robot(robot)
     sim = Simulation(robot, TerrainBank(1, device="cpu"), np.zeros(1, dtype=int))
-    content = {
-        "mass": float(sim.solver.mj_model.body_subtreemass[0]),
-        "num_bodies": builder.body_count,
-        "joints": _align([*_joint_rows(robot, sim)]),
-        "geoms": _align([*_geom_rows(robot, sim, builder)]),
-        "warnings": dict(_unit_warnings(robot, builder)),
-    }
-    return _TEMPLATES.get_template("model.txt").render(robot=robot, **content).rstrip()
+    tables = {"joints": _align([*_joint_rows(robot, sim)]), "geoms": _align([*_geom_rows(robot, sim, builder)])}
+    body = {"mass": float(sim.solver.mj_model.body_subtreemass[0]), "num_bodies": builder.body_count}
+    warnings = dict(_unit_warnings(robot, builder))
+    return _TEMPLATES.get_template("model.txt").render(robot=robot, warnings=warnings, **body, **tables).rstrip()
 
 
 def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
@@ -252,7 +248,6 @@ def _unit_warnings(robot: RobotCfg, builder: Any) -> Iterator[tuple[str, Any]]:
     if turned := [f"{name} ({angle:g})" for name, angle in angles if abs(angle) > _TURN]:
         yield "angles", turned
     low, high = (np.array(limits[6:]) for limits in (builder.joint_limit_lower, builder.joint_limit_upper))
-    span = high - low
-    is_wide = (span > 2.0 * _TURN) & (span < _FREE) & (np.maximum(abs(low), abs(high)) > 2.0 * _TURN)
+    is_wide = (high - low > 2.0 * _TURN) & (high - low < _FREE) & (np.maximum(abs(low), abs(high)) > 2.0 * _TURN)
     if is_wide.any():
         yield "ranges", [f"{robot.joint_names[k]} ({low[k]:g} to {high[k]:g})" for k in np.flatnonzero(is_wide)]

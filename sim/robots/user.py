@@ -16,13 +16,11 @@ from kernels.penalties import PENALTIES
 from sim.controllers.spec import run_file
 from sim.device import host_device
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
-from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, read_robot_file
-from sim.robots.elements import joint_names, mj
+from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import make_builder
 from sim.robots.model_files import read_model_files
 from sim.robots.probes import make_probes, measure_extents, start_height
-from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
 _NAMES = (*_ROLES, "joint_names", "penalties")

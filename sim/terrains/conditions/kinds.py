@@ -208,7 +208,7 @@ class Payload(Condition):
 
     def begin_plain(self, episodes: Any, values: Array) -> None:
         """Adds the mass to the base of the model."""
-        from sim.robots.elements import mj, rotation_matrix
+        from sim.robots.compiled import mj, rotation_matrix
 
         model, base = episodes.model, 1
         added = max(values[0] * model.body_subtreemass[base], -0.5 * model.body_mass[base])

@@ -27,7 +27,7 @@ from qd.faults.searches import find_search
 from qd.search.archive import read_archive
 from sim.controllers.spec import controller_identity
 from sim.files.command import run_command
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.searches import crossing_by

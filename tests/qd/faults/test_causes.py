@@ -19,7 +19,7 @@ from qd.faults.causes import (
 )
 from qd.faults.judge import with_families
 from qd.faults.searches import Search
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING

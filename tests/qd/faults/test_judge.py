@@ -17,8 +17,7 @@ from qd.search.progress import Bar
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
-from sim.robots.robot import RobotCfg
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg
 from sim.terrains.conditions.kinds import condition_column
 from sim.terrains.spaces.registry import get_space
 from tests.builders import judged_archive, small_archive

@@ -17,8 +17,7 @@ from qd.search.presets import SchedulerCfg
 from qd.search.settings import as_settings, differences, is_searched, preset
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
-from sim.robots.robot import RobotCfg, robot_digest
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, RobotCfg, robot_digest
 from tests.builders import fresh_values, judged_archive, small_archive, write_run
 from tests.qd import stand_in
 from tests.qd.searches import CFG

@@ -15,8 +15,7 @@ from sim.controllers.loaders import load_policy
 from sim.controllers.spec import controller_identity
 from sim.robots.find import get_robot, read_penalty_scales, resolve_robot
 from sim.robots.model import build_robot
-from sim.robots.robot import check_robot_identity, robot_digest, robot_identity
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS, check_robot_identity, robot_digest, robot_identity
 from sim.robots.training import TrainingCfg
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank

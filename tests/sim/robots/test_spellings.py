@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim.robots.compiled import robot_spec
-from sim.robots.elements import rotation_matrix
+from sim.robots.compiled import robot_spec, rotation_matrix
 from sim.robots.find import get_robot
 from tests.sim.dogs import DRIVE, GAINS, JOINTS, KINDS, mjcf, urdf, write_dog
 from tests.sim.plain_mujoco import on_plane, to_c

@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 from sim.mujoco_c.model import surface_heights
-from sim.robots.shipped import ROBOTS
+from sim.robots.robot import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.maps.heightmap import Heightmap, as_terrain, fitted, read_heightmap
 from sim.terrains.maps.terrain_files import ExportedTerrain, block_of, check_formats, encode_terrain, write_terrain
