@@ -1,9 +1,7 @@
-"""Whether a robot and its controller are read correctly: it stands, and walks equally in both simulators.
+"""Whether a robot and its controller are read correctly, and the scales by which its penalties are added and compared.
 
-And the penalty scales, by which penalties can be added and compared: the mean of each raw penalty where a crossing
-fails. The scale of a penalty is its mean over those episodes on hard-random terrains that did not reach the goal: one
-typical failure costs about 1 of each kind. Scales are measured once with the shipped controller, before any search, and
-never tuned on an archive.
+The scale of a penalty is its mean over those episodes on hard-random terrains that did not reach the goal: one typical
+failure costs about 1 of each kind. Scales are measured once, before any search, and never tuned on an archive.
 """
 
 import re
@@ -51,8 +49,7 @@ _TRIED = 100  # hard-random terrains at a height, one episode each: terrains dif
 def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bool:
     """Prints what a robot's files hold, whether it stands and walks, and which obstacles it crosses.
 
-    Without ``policy`` it walks by the controller beside its settings. Returns whether nothing has to be mended and it
-    walks equally in both simulators.
+    Without ``policy`` it walks by the controller beside its settings. Returns whether nothing has to be mended.
     """
     policy = policy or str(robot.policy_file)
     if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
@@ -88,8 +85,7 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
 def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
     """A user's robot with room for its contacts and the scales of its penalties; a shipped robot has both.
 
-    Where scales are missing or older than the robot's settings or model, the given controller measures them, and they
-    are written beside the settings.
+    Scales that are missing or older than its settings or model are measured with the given controller, and written.
     """
     if robot.settings_file is None:
         return robot
@@ -110,9 +106,8 @@ def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
     tried = robot
     while (standing := stand(tried, device=device, seconds=seconds)).overflowed:
         if tried.nconmax >= _MAX_CONTACTS:
-            raise ValueError(
-                f"robot '{robot.name}' has more than {tried.nconmax} contacts: let fewer geoms touch anything"
-            )
+            problem = f"has more than {tried.nconmax} contacts: let fewer geoms touch anything"
+            raise ValueError(f"robot '{robot.name}' {problem}")
         tried = replace(tried, nconmax=2 * tried.nconmax)
     if tried is robot:
         return standing
@@ -127,13 +122,13 @@ def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
     return replace(standing, robot=larger)
 
 
-def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
+def walk(crosser: Crosser, policy: str) -> dict[str, dict[str, float]]:
     """How a controller walks over flat ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
 
     Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` from the start to the end
     [m/s], and ``height`` of the base at the end [m].
     """
-    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
+    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([0]))
     engines: dict[str, Engine] = {"searched": "search", "mujoco_c": "mujoco_c_search"}
     walks = {}
     for name, engine in engines.items():
@@ -149,12 +144,11 @@ def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, fl
 
 def _half_label(dose: dict[str, Any], element: str) -> str:
     """The rise up to which half of the robots get over an obstacle: ``of 6 cm``."""
-    (half,) = (half["value"] for half in dose["half"] if half["element"] == element)
-    if half is not None:
-        return f"of {100 * half:.0f} cm"
-    first = next(row["goal_rate"] for row in dose["dose"] if row["element"] == element)
-    over = first is not None and first >= FAILING_GOAL_RATE
-    return f"of over {100 * _RISES[-1]:.0f} cm" if over else f"of less than {100 * _RISES[0]:.0f} cm"
+    (half,) = (half for half in dose["half"] if half["element"] == element)
+    if half["value"] is not None:
+        return f"of {100 * half['value']:.0f} cm"
+    is_over = half["beyond"] == "last"
+    return f"of over {100 * _RISES[-1]:.0f} cm" if is_over else f"of less than {100 * _RISES[0]:.0f} cm"
 
 
 def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
@@ -221,10 +215,8 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     write_atomically(out, to_json(report))
     print(f"Written to {out}.")
     if absent:
-        raise ValueError(
-            f"penalties must occur in some episode, got 0 of {', '.join(absent)}: leave them out of the robot's "
-            f"penalties; the scales in {out} are of the others"
-        )
+        remedy = f"leave them out of the robot's penalties; the scales in {out} are of the others"
+        raise ValueError(f"penalties must occur in some episode, got 0 of {', '.join(absent)}: {remedy}")
     return report
 
 

@@ -62,13 +62,9 @@ class Frames:
         longest = max(part.touching.shape[2] for part in parts)
         grounds = [part.ground for part in parts if part.ground is not None]
         arrays = {name: [getattr(part, name) for part in parts] for name in (*FRAME_ARRAYS, "num_frames", "heights")}
-        for name in FRAME_ARRAYS:
-            arrays[name] = [_lengthen(values, longest) for values in arrays[name]]
+        for name, dtype in FRAME_ARRAYS.items():  # empty frames behind those of shorter episodes
+            empty = False if dtype == np.bool_ else np.nan
+            widths = [[(0, 0), (0, 0), (0, longest - v.shape[2]), *[(0, 0)] * (v.ndim - 3)] for v in arrays[name]]
+            arrays[name] = [np.pad(v, w, constant_values=empty) for v, w in zip(arrays[name], widths, strict=True)]
         joined = {name: np.concatenate(values) for name, values in arrays.items()}
         return Frames(**joined, ground=reduce(GroundMaps.joined, grounds) if grounds else None)
-
-
-def _lengthen(values: NDArray[Any], num_frames: int) -> NDArray[Any]:
-    """Frames (T, K, F, ...) with empty ones behind."""
-    width = [(0, 0), (0, 0), (0, num_frames - values.shape[2]), *[(0, 0)] * (values.ndim - 3)]
-    return np.pad(values, width, constant_values=False if values.dtype == np.bool_ else np.nan)

@@ -5,9 +5,8 @@ the state at ``k * dt``: frame 0 the start, the last one the end of the control 
 ``dt`` after its end. The frames of an invalid episode end before the step that broke it.
 
 On disk a recording is one npz, read as data, with the fields of :class:`Recording` as arrays of those names, of
-``ground`` its maps, ``origin`` as JSON, and ``format`` as its name and version. Of terrains given by genes of a shipped
-space it holds no heights: the reader makes them again. Of a space of a user's own it holds both, so that reading runs
-no code.
+``ground`` its maps, ``origin`` as JSON, and ``format`` as its name and version. Heights of terrains given by genes of a
+shipped space are made again by the reader; of a space of a user's own it holds both, so that reading runs no code.
 """
 
 import json
@@ -154,27 +153,23 @@ class RolloutRecorder:
         )
         return replace(result, frames=frames)
 
-    def _add_frames(self, stepped: bool) -> None:
+    @np.errstate(over="ignore", invalid="ignore")  # of an episode that broke
+    def _add_frames(self, ended: bool) -> None:
         """Add the present state of every robot on its way, or the last of every episode that ended.
 
         Where a step broke the state, there is no last one.
         """
-        outcome = self._rollout.outcome.numpy()
-        if not stepped:
-            self._add(np.flatnonzero(outcome == Outcome.RUNNING), ended=False)
-            return
-        episode = self._rollout.episode.numpy()
-        ended = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0))
-        ended = ended[~self._ended[episode[ended]]]
-        self._ended[episode[ended]] = True
-        self._add(ended[outcome[ended] != Outcome.INVALID], ended=True)
-
-    @np.errstate(over="ignore", invalid="ignore")  # of an episode that broke
-    def _add(self, envs: NDArray[Any], *, ended: bool) -> None:
+        rollout = self._rollout
+        episode = rollout.episode.numpy()
+        outcome = rollout.outcome.numpy()
+        envs = np.flatnonzero((outcome != Outcome.RUNNING) & (episode >= 0) if ended else outcome == Outcome.RUNNING)
+        if ended:
+            envs = envs[~self._ended[episode[envs]]]
+            self._ended[episode[envs]] = True
+            envs = envs[outcome[envs] != Outcome.INVALID]
         if len(envs) == 0:
             return
-        rollout = self._rollout
-        row = rollout.episode.numpy()[envs]
+        row = episode[envs]
         frame = self._num_frames[row]
         joint_q = rollout.sim.joint_q.numpy()[envs]
         force = rollout.sim.geom_force.numpy()[envs]
@@ -182,7 +177,7 @@ class RolloutRecorder:
         command = rollout.command.numpy()[envs]
         touching = np.linalg.norm(force, axis=-1) > COLLISION_FORCE
         if ended:  # the base may have touched in an earlier physics step of the last control step
-            hit = rollout.outcome.numpy()[envs] == Outcome.BASE_COLLISION
+            hit = outcome[envs] == Outcome.BASE_COLLISION
             touching[hit & ~touching[:, : self._num_base].any(axis=1), : self._num_base] = True
         values = {
             "base_position": joint_q[:, :3],

@@ -1,7 +1,6 @@
 """Pictures of recorded poses by MuJoCo's renderer, without a screen: through EGL, on a GPU or in software.
 
-A scene is the robot on its terrain as a MuJoCo model to look at: ground painted by height, light and goal. Nothing in
-it is simulated.
+A scene is a MuJoCo model to look at: the robot on its terrain, ground painted by height, light and goal.
 """
 
 import importlib
@@ -59,8 +58,7 @@ def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None
     shape (4 (nrow - 1), 4 (ncol - 1), 3), row along y.
     """
     cells = 0.25 * (heights[:-1, :-1] + heights[1:, :-1] + heights[:-1, 1:] + heights[1:, 1:])
-    color = height_colors(cells)
-    color = color if ground is None else tinted(color, ground, MARGIN_NODES)
+    color = height_colors(cells) if ground is None else tinted(height_colors(cells), ground, MARGIN_NODES)
     rise_y, rise_x = np.gradient(cells, SPACING)
     color *= (0.75 + 0.25 / np.sqrt(1.0 + rise_x**2 + rise_y**2))[..., None]
     paint = np.asarray(zoom(color, (_PIXELS, _PIXELS, 1), order=1, mode="nearest", grid_mode=True))
@@ -146,11 +144,9 @@ def open_context(width: int, height: int) -> Any:
         context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
         context.make_current()
     except Exception as error:  # a library that is not there fails with anything
-        raise ValueError(
-            f"pictures need OpenGL without a screen, but '{name}' does not work here: {type(error).__name__}: {error}: "
-            "install it (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or name another way in MUJOCO_GL "
-            "(egl, osmesa, glfw)"
-        ) from None
+        problem = f"'{name}' does not work here: {type(error).__name__}: {error}"
+        cure = "install it (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or name another way in MUJOCO_GL"
+        raise ValueError(f"pictures need OpenGL without a screen, but {problem}: {cure} (egl, osmesa, glfw)") from None
     return context
 
 
@@ -207,8 +203,7 @@ class Renderer(AbstractContextManager):
 
         ``ghost`` is the pose of another controller's robot, translucent and with its name over it.
         ``touching`` says whether each geom of ``robot.geom_names`` touches something, shape (num_geoms,): feet that do
-        are yellow, base and limbs magenta. ``foot_force`` is the contact force on each foot, world frame [N], shape
-        (num_feet, 3), shown as arrows.
+        are yellow, base and limbs magenta. Arrows show ``foot_force``, world frame [N], shape (num_feet, 3).
         """
         data = self._data
         self._pose(data, qpos)

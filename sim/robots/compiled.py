@@ -23,15 +23,8 @@ from sim.robots.robot import RobotCfg
 mj: Any = mujoco
 """MuJoCo, whose stubs lack most types."""
 _JOINT = mj.mjtTrn.mjTRN_JOINT
-PER_JOINT = (
-    "default_joint_pos",
-    "stiffness",
-    "damping",
-    "effort_limit",
-    "armature",
-    "saturation_effort",
-    "velocity_limit",
-)
+_GAINS = ("stiffness", "damping", "effort_limit", "armature")
+PER_JOINT = ("default_joint_pos", *_GAINS, "saturation_effort", "velocity_limit")
 """Settings with a value for each joint."""
 _SLACK = 1e-3  # files round [rad]
 _URDF_FRICTION = 1.0
@@ -210,8 +203,7 @@ class RobotFile:
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
     """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
 
-    Gains, torque limits, armature and contact of the settings replace those of the file. With ``visuals`` a URDF keeps
-    what it shows.
+    Gains, torque limits, armature and contact of the settings count first. With ``visuals`` a URDF keeps what it shows.
     """
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, robot_file):
@@ -349,10 +341,9 @@ def _refused_elements(spec: Any) -> Iterator[str]:
     bodies, joints, geoms = spec.bodies, spec.joints, touching_geoms(*spec.bodies)
     elements = {"body": bodies, "joint": joints, "geom": geoms, "actuator": spec.actuators}
     for kind, names in _ZERO_ATTRIBUTES.items():
-        for element in elements[kind]:
-            for name in names:
-                if np.any(getattr(element, name)):
-                    yield f"<{kind} {name}> of {element.name} ({element.info})"
+        for element, name in itertools.product(elements[kind], names):
+            if np.any(getattr(element, name)):
+                yield f"<{kind} {name}> of {element.name} ({element.info})"
     for joint in joints:
         is_free = joint.type == mj.mjtJoint.mjJNT_FREE
         if joint.type == mj.mjtJoint.mjJNT_BALL:

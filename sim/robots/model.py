@@ -70,7 +70,7 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-_FREE_RANGE, _FREE_RANGE)
     anchor = _transform(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
     is_hinge = model.jnt_type[joint] == mj.mjtJoint.mjJNT_HINGE
-    add_joint = builder.add_joint_revolute if is_hinge else builder.add_joint_prismatic
+    add_joint: Any = builder.add_joint_revolute if is_hinge else builder.add_joint_prismatic
     effort = float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else _NO_EFFORT_LIMIT
     return add_joint(
         parent=int(model.body_parentid[body]) - 1,

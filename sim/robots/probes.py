@@ -56,9 +56,8 @@ def _surface_samples(triangles: _Array, spacing: float) -> _Array:
     for a, b, c in triangles:
         longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
         count = max(1, int(np.ceil(longest / spacing)))
-        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
-        inside = i + j <= count
-        u, v = i[inside, None] / count, j[inside, None] / count
+        steps = np.arange(count + 1)
+        u, v = np.argwhere(steps[:, None] + steps <= count).T[..., None] / count
         samples.append(a + u * (b - a) + v * (c - a))
     return np.unique(np.round(np.concatenate(samples), 7), axis=0).astype(np.float64)
 
@@ -114,8 +113,8 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
         if len(chosen):
             row = centres[chosen[np.argsort(along[chosen], kind="stable")]]
             line = row[-1] - row[0]
-            length = float(line @ line)
-            share = np.clip((row - row[0]) @ line / length, 0.0, 1.0) if length > 0.0 else np.zeros(len(row))
+            length = float(line @ line) or 1.0
+            share = np.clip((row - row[0]) @ line / length, 0.0, 1.0)
             spread = float(np.linalg.norm(row - row[0] - share[:, None] * line, axis=1).max())
             strips.append(Strip(centres=row, radius=float(radius), spread=spread))
     return strips
@@ -224,8 +223,7 @@ _PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., list[Strip]]]] = {
 def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
     """Strips of one collision shape, in the shape's frame; a mesh collides as its convex hull.
 
-    ``scale`` is Newton's: (radius,), (radius, half height) or (half x, half y, half z) [m]; of a mesh its factors along
-    x, y and z.
+    ``scale`` is Newton's: (radius,), (radius, half height) or (half x, half y, half z) [m]; factors x, y, z of a mesh.
     """
     num_sizes, make_strips = _PRIMITIVES.get(shape_type, (0, None))
     sizes = np.asarray(scale, dtype=np.float64)[:num_sizes]

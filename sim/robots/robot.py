@@ -46,8 +46,7 @@ class RobotCfg:
     default_joint_pos: tuple[float, ...]
     """Default pose [rad]; an action of 0 holds it."""
     default_base_height: NonNegativeFloat = 0.0
-    """Height of the base over flat ground at the start [m]; of a settings file without it, the lowest one at which no
-    foot starts in the ground."""
+    """Height of the base over flat ground at the start [m]; if 0, the lowest one with no foot in the ground."""
     footprint: tuple[PositiveFloat, PositiveFloat]
     """Half length and half width of the stance [m]."""
     scan_x: tuple[float, ...]
@@ -93,8 +92,7 @@ class RobotCfg:
     drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
     friction: PositiveFloat | None = None
-    """Sliding friction of all geoms on the ground; the file's if None, 1 of a URDF. Less than the ground's .3 counts as
-    .3."""
+    """Sliding friction of all geoms; the file's if None, 1 of a URDF. Less than the ground's .3 counts as .3."""
     contact_time_constant_s: PositiveFloat | None = None
     """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
     training: TrainingCfg = field(default_factory=TrainingCfg)
@@ -221,12 +219,9 @@ def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path,
     check_robot_digest(record, robot, file, remedy)
 
 
-def _steps(low: int, high: int) -> tuple[float, ...]:
-    return tuple(k / 10 for k in range(low, high + 1))
-
-
 _LEGS = ("LF", "RF", "LH", "RH")
 _SIDES = ("left", "right")
+_LEG_JOINTS = ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
 _PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble")
 
 ROBOTS = {
@@ -241,8 +236,8 @@ ROBOTS = {
         default_joint_pos=(0.0, 0.4, -0.8) * 2 + (0.0, -0.4, 0.8) * 2,
         default_base_height=0.6,
         footprint=(0.5, 0.4),
-        scan_x=_steps(-8, 8),
-        scan_y=_steps(-5, 5),
+        scan_x=tuple(k / 10 for k in range(-8, 9)),
+        scan_y=tuple(k / 10 for k in range(-5, 6)),
         contact_force_limit=500.0,
         penalties=(*_PENALTIES, "collision"),
         collision_bit=False,
@@ -256,16 +251,12 @@ ROBOTS = {
         base_geoms=("pelvis",),
         foot_geoms=tuple(f"{side}_toe" for side in _SIDES),
         limb_geoms=(),
-        joint_names=tuple(
-            f"{joint}_{side}"
-            for side in _SIDES
-            for joint in ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
-        ),
+        joint_names=tuple(f"{joint}_{side}" for side in _SIDES for joint in _LEG_JOINTS),
         default_joint_pos=(0.1, 0.0, 1.0, -1.8, 1.57, -1.57, -0.1, 0.0, 1.0, -1.8, 1.57, -1.57),
         default_base_height=1.0,
         footprint=(0.4, 0.3),
-        scan_x=_steps(-5, 5),
-        scan_y=_steps(-5, 5),
+        scan_x=tuple(k / 10 for k in range(-5, 6)),
+        scan_y=tuple(k / 10 for k in range(-5, 6)),
         contact_force_limit=300.0,
         penalties=_PENALTIES,
         collision_bit=True,

@@ -78,9 +78,8 @@ def find_touches(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
             columns = [k for k, touching in enumerate(ids) if model.geom_bodyid[touching] == body]
             distance = {k: np.linalg.norm(model.geom_pos[geom] - model.geom_pos[ids[k]]) for k in columns}
             feet = tuple(k for k in columns if k >= num_bodily and distance[k] < model.geom_rbound[ids[k]])
-            touches[geom] = feet or tuple(k for k in columns if k < num_bodily)
-            if geom in ids:
-                touches[geom] = (ids.index(geom),)
+            itself = (ids.index(geom),) if geom in ids else ()
+            touches[geom] = itself or feet or tuple(k for k in columns if k < num_bodily)
     return touches
 
 

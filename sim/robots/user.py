@@ -143,11 +143,10 @@ def _infer_roles(given: dict[str, Any], model: Any, pose: Sequence[float]) -> di
     body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
     last_bodies = {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
     roles = {role: given[role] for role in _ROLES if role in given}
-    lowest = min(bottoms.values())
+    low = [name for name, bottom in bottoms.items() if bottom <= min(bottoms.values()) + _FOOT_RISE]
     free = [name for name in bottoms if not any(name in names for names in roles.values())]
     roles.setdefault("base_geoms", [name for name in free if body[name] == 1])
-    is_foot = {name: body[name] in last_bodies and bottoms[name] <= lowest + _FOOT_RISE for name in free}
-    roles.setdefault("foot_geoms", [name for name in free if is_foot[name]])
+    roles.setdefault("foot_geoms", [name for name in free if name in low and body[name] in last_bodies])
     with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
     roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
     return roles
